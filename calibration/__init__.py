@@ -1,0 +1,1 @@
+"""Calibration of a stereo pair of cameras from views of a chessboard; usable on its own."""

@@ -1,0 +1,247 @@
+"""Pinhole cameras with Brown distortion, alone and as a stereo pair, with every derivative that a fit needs.
+
+Pixel (0, 0) is the centre of the top-left pixel; a camera's axes are x right, y down, z along the view. Distortion is
+Brown's with OpenCV's coefficients in OpenCV's order, so that numbers can be exchanged with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+N_INTRINSIC = len(INTRINSIC_PARAMETERS)
+RIG_PARAMETERS = (
+    *(f"left_{name}" for name in INTRINSIC_PARAMETERS),
+    *(f"right_{name}" for name in INTRINSIC_PARAMETERS),
+    *(f"right_left_rotation_{axis}" for axis in "xyz"),
+    *(f"right_left_translation_{axis}" for axis in "xyz"),
+    *(f"left_world_rotation_{axis}" for axis in "xyz"),
+    *(f"left_world_translation_{axis}" for axis in "xyz"),
+)
+N_RIG = len(RIG_PARAMETERS)  # 30
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera: pinhole and Brown distortion."""
+
+    fx: float  # [px]
+    fy: float  # [px]
+    cx: float  # [px]
+    cy: float  # [px]
+    distortion: tuple[float, float, float, float, float]  # k1, k2, p1, p2, k3, on normalised coordinates
+    image_size: tuple[int, int]  # width, height [px]
+
+    @property
+    def camera_matrix(self) -> Array:
+        """The 3 x 3 matrix K of the textbooks."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def parameters(self) -> Array:
+        """(9,) in the order of INTRINSIC_PARAMETERS."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
+    @classmethod
+    def from_parameters(cls, parameters: Array, image_size: tuple[int, int]) -> Camera:
+        """Inverse of `parameters`."""
+        fx, fy, cx, cy, *distortion = (float(p) for p in parameters)
+        k1, k2, p1, p2, k3 = distortion
+        return cls(fx, fy, cx, cy, (k1, k2, p1, p2, k3), image_size)
+
+
+def project(points_camera: Array, camera: Camera) -> Array:
+    """Pixels (..., 2) of points (..., 3) given in the camera's own axes; NaN behind the camera."""
+    return project_with_jacobians(points_camera, camera)[0]
+
+
+def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """Pixels (..., 2), d pixel / d point (..., 2, 3) and d pixel / d intrinsics (..., 2, 9); NaN behind the camera."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    X, Y, Z = np.moveaxis(np.asarray(points_camera, float), -1, 0)
+    Z = np.where(Z > 0, Z, np.nan)
+    iz = 1.0 / Z
+    a, b = X * iz, Y * iz
+    r2 = a * a + b * b
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial_r2 = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2
+    xd = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    yd = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    pixels = np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
+
+    xd_a = radial + 2 * a * a * radial_r2 + 2 * p1 * b + 6 * p2 * a
+    xd_b = 2 * a * b * radial_r2 + 2 * p1 * a + 2 * p2 * b
+    yd_a = xd_b
+    yd_b = radial + 2 * b * b * radial_r2 + 6 * p1 * b + 2 * p2 * a
+    d_point = np.empty((*a.shape, 2, 3))
+    d_point[..., 0, 0] = camera.fx * xd_a * iz
+    d_point[..., 0, 1] = camera.fx * xd_b * iz
+    d_point[..., 0, 2] = -camera.fx * (xd_a * a + xd_b * b) * iz
+    d_point[..., 1, 0] = camera.fy * yd_a * iz
+    d_point[..., 1, 1] = camera.fy * yd_b * iz
+    d_point[..., 1, 2] = -camera.fy * (yd_a * a + yd_b * b) * iz
+
+    d_intrinsics = np.zeros((*a.shape, 2, N_INTRINSIC))
+    d_intrinsics[..., 0, 0], d_intrinsics[..., 1, 1] = xd, yd
+    d_intrinsics[..., 0, 2] = d_intrinsics[..., 1, 3] = 1.0
+    for column, factor in ((4, r2), (5, r2**2), (8, r2**3)):
+        d_intrinsics[..., 0, column] = camera.fx * a * factor
+        d_intrinsics[..., 1, column] = camera.fy * b * factor
+    d_intrinsics[..., 0, 6] = camera.fx * 2 * a * b
+    d_intrinsics[..., 1, 6] = camera.fy * (r2 + 2 * b * b)
+    d_intrinsics[..., 0, 7] = camera.fx * (r2 + 2 * a * a)
+    d_intrinsics[..., 1, 7] = camera.fy * 2 * a * b
+    return pixels, d_point, d_intrinsics
+
+
+def normalise(pixels: Array, camera: Camera, iterations: int = 20) -> Array:
+    """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `project` up to depth.
+
+    Newton's method on the distortion; NaN where it does not return to the pixel within 1e-6 px (beyond the radius at
+    which the distortion polynomial folds).
+    """
+    target = np.asarray(pixels, float)
+    ab = np.stack([(target[..., 0] - camera.cx) / camera.fx, (target[..., 1] - camera.cy) / camera.fy], axis=-1)
+    ones = np.ones((*ab.shape[:-1], 1))
+    for _ in range(iterations):
+        found, d_point, _ = project_with_jacobians(np.concatenate([ab, ones], axis=-1), camera)
+        residual = target - found
+        J = d_point[..., :2]
+        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        step = np.stack(
+            [
+                (J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]) / det,
+                (J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]) / det,
+            ],
+            axis=-1,
+        )
+        ab = ab + step
+        if not np.any(np.abs(step) > 1e-14):
+            break
+    found = project(np.concatenate([ab, ones], axis=-1), camera)
+    bad = ~(np.linalg.norm(found - target, axis=-1) < 1e-6)
+    return np.where(bad[..., None], np.nan, ab)
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """Two calibrated cameras and the world (lab) frame they look at.
+
+    points_left = R_left_world @ points_world + t_left_world;  points_right = R_right_left @ points_left + t_right_left.
+    `covariance` is that of RIG_PARAMETERS, rotations as rotation vectors that multiply the estimate from the left
+    (R = exp([v]x) R_estimate); zero rows belong to parameters that were not estimated. It is common to all frames.
+    A rig without a table view has the left camera's axes for a world (`world_is_table` False).
+    """
+
+    left: Camera
+    right: Camera
+    R_right_left: Array  # (3, 3)
+    t_right_left: Array  # (3,) [m]
+    R_left_world: Array = field(default_factory=lambda: np.eye(3))  # (3, 3)
+    t_left_world: Array = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
+    covariance: Array = field(default_factory=lambda: np.zeros((N_RIG, N_RIG)))  # (30, 30)
+    world_is_table: bool = False
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Left, right."""
+        return self.left, self.right
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the two projection centres [m]."""
+        return float(np.linalg.norm(self.t_right_left))
+
+    def camera_poses(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """(R_camera_world, t_camera_world) of the left and of the right camera."""
+        R_right_world = self.R_right_left @ self.R_left_world
+        t_right_world = self.R_right_left @ self.t_left_world + self.t_right_left
+        return (self.R_left_world, self.t_left_world), (R_right_world, t_right_world)
+
+    def project(self, points_world: Array) -> Array:
+        """Pixels (..., 2 cameras, n, 2) of points (..., n, 3) [m]; NaN behind a camera."""
+        views = [
+            project(points_world @ R.T + t, camera)
+            for camera, (R, t) in zip(self.cameras, self.camera_poses(), strict=True)
+        ]
+        return np.stack(views, axis=-3)
+
+    def project_with_jacobians(self, points_world: Array) -> tuple[Array, Array, Array]:
+        """Pixels (..., 2, n, 2), d/d point_world (..., 2, n, 2, 3) and d/d RIG_PARAMETERS (..., 2, n, 2, 30)."""
+        points_world = np.asarray(points_world, float)
+        points_left = points_world @ self.R_left_world.T + self.t_left_world
+        pixels_left, d_left, d_k_left = project_with_jacobians(points_left, self.left)
+        turned_right = points_left @ self.R_right_left.T
+        pixels_right, d_right, d_k_right = project_with_jacobians(turned_right + self.t_right_left, self.right)
+        d_right_left = d_right @ self.R_right_left  # d pixel_right / d point_left
+
+        def rotated(d_point: Array, arm: Array) -> Array:
+            """D pixel / d rotation vector when the arm turns: d_point @ (v x arm) = (arm x d_point) . v."""
+            return np.cross(arm[..., None, :], d_point)
+
+        arm_world = points_world @ self.R_left_world.T
+        d_rig = np.zeros((*points_world.shape[:-2], 2, points_world.shape[-2], 2, N_RIG))
+        d_rig[..., 0, :, :, 0:9] = d_k_left
+        d_rig[..., 1, :, :, 9:18] = d_k_right
+        d_rig[..., 1, :, :, 18:21] = rotated(d_right, turned_right)
+        d_rig[..., 1, :, :, 21:24] = d_right
+        for camera, d_point in enumerate((d_left, d_right_left)):
+            d_rig[..., camera, :, :, 24:27] = rotated(d_point, arm_world)
+            d_rig[..., camera, :, :, 27:30] = d_point
+        d_world = np.stack([d_left @ self.R_left_world, d_right_left @ self.R_left_world], axis=-4)
+        return np.stack([pixels_left, pixels_right], axis=-3), d_world, d_rig
+
+    def perturbed(self, delta: Array) -> StereoRig:
+        """The rig after a small change delta (30,) of RIG_PARAMETERS (SI units, rotation vectors in radians)."""
+        delta = np.asarray(delta, float)
+        return replace(
+            self,
+            left=Camera.from_parameters(self.left.parameters + delta[0:9], self.left.image_size),
+            right=Camera.from_parameters(self.right.parameters + delta[9:18], self.right.image_size),
+            R_right_left=rotation_from_vector(delta[18:21]) @ self.R_right_left,
+            t_right_left=self.t_right_left + delta[21:24],
+            R_left_world=rotation_from_vector(delta[24:27]) @ self.R_left_world,
+            t_left_world=self.t_left_world + delta[27:30],
+        )
+
+
+def rotation_from_vector(v: Array) -> Array:
+    """Rodrigues' formula: rotation vector (3,) [rad] -> (3, 3)."""
+    v = np.asarray(v, float)
+    angle = float(np.linalg.norm(v))
+    S = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    if angle < 1e-6:
+        return np.eye(3) + S + 0.5 * S @ S
+    return np.eye(3) + np.sin(angle) / angle * S + (1 - np.cos(angle)) / angle**2 * S @ S
+
+
+def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:
+    """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice."""
+    rays = [
+        np.concatenate([normalise(view, camera), np.ones((len(view), 1))], axis=-1)
+        for view, camera in zip(pixels, rig.cameras, strict=True)
+    ]
+    rows, rhs = [], []
+    for ray, (R, t) in zip(rays, rig.camera_poses(), strict=True):
+        for axis in (0, 1):
+            rows.append(R[axis] - ray[:, axis, None] * R[2])
+            rhs.append(ray[:, axis] * t[2] - t[axis])
+    A, b = np.stack(rows, axis=-2), np.stack(rhs, axis=-1)
+    good = np.isfinite(A).all(axis=(-2, -1)) & np.isfinite(b).all(axis=-1)
+    points = np.full((len(good), 3), np.nan)
+    normal = np.swapaxes(A[good], -1, -2) @ A[good]
+    points[good] = np.linalg.solve(normal, (np.swapaxes(A[good], -1, -2) @ b[good][..., None]))[..., 0]
+    for _ in range(iterations):
+        found, d_world, _ = rig.project_with_jacobians(points[good])
+        J = np.moveaxis(d_world, 0, 1).reshape(-1, 4, 3)
+        residual = np.moveaxis(pixels[:, good] - found, 0, 1).reshape(-1, 4, 1)
+        step = np.linalg.solve(np.swapaxes(J, -1, -2) @ J, np.swapaxes(J, -1, -2) @ residual)[..., 0]
+        points[good] += step
+        if not np.any(np.abs(step) > 1e-12):
+            break
+    return points

@@ -1,0 +1,19 @@
+"""What can go wrong, as classes a caller can tell apart.
+
+Every message says which file, frame or camera, what was found, what was expected and what to do.
+"""
+
+
+class DiscTrackError(Exception):
+    """Base of every error this distribution raises on purpose.
+
+    It lives here, not in `disctrack`, because imports point from `disctrack` to `calibration` only.
+    """
+
+
+class CalibrationError(DiscTrackError):
+    """The cameras cannot be calibrated from what was given."""
+
+
+class RigFileError(DiscTrackError):
+    """A rig file cannot be read, or does not hold a stereo rig."""

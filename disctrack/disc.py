@@ -1,0 +1,72 @@
+"""The disc as an object: its size, its inertia and the dots on its upper face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A homogeneous disc of radius r and thickness 2h with round dots on its upper face.
+
+    Body frame: origin at the centre of mass, third axis e3 out of the upper face.
+    """
+
+    radius: float  # r [m]
+    half_thickness: float  # h [m]
+    mass: float  # m [kg]
+    marker_centres_body: Array  # (n_markers, 3) [m]; third component +h for dots on the upper face
+    marker_diameter: float  # [m]
+
+    @property
+    def moment_diametral(self) -> float:
+        """J1 = J2 = m r^2 / 4 + m h^2 / 3  [kg m^2]  (Ma et al. 2014, below eq. 2.3)."""
+        return self.mass * (self.radius**2 / 4 + self.half_thickness**2 / 3)
+
+    @property
+    def moment_axial(self) -> float:
+        """J3 = m r^2 / 2  [kg m^2]."""
+        return self.mass * self.radius**2 / 2
+
+    @property
+    def n_markers(self) -> int:
+        """Number of dots on the upper face."""
+        return len(self.marker_centres_body)
+
+
+def disc_from_mm(
+    radius_mm: float,
+    thickness_mm: float,
+    mass_g: float,
+    marker_centres_mm: list[list[float]] | Array,
+    marker_diameter_mm: float,
+) -> Disc:
+    """Disc from the millimetres and grams of a recording.toml; centres are (n, 2) on the upper face."""
+    centres = np.asarray(marker_centres_mm, float).reshape(-1, 2) * 1e-3
+    height = np.full(len(centres), thickness_mm * 0.5e-3)
+    return Disc(
+        radius=radius_mm * 1e-3,
+        half_thickness=thickness_mm * 0.5e-3,
+        mass=mass_g * 1e-3,
+        marker_centres_body=np.column_stack([centres, height]),
+        marker_diameter=marker_diameter_mm * 1e-3,
+    )
+
+
+_HEXAGON = np.radians(60.0 * np.arange(6))
+
+# Radius, thickness and mass as in Ma et al. 2014, section 3a. The layout of the dots is not published; this one has
+# no rotational symmetry (the sixth dot sits at half radius), so that the spin angle is determined.
+MA_2014 = disc_from_mm(
+    radius_mm=37.5,
+    thickness_mm=6.0,
+    mass_g=209.69,
+    marker_centres_mm=np.column_stack([np.cos(_HEXAGON), np.sin(_HEXAGON)])
+    * np.where(np.arange(6) == 5, 13.0, 26.0)[:, None],
+    marker_diameter_mm=7.0,
+)

@@ -1,0 +1,29 @@
+"""The errors that disctrack raises on purpose; `cli` alone turns them into a line and an exit code."""
+
+from calibration.errors import CalibrationError, DiscTrackError, RigFileError
+
+__all__ = [
+    "CalibrationError",
+    "DiscTrackError",
+    "OutputError",
+    "RecordingError",
+    "RigFileError",
+    "TrackingError",
+    "TrajectoryFileError",
+]
+
+
+class RecordingError(DiscTrackError):
+    """A recording folder, its recording.toml or its images cannot be used as they are."""
+
+
+class TrackingError(DiscTrackError):
+    """The disc cannot be found or followed in the images."""
+
+
+class OutputError(DiscTrackError):
+    """A result cannot be written where it was asked for."""
+
+
+class TrajectoryFileError(DiscTrackError):
+    """A trajectory file cannot be read, or holds something else."""

@@ -1,0 +1,199 @@
+"""Conventions, and the rotations that follow from them.
+
+This docstring is the one home of the conventions; every other file obeys it silently.
+
+World frame I = (O, i, j, k): k up, the table is z = 0 (Ma et al. 2014, section 2a). The calibration's table view fixes
+    origin and heading (`calibration.table_frame`).
+Body frame: fixed to the disc, origin at its centre O, third axis e3 out of the upper face.
+Nodal frame R_O = (e1, e2, e3): follows precession and nutation, not spin. e1 = (cos psi, sin psi, 0) is horizontal,
+    e2 = e3 x e1 points from the contact A towards B; r_OA = -r e2 - h e3, the thickness is 2h.
+Contact frame R_A = (n0, m0, k): n0 = e1, m0 = k x n0.
+Rotation body -> world: R_world_body = Rz(psi) Rx(theta) Rz(phi), points_world = points_body @ R_world_body.T + t.
+    psi precession, theta nutation in [0, pi], phi spin. R_a_b maps components in b to components in a: names that
+    touch must match (R_left_body = R_left_world @ R_world_body).
+Small rotations: a rotation vector in world axes that multiplies from the left, R = exp([v]x) R_estimate. Pose
+    covariances are in (x, y, z, v_x, v_y, v_z): regular at theta = 0, where psi and phi each lose their meaning.
+Generalized coordinates q = (x, y, z, psi, theta, phi), rates qdot = dq/dt; omega_world = thetadot e1 + psidot k +
+    phidot e3.
+Quaternions (w, x, y, z), body to world, scalar part not negative at the first frame and continuous from there.
+Units: SI and radians inside. Another unit has a suffix (radius_mm, theta_deg) and is converted where a file is read or
+    a page is printed.
+Pixels: (0, 0) is the centre of the top-left pixel, x right, y down; points are (x, y), images are [y, x].
+Camera frame: x right, y down, z along the view: points_camera = R_camera_world @ points_world + t_camera_world.
+Arrays: many of a thing on leading axes, components last; image points are (n_frames, n_cameras, n_markers, 2) with
+    camera 0 = left, 1 = right. A frame without an answer is NaN with a status, never a missing row.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+POSE_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
+COORDINATES = ("x", "y", "z", "psi", "theta", "phi")
+CAMERAS = ("left", "right")
+
+
+def rotation_x(angle: ArrayLike) -> Array:
+    """Rotation about the first axis; angle (...) [rad] -> (..., 3, 3)."""
+    return _axis_rotation(angle, 1, 2)
+
+
+def rotation_z(angle: ArrayLike) -> Array:
+    """Rotation about the third axis; angle (...) [rad] -> (..., 3, 3)."""
+    return _axis_rotation(angle, 0, 1)
+
+
+def _axis_rotation(angle: ArrayLike, i: int, j: int) -> Array:
+    angle = np.asarray(angle, float)
+    R = np.zeros((*angle.shape, 3, 3))
+    R[..., 0, 0] = R[..., 1, 1] = R[..., 2, 2] = 1.0
+    R[..., i, i] = R[..., j, j] = np.cos(angle)
+    R[..., j, i] = np.sin(angle)
+    R[..., i, j] = -R[..., j, i]
+    return R
+
+
+def rotation_from_euler(psi: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Array:
+    """R_world_body = Rz(psi) Rx(theta) Rz(phi); angles (...) [rad], wrapped or not -> (..., 3, 3)."""
+    return rotation_z(psi) @ rotation_x(theta) @ rotation_z(phi)
+
+
+def euler_from_rotation(R_world_body: Array) -> Array:
+    """(psi, theta, phi) of R_world_body (..., 3, 3) -> (..., 3) [rad]; psi and phi in (-pi, pi], theta in [0, pi].
+
+    At theta = 0 (and pi) psi and phi cannot be told apart; then psi = 0 and phi takes the whole turn.
+    """
+    R = np.asarray(R_world_body, float)
+    sine = np.hypot(R[..., 0, 2], R[..., 1, 2])
+    theta = np.arctan2(sine, R[..., 2, 2])
+    regular = sine > 1e-14
+    psi = np.where(regular, np.arctan2(R[..., 0, 2], -R[..., 1, 2]), 0.0)
+    phi = np.where(regular, np.arctan2(R[..., 2, 0], R[..., 2, 1]), np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    return np.stack([psi, theta, phi], axis=-1)
+
+
+def unwrap_euler(euler: Array) -> Array:
+    """Angles continuous in time: (n, 3) psi, theta, phi [rad], NaN rows allowed and bridged.
+
+    psi + phi (the turn of the body about the vertical for small theta) is well determined even where psi and phi are
+    not, so psi is unwrapped first and phi is then given the branch that keeps psi + phi continuous.
+    """
+    result = np.array(euler, float)
+    good = np.flatnonzero(np.isfinite(result).all(axis=-1))
+    psi, total = result[good, 0], result[good, 0] + result[good, 2]
+    psi, total = np.unwrap(psi), np.unwrap(total)
+    result[good, 0], result[good, 2] = psi, total - psi
+    return result
+
+
+def nodal_axes_world(psi: ArrayLike, theta: ArrayLike) -> tuple[Array, Array, Array]:
+    """e1, e2, e3 in world axes, each (..., 3), from precession and nutation (...) [rad]."""
+    s, c = np.sin(theta), np.cos(theta)
+    sp, cp = np.sin(psi), np.cos(psi)
+    zero = np.zeros(np.broadcast(s, sp).shape)
+    e1 = np.stack([cp + zero, sp + zero, zero], axis=-1)
+    e2 = np.stack([-sp * c, cp * c, s + zero], axis=-1)
+    e3 = np.stack([sp * s, -cp * s, c + zero], axis=-1)
+    return e1, e2, e3
+
+
+def euler_rate_axes_world(psi: ArrayLike, theta: ArrayLike) -> Array:
+    """Matrix (..., 3, 3) with omega_world = matrix @ (psidot, thetadot, phidot); its columns are k, e1, e3."""
+    e1, _, e3 = nodal_axes_world(psi, theta)
+    k = np.zeros_like(e1)
+    k[..., 2] = 1.0
+    return np.stack([k, e1, e3], axis=-1)
+
+
+def euler_jacobian(psi: ArrayLike, theta: ArrayLike) -> Array:
+    """d(psi, theta, phi)/d(world rotation vector), (..., 3, 3); entries grow as 1/sin theta, NaN at theta = 0."""
+    s, c = np.sin(theta), np.cos(theta)
+    sp, cp = np.sin(psi), np.cos(psi)
+    J = np.zeros((*np.broadcast(s, sp).shape, 3, 3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cot, csc = c / s, 1.0 / s
+        J[..., 0, 0], J[..., 0, 1], J[..., 0, 2] = -sp * cot, cp * cot, 1.0
+        J[..., 1, 0], J[..., 1, 1] = cp, sp
+        J[..., 2, 0], J[..., 2, 1] = sp * csc, -cp * csc
+    J[np.broadcast_to(s, J.shape[:-2]) == 0] = np.nan
+    return J
+
+
+def skew(v: ArrayLike) -> Array:
+    """Matrix of the cross product, skew(v) @ w = v x w; v (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, float)
+    S = np.zeros((*v.shape[:-1], 3, 3))
+    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    S[..., 1, 0], S[..., 2, 0], S[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return S
+
+
+def rotation_from_vector(v: ArrayLike) -> Array:
+    """Rodrigues' formula: rotation vector (..., 3) [rad] -> (..., 3, 3), accurate also near zero."""
+    v = np.asarray(v, float)
+    angle2 = np.sum(v * v, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle2 < 1e-8
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle2 / 24, (1 - np.cos(safe)) / safe**2)
+    S = skew(v)
+    return np.eye(3) + a * S + b * (S @ S)
+
+
+def vector_from_rotation(R: Array) -> Array:
+    """Rotation vector (..., 3) [rad] of R (..., 3, 3), length in [0, pi]; inverse of `rotation_from_vector`."""
+    q = quaternion_from_rotation(R)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    scale = np.where(sine < 1e-9, 2.0, angle / np.where(sine == 0, 1.0, sine))
+    return scale * q[..., 1:]
+
+
+def quaternion_from_rotation(R: Array) -> Array:
+    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4); NaN in, NaN out.
+
+    The largest of the four squared components is taken from the trace identities, the others follow from sums and
+    differences, so that no cancellation occurs at any angle.
+    """
+    R = np.asarray(R, float)
+    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
+    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    d, e, f = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], a, b, c], axis=-1),
+            np.stack([a, squares[..., 1], d, e], axis=-1),
+            np.stack([b, d, squares[..., 2], f], axis=-1),
+            np.stack([c, e, f, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.where(np.isfinite(squares), squares, -1.0), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def rotation_from_quaternion(q: Array) -> Array:
+    """R (..., 3, 3) of a unit quaternion (w, x, y, z) (..., 4)."""
+    q = np.asarray(q, float)
+    w, v = q[..., :1, None], q[..., 1:]
+    S = skew(v)
+    return np.eye(3) + 2 * w * S + 2 * (S @ S)
+
+
+def continuous_quaternions(q: Array) -> Array:
+    """Signs of (n, 4) chosen so that neighbours lie in the same half space; NaN rows are passed over."""
+    q = np.array(q, float)
+    good = np.flatnonzero(np.isfinite(q).all(axis=-1))
+    if good.size == 0:
+        return q
+    dots = np.sum(q[good[1:]] * q[good[:-1]], axis=-1)
+    signs = np.concatenate([[1.0 if q[good[0], 0] >= 0 else -1.0], np.where(dots < 0, -1.0, 1.0)])
+    q[good] *= np.cumprod(signs)[:, None]
+    return q

@@ -1,0 +1,100 @@
+"""The measured motion of one recording, with what is needed to judge every frame of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import StereoRig
+from disctrack.disc import Disc
+
+Array = NDArray[np.float64]
+
+
+class FrameStatus(IntEnum):
+    """Why a frame has a pose, or has none; `sentence` is what a report prints."""
+
+    MEASURED = 0
+    ONE_CAMERA = 1
+    FEW_MARKERS = 2
+    MARKERS_NOT_FOUND = 3
+    NOT_CONVERGED = 4
+    UNREADABLE = 5
+    NOT_PROCESSED = 6
+
+    @property
+    def has_pose(self) -> bool:
+        """True where the pose is a number, perhaps with a large sigma."""
+        return self in (FrameStatus.MEASURED, FrameStatus.ONE_CAMERA, FrameStatus.FEW_MARKERS)
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return _FRAME_SENTENCES[self]
+
+
+_FRAME_SENTENCES = {
+    FrameStatus.MEASURED: "measured with both cameras",
+    FrameStatus.ONE_CAMERA: "measured with one camera: sigma along its view is large",
+    FrameStatus.FEW_MARKERS: "measured with fewer than 6 good dot images: sigma is larger",
+    FrameStatus.MARKERS_NOT_FOUND: "fewer than 3 dots found: outside the field, hidden, or blurred",
+    FrameStatus.NOT_CONVERGED: "no pose fits the dots: two exchanged, or the rig does not belong to this recording",
+    FrameStatus.UNREADABLE: "image file could not be read",
+    FrameStatus.NOT_PROCESSED: "not processed",
+}
+
+
+class MarkerStatus(IntEnum):
+    """Why a dot has a centre, or has none."""
+
+    MEASURED = 0
+    OUTSIDE = 1  # its window leaves the image
+    LOW_CONTRAST = 2
+    OCCLUDED = 3  # the grey values do not look like a dot: hidden in part, or a glare edge across it
+    NOT_CONVERGED = 4
+    BLURRED = 5
+    REJECTED = 6  # disagrees with the other dots of the frame
+    NOT_LOOKED_FOR = 7
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Pose of the disc in every frame of a recording; always as long as the recording.
+
+    n frames, m markers. NaN where there is no answer; `frame_status` tells why.
+    """
+
+    time: Array  # (n,) [s], mid exposure of frame i is i / frame_rate unless the camera said otherwise
+    frame: NDArray[np.int64]  # (n,) number of the frame in its sequence
+    q: Array  # (n, 6) x, y, z [m], psi, theta, phi [rad] unwrapped
+    pose_covariance: Array  # (n, 6, 6) noise of this frame, in POSE_COMPONENTS (frames.py); calibration not included
+    calibration_sensitivity: Array  # (n, 6, 30) d pose / d RIG_PARAMETERS at fixed pixels; common to all frames
+    quaternion: Array  # (n, 4) w, x, y, z; body to world, continuous
+    frame_status: NDArray[np.uint8]  # (n,) FrameStatus
+    reprojection_rms_px: Array  # (n, 2) per camera
+    reduced_chi_square: Array  # (n,) of the pose fit
+    markers_px: Array  # (n, 2, m, 2) centres: images of the dots' own centres, not of the ellipses'
+    markers_covariance_px2: Array  # (n, 2, m, 2, 2)
+    markers_residual_px: Array  # (n, 2, m, 2) observed - projected
+    marker_status: NDArray[np.uint8]  # (n, 2, m) MarkerStatus
+    disc: Disc  # with the marker centres that were used (refined ones if they were refined)
+    rig: StereoRig
+    frame_rate: float  # [Hz]
+    gravity: float  # [m/s^2]
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(n,) True where there is a pose."""
+        return np.isfinite(self.q).all(axis=1)
+
+    @property
+    def calibration_covariance(self) -> Array:
+        """(n, 6, 6) part of the pose's covariance that comes from the rig and is common to all frames."""
+        S = self.calibration_sensitivity
+        return S @ self.rig.covariance @ np.swapaxes(S, -1, -2)
