@@ -1,0 +1,128 @@
+"""What an effect is: a named part with parameters that is added to the ideal rolling disc.
+
+To add one, write a class in a module of this package: a name, its parameters, where it comes from, and either
+
+    law(p, s, w)         adds to the wrench `w` a moment, a load lever or a force (records.WRENCH), from parameters
+                         `p.<name>` and kinematics `s.<name>` (records.KINEMATICS). One expression for numbers, arrays
+                         and complex numbers alike: no `if`, no `abs`; use `magnitude`, `sign`, `np.sqrt`, `np.exp`.
+    adjust(body, p)      changes the body's constants (records.BODY) before the motion starts
+
+or both. Defining the class registers it: simulation, fitting and diagnosis take it from CATALOGUE.
+
+Signs: M is the moment of the table on the disc at the contact, in (n0, m0, k). Its power is
+M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O, and for a passive effect it is never positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from disctrack.errors import DiscTrackError
+
+CATALOGUE: dict[str, type[Effect]] = {}
+
+
+class ModelError(DiscTrackError):
+    """A model of the motion cannot be built: unknown effect or parameter, or a value outside its bounds."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect."""
+
+    name: str
+    unit: str
+    nominal: float  # a physically sensible size, and the scale for fits
+    meaning: str
+    null: float = 0.0  # value at which the effect is absent
+    lower: float = -np.inf
+    upper: float = np.inf
+    is_shape: bool = False  # exponent or scale of the law: meaningless without the amount, not fitted by default
+
+
+def magnitude(x: Any) -> Any:
+    """|x| that is analytic away from 0, so that imaginary parts carry the derivative."""
+    return np.sqrt(x * x)
+
+
+def sign(x: Any, width: float) -> Any:
+    """Sign of x, smoothed over `width`: x / sqrt(x^2 + width^2)."""
+    return x / np.sqrt(x * x + width * width)
+
+
+HELPERS = (magnitude, sign)
+
+
+class Effect:
+    """One addition to the ideal disc; an instance holds the values of its parameters."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    source: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    passive: ClassVar[bool] = True  # its power is never positive ...
+    counter_rotating: ClassVar[bool] = False  # ... provided that psidot phidot < 0, as in every rolling down
+    airborne: ClassVar[bool] = False  # acts also without contact
+    law: ClassVar[Any] = None  # static method law(p, s, w), or None
+    adjust: ClassVar[Any] = None  # static method adjust(body, p), or None
+
+    def __init_subclass__(cls) -> None:
+        if cls.name in CATALOGUE and CATALOGUE[cls.name].__qualname__ != cls.__qualname__:
+            raise ModelError(
+                f"two effects are called '{cls.name}': {CATALOGUE[cls.name].__qualname__}, {cls.__qualname__}"
+            )
+        CATALOGUE[cls.name] = cls
+
+    def __init__(self, **values: float) -> None:
+        """Values by parameter name, in the parameter's unit; those not given take their nominal value."""
+        known = [p.name for p in self.parameters]
+        for given in values:
+            if given not in known:
+                raise ModelError(f"effect '{self.name}' has no parameter '{given}'; it has {', '.join(known)}")
+        self._values = {p.name: float(values.get(p.name, p.nominal)) for p in self.parameters}
+        for p in self.parameters:
+            value = self._values[p.name]
+            if not p.lower <= value <= p.upper:
+                raise ModelError(
+                    f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
+                    + (
+                        ": a passive effect cannot feed the disc with energy"
+                        if self.passive and value < p.lower
+                        else ""
+                    )
+                )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by name."""
+        return dict(self._values)
+
+    @classmethod
+    def absent(cls) -> Effect:
+        """The effect with its amounts at null: it changes nothing, but its sensitivities can be asked for."""
+        return cls(**{p.name: p.nominal if p.is_shape else p.null for p in cls.parameters})
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self._values == getattr(other, "_values", None)
+
+    def __hash__(self) -> int:
+        return hash((self.name, tuple(self._values.items())))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self._values.items())})"
+
+
+def effect_class(name: str) -> type[Effect]:
+    """Class of the effect of this name; raises ModelError naming what there is."""
+    if name not in CATALOGUE:
+        raise ModelError(f"there is no effect '{name}'; the catalogue has {', '.join(sorted(CATALOGUE))}")
+    return CATALOGUE[name]
+
+
+def catalogue() -> Iterator[type[Effect]]:
+    """All effects in the order of their definition."""
+    return iter(CATALOGUE.values())

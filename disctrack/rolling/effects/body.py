@@ -1,0 +1,168 @@
+"""The disc, the table and gravity differ from what was declared."""
+
+from typing import Any
+
+import numpy as np
+
+from disctrack.rolling.effects.base import Effect, Parameter
+
+
+class TableTilt(Effect):
+    """Gravity is not along k: the table descends towards (i, j) with these slopes."""
+
+    name = "table_tilt"
+    title = "tilted table: horizontal part of gravity g (tilt_x, tilt_y)"
+    source = "geometry; k stays the normal of the table"
+    parameters = (
+        Parameter("tilt_x", "rad", 1e-3, "direction cosine of gravity along i", lower=-0.5, upper=0.5),
+        Parameter("tilt_y", "rad", 1e-3, "direction cosine of gravity along j", lower=-0.5, upper=0.5),
+    )
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        g = -body.g_z
+        body.g_x = g * p.tilt_x
+        body.g_y = g * p.tilt_y
+        body.g_z = -g * np.sqrt(1.0 - p.tilt_x * p.tilt_x - p.tilt_y * p.tilt_y)
+
+
+class Gravity(Effect):
+    """Gravity differs from the declared value; indistinguishable from a wrong frame rate."""
+
+    name = "gravity"
+    title = "gravity differs by g_error"
+    source = "local value of g"
+    parameters = (Parameter("g_error", "m/s^2", 0.01, "gravity minus the declared one", lower=-5.0, upper=5.0),)
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        g = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
+        factor = 1.0 + p.g_error / g
+        body.g_x, body.g_y, body.g_z = factor * body.g_x, factor * body.g_y, factor * body.g_z
+
+
+class CentreOfMass(Effect):
+    """The centre of mass is not the geometric centre; inertia is that about the centre of mass."""
+
+    name = "centre_of_mass"
+    title = "centre of mass at (c_1, c_2, c_3) from the geometric centre, body axes"
+    source = "rigid-body mechanics; c_3 along e3"
+    parameters = (
+        Parameter("c_1", "m", 1e-4, "along the first body axis"),
+        Parameter("c_2", "m", 1e-4, "along the second body axis"),
+        Parameter("c_3", "m", 1e-4, "along the axis of the disc, towards the upper face"),
+    )
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.com_1 = body.com_1 + p.c_1
+        body.com_2 = body.com_2 + p.c_2
+        body.com_3 = body.com_3 + p.c_3
+
+
+class ContactRadius(Effect):
+    """The circle of contact has another radius; mass and inertia stay."""
+
+    name = "contact_radius"
+    title = "radius of the contact circle differs by r_error"
+    source = "geometry (chamfer, burr, micrometer error)"
+    parameters = (Parameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),)
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.radius = body.radius + p.r_error
+
+
+class ContactHeight(Effect):
+    """The contact circle lies at another distance below the centre; mass and inertia stay."""
+
+    name = "contact_height"
+    title = "half thickness at the contact differs by h_error"
+    source = "geometry (paper, chamfer, micrometer error)"
+    parameters = (Parameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),)
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.half_thickness = body.half_thickness + p.h_error
+
+
+class RoundedEdge(Effect):
+    """The edge is a quarter of a torus: the contact wanders over it with the nutation."""
+
+    name = "edge_radius"
+    title = "edge rounded with radius rho"
+    source = "geometry: r_OA = -(r - rho) e2 - (h - rho) e3 - rho k"
+    parameters = (Parameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),)
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.edge_radius = body.edge_radius + p.rho
+
+
+class DiametralInertia(Effect):
+    """J1 = J2 differ from the homogeneous disc's."""
+
+    name = "inertia_diametral"
+    title = "J1 and J2 multiplied by 1 + e"
+    source = "holes, rims, inhomogeneous material"
+    parameters = (Parameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),)
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.J_11 = body.J_11 * (1.0 + p.e)
+        body.J_22 = body.J_22 * (1.0 + p.e)
+
+
+class AxialInertia(Effect):
+    """J3 differs from the homogeneous disc's."""
+
+    name = "inertia_axial"
+    title = "J3 multiplied by 1 + e"
+    source = "holes, rims, inhomogeneous material"
+    parameters = (Parameter("e", "1", 0.01, "relative change of J3", lower=-0.5, upper=1.0),)
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.J_33 = body.J_33 * (1.0 + p.e)
+
+
+class InertiaProduct(Effect):
+    """Products of inertia with the axis: dynamic imbalance of a wedge-shaped disc."""
+
+    name = "inertia_product"
+    title = "products of inertia J_13 = e_13 J3, J_23 = e_23 J3"
+    source = "wedge, dynamic imbalance"
+    parameters = (
+        Parameter("e_13", "1", 1e-4, "J_13 / J3", lower=-0.2, upper=0.2),
+        Parameter("e_23", "1", 1e-4, "J_23 / J3", lower=-0.2, upper=0.2),
+    )
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.J_13 = body.J_13 + p.e_13 * body.J_33
+        body.J_23 = body.J_23 + p.e_23 * body.J_33
+
+
+class Slip(Effect):
+    """Coulomb friction of finite coefficient: the disc slips where rolling would need more."""
+
+    name = "slip"
+    title = "Coulomb friction, |F_t| <= mu F_z, F_t = -mu F_z v_A / |v_A| in slip"
+    source = "Coulomb's law at the contact"
+    parameters = (
+        Parameter("mu", "1", 0.2, "coefficient of friction; infinite = never slips", null=np.inf, lower=1e-3),
+    )
+    passive = False  # acts through the constraint force, not through the wrench of a law
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.inverse_friction = 1.0 / p.mu

@@ -1,0 +1,226 @@
+"""Newton-Euler equations of a rigid disc on a plane: pure rolling, slipping with Coulomb friction, free flight.
+
+Vectors are nodal components (frames.py). With G the centre of mass, O the geometric centre, A the contact,
+D = r_GA = r_OA - r_OG, omega the angular velocity of the body, Omega that of the nodal frame, X a force at O:
+
+    m a_G = F + m g + X,      J omegadot + omega x J omega = D x F + M - r_OG x X,      M = M_0 + F_z L
+    r_OA = a - rho k,         a = -(r - rho) e2 - (h - rho) e3          (rho: radius of the rounded edge, 0 = sharp)
+
+Contact keeps A at the table's height, rolling also at rest: v_O = -omega x r_OA, and d(r_OA)/dt = Omega x a since k is
+constant, hence  F = f0 - m omegadot x D  with  f0 = m (omega x (omega x r_OG) - omega x (Omega x a)) - m g - X,  and
+
+    rolling    [J + m (|D|^2 - D D') + m L (D x k)'] omegadot = -omega x J omega + D x f0 + M_0 + L f0_z - r_OG x X
+    slipping   F = F_z d,  d = k - mu v_A / |v_A|,   F_z = f0_z - m (D x k) . omegadot
+               [J + m (D x d + L) (D x k)'] omegadot = -omega x J omega + (D x d + L) f0_z + M_0 - r_OG x X
+    flying     F = 0, M = M_0
+
+F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
+edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
+thetadot, and (2.7) taken with Omega, the rate of the frame, not omega, that of the body.
+
+The functions are written for float and for complex numbers: an imaginary part of 1e-30 carries an exact derivative.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from disctrack.rolling._compiled import call_law
+
+ROLLING, SLIPPING, FLYING = 0, 1, 2
+EVENTS = ("theta_end", "load", "grip", "upright")
+N_EVENTS = len(EVENTS)
+STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
+LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
+
+# table: integers shared by all functions: regime, number of laws, addresses of kinematics and wrench, then the address
+# of each law and of its parameters.
+HEADER = 4
+
+
+@njit
+def _cross(a: Any, b: Any) -> Any:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@njit
+def _dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit
+def _add(a: Any, b: Any) -> Any:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@njit
+def _scale(f: Any, a: Any) -> Any:
+    return (f * a[0], f * a[1], f * a[2])
+
+
+@njit
+def _nodal(n: Any, m: Any, z: Any, s: Any, c: Any) -> Any:
+    """(n0, m0, k) -> (e1, e2, e3): n0 = e1, m0 = c e2 - s e3, k = s e2 + c e3."""
+    return (n, m * c + z * s, z * c - m * s)
+
+
+@njit
+def _solve(rows: Any, b: Any) -> Any:
+    """3 x 3 system by Cramer's rule."""
+    r0, r1, r2 = rows
+    c0, c1, c2 = _cross(r1, r2), _cross(r2, r0), _cross(r0, r1)
+    x = _add(_scale(b[0], c0), _add(_scale(b[1], c1), _scale(b[2], c2)))
+    return _scale(1.0 / _dot(r0, c0), x)
+
+
+@njit
+def _contact_arm(body: Any, s: Any, c: Any) -> Any:
+    """r_OA and its part a that turns with the nodal frame, nodal components."""
+    rho = body.edge_radius
+    a2, a3 = rho - body.radius, rho - body.half_thickness
+    zero = 0.0 * s
+    return (zero, a2 - rho * s, a3 - rho * c), (zero, a2, a3)
+
+
+@njit
+def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
+    """Fills the record of kinematic quantities from the state."""
+    psi, theta = y[2], y[3]
+    s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
+    w1, w2, w3 = y[5], y[6], y[7]
+    arm, _ = _contact_arm(body, s, c)
+    turn = _cross((w1, w2, w3), arm)  # omega x r_OA
+    turn_n, turn_m, turn_z = turn[0], c * turn[1] - s * turn[2], s * turn[1] + c * turn[2]
+    k.time, k.x, k.y, k.psi, k.theta, k.phi = t[0], y[0], y[1], psi, theta, y[4]
+    k.sin_theta, k.cos_theta, k.thetadot, k.omega2, k.omega3 = s, c, w1, w2, w3
+    k.psidot = w2 / s
+    k.phidot = w3 - w2 * c / s
+    k.omega_z = w2 * s + w3 * c
+    k.z, k.v_n, k.v_m, k.v_z = -(s * arm[1] + c * arm[2]), -turn_n, -turn_m, -turn_z
+    if regime != ROLLING:
+        k.v_n, k.v_m = y[8] * cp + y[9] * sp, y[9] * cp - y[8] * sp
+    if regime == FLYING:
+        k.z, k.v_z = y[10], y[11]
+    k.slip_n, k.slip_m = k.v_n + turn_n, k.v_m + turn_m
+    k.radius, k.half_thickness, k.mass = body.radius, body.half_thickness, body.mass
+    k.gravity = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
+
+
+@njit
+def _apply_laws(table: Any, w: Any) -> None:
+    w.M_n = w.M_m = w.M_z = 0.0
+    w.load_n = w.load_m = w.load_z = 0.0
+    w.X_n = w.X_m = w.X_z = 0.0
+    for i in range(table[1]):
+        call_law(table[HEADER + 2 * i], table[HEADER + 1 + 2 * i], table[2], table[3])
+
+
+@njit
+def _inertia_rows(body: Any, phi: Any) -> Any:
+    """Inertia about G in nodal axes, from body axes turned by the spin angle."""
+    c, s = np.cos(phi), np.sin(phi)
+    J11 = c * c * body.J_11 - 2 * c * s * body.J_12 + s * s * body.J_22
+    J22 = s * s * body.J_11 + 2 * c * s * body.J_12 + c * c * body.J_22
+    J12 = c * s * (body.J_11 - body.J_22) + (c * c - s * s) * body.J_12
+    J13, J23 = c * body.J_13 - s * body.J_23, s * body.J_13 + c * body.J_23
+    return (J11, J12, J13), (J12, J22, J23), (J13, J23, body.J_33)
+
+
+@njit
+def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
+    """Omegadot and acceleration of O (vectors, nodal components); writes the contact force into the record."""
+    s, c, m = kin.sin_theta, kin.cos_theta, body.mass
+    omega = (y[5], y[6], y[7])
+    frame = (y[5], y[6], y[6] * c / s)
+    k = (0.0 * s, s, c)
+    arm, a = _contact_arm(body, s, c)
+    cf, sf = np.cos(kin.phi), np.sin(kin.phi)
+    com = (body.com_1 * cf - body.com_2 * sf, body.com_1 * sf + body.com_2 * cf, body.com_3)
+    D = _add(arm, _scale(-1.0, com))
+    sp, cp = np.sin(kin.psi), np.cos(kin.psi)
+    g = _nodal(body.g_x * cp + body.g_y * sp, body.g_y * cp - body.g_x * sp, body.g_z, s, c)
+    X = _nodal(w.X_n, w.X_m, w.X_z, s, c)
+    M0 = _nodal(w.M_n, w.M_m, w.M_z, s, c)
+    L = _nodal(w.load_n, w.load_m, w.load_z, s, c)
+    centripetal_G = _cross(omega, _cross(omega, com))
+    centripetal_A = _cross(omega, _cross(frame, a))
+    weight = _add(_scale(m, g), X)
+    f0 = _add(_scale(m, _add(centripetal_G, _scale(-1.0, centripetal_A))), _scale(-1.0, weight))
+    f0_z = _dot(k, f0)
+    J0, J1, J2 = _inertia_rows(body, kin.phi)
+    H = (_dot(J0, omega), _dot(J1, omega), _dot(J2, omega))
+    b = _add(_add(M0, _scale(-1.0, _cross(omega, H))), _scale(-1.0, _cross(com, X)))
+    Dk = _scale(m, _cross(D, k))
+    if regime == ROLLING:
+        DD = m * _dot(D, D)
+        J0 = _add(_add(J0, (DD, 0.0 * DD, 0.0 * DD)), _add(_scale(-m * D[0], D), _scale(L[0], Dk)))
+        J1 = _add(_add(J1, (0.0 * DD, DD, 0.0 * DD)), _add(_scale(-m * D[1], D), _scale(L[1], Dk)))
+        J2 = _add(_add(J2, (0.0 * DD, 0.0 * DD, DD)), _add(_scale(-m * D[2], D), _scale(L[2], Dk)))
+        b = _add(b, _add(_cross(D, f0), _scale(f0_z, L)))
+        omegadot = _solve((J0, J1, J2), b)
+        F = _add(f0, _scale(-m, _cross(omegadot, D)))
+        a_O = _scale(-1.0, _add(_cross(omegadot, arm), centripetal_A))
+    else:
+        d = k
+        if regime == SLIPPING:
+            v = body.inverse_friction * np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m)
+            d = _nodal(-kin.slip_n / v, -kin.slip_m / v, 1.0 + 0.0 * v, s, c)
+            B = _add(_cross(D, d), L)
+            J0, J1, J2 = _add(J0, _scale(B[0], Dk)), _add(J1, _scale(B[1], Dk)), _add(J2, _scale(B[2], Dk))
+            b = _add(b, _scale(f0_z, B))
+        omegadot = _solve((J0, J1, J2), b)
+        load = f0_z - _dot(Dk, omegadot)
+        if regime == FLYING:
+            load = 0.0 * load
+        F = _scale(load, d)
+        a_G = _scale(1.0 / m, _add(F, weight))
+        a_O = _add(a_G, _scale(-1.0, _add(_cross(omegadot, com), centripetal_G)))
+    w.F_n, w.F_m, w.F_z = F[0], c * F[1] - s * F[2], s * F[1] + c * F[2]
+    return omegadot, frame, a_O
+
+
+@njit
+def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    _kinematics(table[0], t, y, body, kin)
+    _apply_laws(table, wrench)
+    return _accelerations(table[0], y, body, kin, wrench)
+
+
+def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
+    """Time derivative of the state; fills kinematics and wrench on the way."""
+    omegadot, frame, a_O = _evaluate(t, y, table, body, kin, wrench)
+    s, c, sp, cp = kin.sin_theta, kin.cos_theta, np.sin(kin.psi), np.cos(kin.psi)
+    # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
+    relative = _cross(frame, (y[5], y[6], y[7]))
+    ydot[0], ydot[1] = kin.v_n * cp - kin.v_m * sp, kin.v_n * sp + kin.v_m * cp
+    ydot[2], ydot[3], ydot[4] = kin.psidot, kin.thetadot, kin.phidot
+    ydot[5], ydot[6], ydot[7] = omegadot[0] - relative[0], omegadot[1] - relative[1], omegadot[2] - relative[2]
+    if table[0] != ROLLING:
+        a_n, a_m = a_O[0], c * a_O[1] - s * a_O[2]
+        ydot[8], ydot[9] = a_n * cp - a_m * sp, a_n * sp + a_m * cp
+    if table[0] == FLYING:
+        ydot[10], ydot[11] = kin.v_z, s * a_O[1] + c * a_O[2]
+
+
+def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
+    """Margins (EVENTS) that are positive while the regime lasts.
+
+    theta_end: nutation above its end. load: F_z, or in flight the gap. grip: rolling F_z - |F_t|/mu, slipping the slip
+    speed. upright: the lower rim alone touches; beyond pi/2 it would be the other one.
+    """
+    _evaluate(t, y, table, body, kin, wrench)
+    margin[0] = kin.theta - body.theta_end
+    margin[3] = 0.5 * np.pi - kin.theta
+    margin[1] = wrench.F_z
+    margin[2] = 1.0 + 0.0 * kin.theta
+    if table[0] == ROLLING:
+        tangential = np.sqrt(wrench.F_n * wrench.F_n + wrench.F_m * wrench.F_m)
+        margin[2] = wrench.F_z - body.inverse_friction * tangential
+    if table[0] == SLIPPING:
+        margin[2] = np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m) - STICK_SPEED
+    if table[0] == FLYING:
+        arm, _ = _contact_arm(body, kin.sin_theta, kin.cos_theta)
+        margin[1] = kin.z + kin.sin_theta * arm[1] + kin.cos_theta * arm[2] + LIFT_OFF_GAP

@@ -1,0 +1,317 @@
+"""Runge-Kutta method of order 8 with dense output (coefficients: SciPy's DOP853) and events, compiled.
+
+It has never heard of discs: the system and its event margins are C functions by address. Numbers may be complex: the
+step control looks at real parts only, so that an imaginary part of 1e-30 is carried along the very steps of the real
+solution and is the exact derivative of the numerical one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.integrate import DOP853
+
+from disctrack.rolling._compiled import call_system
+
+REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
+
+_N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 serve the dense output
+_A_ALL = np.zeros((_N + 4, _N + 4))
+_A_ALL[:_N, :_N] = DOP853.A[:_N, :_N]
+_A_ALL[_N + 1 :] = DOP853.A_EXTRA
+_C_ALL = np.concatenate([DOP853.C[:_N], [1.0], DOP853.C_EXTRA])
+_TABLEAU = tuple(np.ascontiguousarray(a) for a in (_A_ALL, DOP853.B, _C_ALL, DOP853.E3, DOP853.E5, DOP853.D))
+
+
+@dataclass(frozen=True)
+class System:
+    """Addresses of the rates and of the event margins, and the four addresses that both are called with."""
+
+    rates: int
+    margins: int
+    n_margins: int
+    arguments: NDArray[np.int64]  # (4,)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Solution up to the end of the grid or to the first event; real or complex like its start."""
+
+    status: int
+    n_filled: int  # grid points reached
+    y: NDArray[Any]  # (n_grid, n)
+    t_last: Any  # instant of the event, or the last grid point
+    y_last: NDArray[Any]  # (n,)
+    event: int  # number of the margin that ran out, or -1
+    n_steps: int
+
+
+def integrate(
+    system: System,
+    t0: Any,
+    y0: NDArray[Any],
+    grid: NDArray[np.float64],
+    rtol: float,
+    atol: NDArray[np.float64],
+    max_steps: int = 200_000,
+) -> Stretch:
+    """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.
+
+    grid : (n_grid,) increasing, none before t0.   atol : (n,)
+    """
+    kind = y0.dtype
+    solution = np.full((len(grid), len(y0)), np.nan, kind)
+    t_last, y_last = np.array([t0], kind), y0.copy()
+    status, n_filled, event, n_steps = _dop853(
+        system.rates,
+        system.margins,
+        system.arguments,
+        np.array([t0], kind),
+        y0,
+        grid,
+        rtol,
+        atol,
+        max_steps,
+        _TABLEAU,
+        solution,
+        np.zeros(system.n_margins, kind),
+        t_last,
+        y_last,
+    )
+    return Stretch(status, n_filled, solution, t_last[0], y_last, event, n_steps)
+
+
+@njit
+def _call(function: int, t: Any, y: Any, out: Any, t_box: Any, args: Any) -> None:
+    t_box[0] = t
+    call_system(function, t_box.ctypes.data, y.ctypes.data, out.ctypes.data, args[0], args[1], args[2], args[3])
+
+
+@njit
+def _stages(
+    rates: int, args: Any, t: Any, y: Any, h: Any, first: int, last: int, A: Any, C: Any, K: Any, box: Any
+) -> None:
+    """K[i] = f(t + c_i h, y + h sum_j a_ij K_j) for first <= i < last."""
+    y_stage, t_box = box
+    for i in range(first, last):
+        for k in range(y.size):
+            total = A[i, 0] * K[0, k]
+            for j in range(1, i):
+                total += A[i, j] * K[j, k]
+            y_stage[k] = y[k] + h * total
+        _call(rates, t + C[i] * h, y_stage, K[i], t_box, args)
+
+
+@njit
+def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, box: Any, y_new: Any) -> None:
+    """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
+    A, B, C, _, _, _ = tableau
+    _stages(rates, args, t, y, h, 1, B.size, A, C, K, box)
+    for k in range(y.size):
+        total = B[0] * K[0, k]
+        for i in range(1, B.size):
+            total += B[i] * K[i, k]
+        y_new[k] = y[k] + h * total
+
+
+@njit
+def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float, atol: Any) -> float:
+    """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance."""
+    _, _, _, E3, E5, _ = tableau
+    sum5, sum3 = 0.0, 0.0
+    for k in range(y.size):
+        e5, e3 = 0.0, 0.0
+        for i in range(E5.size):
+            e5 += E5[i] * K[i, k].real
+            e3 += E3[i] * K[i, k].real
+        scale = atol[k] + rtol * max(abs(y[k].real), abs(y_new[k].real))
+        sum5 += (e5 / scale) ** 2
+        sum3 += (e3 / scale) ** 2
+    if sum5 == 0.0 and sum3 == 0.0:
+        return 0.0
+    return abs(h) * sum5 / np.sqrt((sum5 + 0.01 * sum3) * y.size)
+
+
+@njit
+def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
+    """Coefficients F (7, n) of the polynomial of degree 7 through the step."""
+    for k in range(y.size):
+        difference = y_new[k] - y[k]
+        F[0, k] = difference
+        F[1, k] = h * K[0, k] - difference
+        F[2, k] = 2.0 * difference - h * (K[12, k] + K[0, k])
+        for row in range(D.shape[0]):
+            total = D[row, 0] * K[0, k]
+            for i in range(1, D.shape[1]):
+                total += D[row, i] * K[i, k]
+            F[3 + row, k] = h * total
+
+
+@njit
+def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
+    """Value at the fraction x of the step, by nested factors x, 1 - x, x, ..."""
+    for k in range(y.size):
+        total = 0.0 * F[0, k]
+        for i in range(F.shape[0]):
+            total = (total + F[6 - i, k]) * (x if i % 2 == 0 else 1.0 - x)
+        out[k] = y[k] + total
+
+
+@njit
+def _locate(
+    system: Any,
+    args: Any,
+    e: int,
+    t: Any,
+    y: Any,
+    h_max: float,
+    tableau: Any,
+    K: Any,
+    box: Any,
+    y_new: Any,
+    margin: Any,
+) -> float:
+    """Length of the step after which margin e has just run out, by bisection; inf if it has not after h_max."""
+    rates, margins = system
+    unit = 0.0 * y[0] + 1.0
+    low, high, trial = 0.0, h_max, h_max
+    for i in range(60):
+        _step(rates, args, t, y, trial * unit, tableau, K, box, y_new)
+        _call(margins, t + trial * unit, y_new, margin, box[1], args)
+        if margin[e].real > 0.0:
+            if i == 0:
+                return np.inf
+            low = trial
+        else:
+            high = trial
+        trial = 0.5 * (low + high)
+        if trial in (low, high) or high - low < 1e-16:
+            break
+    return high
+
+
+@njit
+def _first_event(
+    system: Any,
+    args: Any,
+    t: Any,
+    y: Any,
+    h: float,
+    tableau: Any,
+    K: Any,
+    box: Any,
+    y_new: Any,
+    before: Any,
+    after: Any,
+) -> Any:
+    """Number and step length of the earliest margin that ran out within the step, or (-1, h)."""
+    event, ran_out = -1, np.zeros(after.size, np.bool_)
+    for e in range(after.size):
+        ran_out[e] = before[e].real > 0.0 and after[e].real <= 0.0
+    for e in range(after.size):
+        if ran_out[e]:
+            root = _locate(system, args, e, t, y, h, tableau, K, box, y_new, after)
+            if root <= h:
+                event, h = e, root
+    return event, h
+
+
+@njit(cache=True, nogil=True)
+def _dop853(
+    rates: int,
+    margins: int,
+    args: Any,
+    t0: Any,
+    y0: Any,
+    grid: Any,
+    rtol: float,
+    atol: Any,
+    max_steps: int,
+    tableau: Any,
+    solution: Any,
+    margin: Any,
+    t_last: Any,
+    y_last: Any,
+) -> Any:
+    A, B, C, _, _, D = tableau
+    n, n_stages = y0.size, B.size
+    unit = 0.0 * y0[0] + 1.0  # one, in the kind of number of the state
+    K, F = np.zeros((C.size, n), y0.dtype), np.zeros((7, n), y0.dtype)
+    y, y_new, margin_new = y0.copy(), y0.copy(), margin.copy()
+    box = (y0.copy(), t0.copy())
+    t = t0[0]
+    _call(rates, t, y, K[0], box[1], args)
+    _call(margins, t, y, margin, box[1], args)
+    steepest = 0.0
+    for k in range(n):
+        steepest = max(steepest, abs(K[0, k].real) / (atol[k] * 1e6 + abs(y[k].real)))
+    h_next, i_grid = 0.01 / (1.0 + steepest), 0
+    for steps in range(max_steps):
+        t_last[0], y_last[:] = t, y
+        if i_grid == grid.size:
+            return 0, i_grid, -1, steps
+        room = grid[-1] - t
+        h = room if room.real <= h_next else h_next * unit
+        if room.real < 1e-15:  # the last points coincide with t up to rounding
+            while i_grid < grid.size:
+                solution[i_grid] = y
+                i_grid += 1
+            continue
+        _step(rates, args, t, y, h, tableau, K, box, y_new)
+        error = _error_norm(y, y_new, h.real, K, tableau, rtol, atol)
+        if not error <= 1.0:  # also when not a number
+            h_next = h.real * (max(0.2, 0.9 * error**-0.125) if np.isfinite(error) else 0.1)
+            if h_next < 1e-15:
+                return 3, i_grid, -1, steps
+            continue
+        h_next = h.real * (5.0 if error == 0.0 else min(5.0, 0.9 * error**-0.125))
+        _call(margins, t + h, y_new, margin_new, box[1], args)
+        event, h_event = _first_event((rates, margins), args, t, y, h.real, tableau, K, box, y_new, margin, margin_new)
+        if event >= 0:
+            h = h_event * unit
+            _step(rates, args, t, y, h, tableau, K, box, y_new)
+        _call(rates, t + h, y_new, K[n_stages], box[1], args)
+        if i_grid < grid.size and grid[i_grid] <= (t + h).real:
+            _stages(rates, args, t, y, h, n_stages + 1, C.size, A, C, K, box)
+            _interpolant(y, y_new, h, K, D, F)
+            while i_grid < grid.size and grid[i_grid] <= (t + h).real:
+                _interpolate(y, F, (grid[i_grid] - t) / h, solution[i_grid])
+                i_grid += 1
+        t, y[:] = t + h, y_new
+        if event >= 0:
+            t_last[0], y_last[:] = t, y
+            return 1, i_grid, event, steps
+        K[0], margin[:] = K[n_stages], margin_new
+    return 2, i_grid, -1, max_steps
+
+
+@njit(cache=True)
+def _evaluate(
+    function: int, args: Any, t: Any, Y: Any, out: Any, first: Any, second: Any, firsts: Any, seconds: Any
+) -> None:
+    t_box = t[:1].copy()
+    for i in range(len(t)):
+        _call(function, t[i], Y[i], out[i], t_box, args)
+        firsts[i], seconds[i] = first[0], second[0]
+
+
+def evaluate(
+    function: int,
+    arguments: NDArray[np.int64],
+    t: NDArray[Any],
+    Y: NDArray[Any],
+    n_out: int,
+    scratch: tuple[NDArray[Any], NDArray[Any]],
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Call a system function at many states; also returns the two scratch records (1,) as they are after each call.
+
+    t : (n,), Y : (n, n_y) -> (n, n_out), (n,), (n,)
+    """
+    out = np.zeros((len(t), n_out), Y.dtype)
+    records = [np.zeros(len(t), s.dtype) for s in scratch]
+    _evaluate(function, arguments, t.astype(Y.dtype), np.ascontiguousarray(Y), out, *scratch, *records)
+    return out, records[0], records[1]

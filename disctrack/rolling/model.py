@@ -1,0 +1,97 @@
+"""A model of the motion: the declared disc and gravity, and the effects that are added to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from disctrack.disc import Disc
+from disctrack.rolling.effects import Effect, ModelError, Parameter, effect_class
+from disctrack.rolling.records import BODY
+
+DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper
+
+
+@dataclass(frozen=True)
+class Model:
+    """Disc, gravity and effects; parameters are addressed as "effect.parameter"."""
+
+    disc: Disc
+    gravity: float = 9.81  # [m/s^2] along -k, unless an effect says otherwise
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "effects", tuple(self.effects))
+        names = [effect.name for effect in self.effects]
+        for name in names:
+            if names.count(name) > 1:
+                raise ModelError(f"effect '{name}' is in the model twice: give it once, with the sum of its amounts")
+        if not (np.isfinite(self.gravity) and self.gravity > 0):
+            raise ModelError(f"gravity is {self.gravity} m/s^2: expected a positive number")
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by "effect.parameter"."""
+        return {f"{e.name}.{k}": v for e in self.effects for k, v in e.values.items()}
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Parameters by "effect.parameter"."""
+        return {f"{e.name}.{p.name}": p for e in self.effects for p in e.parameters}
+
+    def effect(self, name: str) -> Effect | None:
+        """The effect of this name, or None."""
+        return next((e for e in self.effects if e.name == name), None)
+
+    def with_effects(self, *effects: Effect) -> Model:
+        """Copy in which these effects replace those of the same name, or are appended."""
+        new = {e.name: e for e in self.effects} | {e.name: e for e in effects}
+        return replace(self, effects=tuple(new.values()))
+
+    def without(self, *names: str) -> Model:
+        """Copy without the effects of these names."""
+        return replace(self, effects=tuple(e for e in self.effects if e.name not in names))
+
+    def with_values(self, values: Mapping[str, float]) -> Model:
+        """Copy with new values by "effect.parameter"; an effect that is not in the model is added, absent otherwise."""
+        new = {e.name: dict(e.values) for e in self.effects}
+        for full_name, value in values.items():
+            effect, parameter = split_name(full_name)
+            new.setdefault(effect, effect_class(effect).absent().values)[parameter] = value
+        return replace(self, effects=tuple(effect_class(name)(**v) for name, v in new.items()))
+
+
+def split_name(full_name: str) -> tuple[str, str]:
+    """("effect", "parameter") of "effect.parameter"; raises ModelError where the catalogue has no such parameter."""
+    effect, _, parameter = full_name.partition(".")
+    known = [p.name for p in effect_class(effect).parameters]
+    if parameter not in known:
+        raise ModelError(f"'{full_name}' is no parameter; effect '{effect}' has {', '.join(known)}")
+    return effect, parameter
+
+
+def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Constants of records.BODY with all adjustments; numbers are complex where `values` (by full name) are."""
+    disc = model.disc
+    body = SimpleNamespace(**dict.fromkeys(BODY, 0.0))
+    body.mass, body.radius, body.half_thickness = disc.mass, disc.radius, disc.half_thickness
+    body.J_11 = body.J_22 = disc.moment_diametral
+    body.J_33 = disc.moment_axial
+    body.g_z = -model.gravity
+    body.theta_end = theta_end
+    for effect in model.effects:
+        if effect.adjust is not None:
+            effect.adjust(body, SimpleNamespace(**effect_values(effect, values)))
+    return vars(body)
+
+
+def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Parameter values of one effect, those in `values` (by full name) taking precedence."""
+    own: dict[str, Any] = effect.values
+    for name in own:
+        own[name] = (values or {}).get(f"{effect.name}.{name}", own[name])
+    return own

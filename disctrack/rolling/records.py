@@ -1,0 +1,89 @@
+"""The quantities that the equations of motion and the effects share, by name.
+
+They travel as NumPy records, so that compiled code and plain Python read them alike: `s.psidot`, `w.M_m`.
+
+State vector y (SI, radians), of which each regime integrates the first 8, 10 or 12 entries:
+    rolling   x, y, psi, theta, phi, omega1 = thetadot, omega2 = psidot sin(theta), omega3 = psidot cos(theta) + phidot
+    slipping  the same, and v_x, v_y: the horizontal velocity of the geometric centre O in world axes
+    flying    the same, and z, v_z of O
+    x, y belong to O. omega is in the nodal frame (frames.py); omega2 stays small and smooth where psidot grows without
+    bound. In contact z follows from theta, and in rolling the velocity of O from omega, so they cannot drift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+STATE_COMPONENTS = ("x", "y", "psi", "theta", "phi", "thetadot", "omega2", "omega3", "v_x", "v_y", "z", "v_z")
+ROLLING_COMPONENTS = STATE_COMPONENTS[:8]
+
+# Read by the laws of the effects. Vectors are in the contact frame (n0, m0, k), n0 = e1, m0 = k x n0.
+KINEMATICS = (
+    "time",
+    "x",  # O in world axes [m]
+    "y",
+    "z",
+    "psi",  # precession, nutation, spin [rad]
+    "theta",
+    "phi",
+    "sin_theta",
+    "cos_theta",
+    "thetadot",  # [rad/s]
+    "psidot",
+    "phidot",
+    "omega2",  # psidot sin(theta)
+    "omega3",  # psidot cos(theta) + phidot
+    "omega_z",  # psidot + phidot cos(theta)
+    "v_n",  # velocity of O [m/s]
+    "v_m",
+    "v_z",
+    "slip_n",  # velocity of the disc's material point at the contact [m/s]; zero in pure rolling
+    "slip_m",
+    "radius",  # of the contact circle [m]
+    "half_thickness",
+    "mass",
+    "gravity",  # magnitude [m/s^2]
+)
+
+# Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k). F is the answer.
+WRENCH = (
+    "M_n",  # moments that do not depend on the load [N m]
+    "M_m",
+    "M_z",
+    "load_n",  # moments per unit of normal force: lever arms [m]
+    "load_m",
+    "load_z",
+    "X_n",  # force on the centre O [N]
+    "X_m",
+    "X_z",
+    "F_n",  # contact force on the disc [N], solved from the equations of motion; not to be set by a law
+    "F_m",
+    "F_z",
+)
+
+# Constants of one body on one table. Inertia about the centre of mass in body axes.
+BODY = (
+    "mass",
+    "radius",  # r: the contact runs on the circle of this radius ...
+    "half_thickness",  # ... this far below O along -e3
+    "edge_radius",  # of the rounded edge; 0 = sharp
+    "com_1",  # centre of mass from O in body axes [m]
+    "com_2",
+    "com_3",
+    "J_11",
+    "J_22",
+    "J_33",
+    "J_12",
+    "J_13",
+    "J_23",
+    "g_x",  # gravity in world axes [m/s^2]
+    "g_y",
+    "g_z",
+    "inverse_friction",  # 1/mu of Coulomb's law; 0 = never slips
+    "theta_end",  # the motion ends here [rad]
+)
+
+
+def record_dtype(names: tuple[str, ...], scalar: type) -> np.dtype:
+    """Aligned record of equal scalars (float or complex)."""
+    return np.dtype([(name, scalar) for name in names], align=True)

@@ -1,0 +1,87 @@
+"""Exact derivatives of the motion with respect to its initial state and to the parameters of its effects.
+
+Each column is one more run of the same compiled integrator with an imaginary part of 1e-30 on one number (complex-step
+derivative): exact to rounding for the numerical solution, on the very steps of the real one, and including the way in
+which the instants of the switches between rolling, slip and flight move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from disctrack.rolling._assembly import Assembly
+from disctrack.rolling.model import DEFAULT_THETA_END, Model
+from disctrack.rolling.motion import coordinates
+from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS
+from disctrack.rolling.simulate import RTOL, _grid, _start, check_in_model, follow
+from disctrack.rolling.state import State
+
+Array = NDArray[np.float64]
+_SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """Motion at n times and its derivatives with respect to k numbers; NaN after the end of the motion."""
+
+    time: Array  # (n,)
+    q: Array  # (n, 6)
+    qdot: Array  # (n, 6)
+    names: tuple[str, ...]  # (k,) components of the state, then "effect.parameter"
+    dq: Array  # (n, 6, k) in the unit of q per unit of the number
+    dqdot: Array  # (n, 6, k)
+
+
+def sensitivities(
+    model: Model,
+    state: State,
+    times: ArrayLike,
+    parameters: Sequence[str] = (),
+    components: Sequence[str] | None = None,
+    theta_end: float = DEFAULT_THETA_END,
+    rtol: float = RTOL,
+) -> Sensitivities:
+    """D q(t), d qdot(t) by initial state and parameters.
+
+    parameters : "effect.parameter" names; an effect that is not in the model is taken at its null value.
+    components : of records.STATE_COMPONENTS; all that the state has if not given.
+    """
+    grid = _grid(None, 0.0, times)
+    y0 = _start(state, theta_end)
+    enlarged = model.with_values({name: value for name, value in _missing(model, parameters).items()})
+    check_in_model(enlarged, list(parameters))
+    components = STATE_COMPONENTS[: len(y0)] if components is None else components
+    names = (*components, *parameters)
+    dq, dqdot = np.full((2, len(grid), 6, len(names)), np.nan)
+    q, qdot = np.full((2, len(grid), 6), np.nan)
+    for column, name in enumerate(names or ROLLING_COMPONENTS[:1]):
+        y, values = y0.astype(complex), {}
+        if column < len(components):
+            y[STATE_COMPONENTS.index(name)] += 1j * _SEED
+        else:
+            values = {name: enlarged.values[name] + 1j * _SEED}
+        path = follow(Assembly(enlarged, theta_end, complex, values), y, grid, rtol)
+        n = len(path.samples.time)
+        complex_q, complex_qdot = coordinates(path.samples.kinematics)
+        q[:n], qdot[:n] = complex_q.real, complex_qdot.real
+        if names:
+            dq[:n, :, column], dqdot[:n, :, column] = complex_q.imag / _SEED, complex_qdot.imag / _SEED
+    return Sensitivities(grid, q, qdot, names, dq, dqdot)
+
+
+def _missing(model: Model, parameters: Sequence[str]) -> dict[str, float]:
+    """Null values of parameters whose effect the model lacks."""
+    from disctrack.rolling.effects import effect_class
+    from disctrack.rolling.model import split_name
+
+    present = {e.name for e in model.effects}
+    missing = {}
+    for full_name in parameters:
+        effect, name = split_name(full_name)
+        if effect not in present:
+            missing[full_name] = effect_class(effect).absent().values[name]
+    return missing
