@@ -1,0 +1,133 @@
+"""Blocks of image pairs, read ahead by several threads in bounded memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.readers import FrameReader
+
+BLOCK_BYTES = 32 << 20  # large enough to hide the switch between blocks, small enough for three of them in 100 MB
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """One image that could not be read."""
+
+    frame: int
+    camera: int  # 0 left, 1 right
+    reason: str
+
+
+@dataclass(frozen=True)
+class PairBlock:
+    """Consecutive image pairs.
+
+    `images` is a buffer that is filled anew: it is valid until the next block is asked for; copy what must stay.
+    """
+
+    frames: NDArray[np.int64]  # (n,)
+    images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 where not readable
+    unreadable: tuple[Unreadable, ...]
+
+    @property
+    def readable(self) -> NDArray[np.bool_]:
+        """(n, 2) True where the image could be read."""
+        good = np.ones(self.images.shape[:2], bool)
+        for image in self.unreadable:
+            good[image.frame - self.frames[0], image.camera] = False
+        return good
+
+
+def check_pair(left: FrameReader, right: FrameReader) -> None:
+    """Raise RecordingError unless both sequences have the same number of frames, size and depth."""
+    if len(left) != len(right):
+        short = CAMERAS[int(len(right) < len(left))]
+        last = min(len(left), len(right)) - 1
+        raise RecordingError(
+            f"left has {len(left)} frames ({left.describe(0)} ...), right has {len(right)} ({right.describe(0)} ...). "
+            f"Frame i of both must belong together: bring the missing {short} images, or move the surplus ones away "
+            f"(the last pair would be {left.describe(last)} with {right.describe(last)})."
+        )
+    for what, unit in (("image_size", "px"), ("bit_depth", "bit")):
+        ours, theirs = (getattr(reader, what) for reader in (left, right))
+        if ours != theirs:
+            shown = [f"{v[0]} x {v[1]}" if isinstance(v, tuple) else f"{v}" for v in (ours, theirs)]
+            raise RecordingError(
+                f"left images ({left.describe(0)}) have {shown[0]} {unit}, right images ({right.describe(0)}) have "
+                f"{shown[1]} {unit}. Export both cameras alike."
+            )
+
+
+def default_threads() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def iter_pair_blocks(
+    left: FrameReader,
+    right: FrameReader,
+    start: int = 0,
+    stop: int | None = None,
+    block: int | None = None,
+    threads: int | None = None,
+) -> Iterator[PairBlock]:
+    """Pairs start..stop-1 in blocks of `block` pairs, two blocks read ahead while the caller works on a third.
+
+    An image that cannot be read is named in the block's `unreadable`; the others are delivered. The default block
+    holds BLOCK_BYTES, so that the memory is independent of the recording's length and of the image size.
+    Raises RecordingError if the two sequences do not belong together (`check_pair`).
+    """
+    check_pair(left, right)
+    stop = len(left) if stop is None else min(stop, len(left))
+    width, height = left.image_size
+    dtype = np.uint8 if left.bit_depth == 8 else np.uint16
+    block = block or int(np.clip(BLOCK_BYTES // (2 * width * height * np.dtype(dtype).itemsize), 1, 256))
+    starts = range(start, stop, block)
+    n_ahead = min(2, max(len(starts) - 1, 0))
+    ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]
+    pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
+    pending: list[list[Future[list[Unreadable]]]] = []
+    try:
+        for number, first in enumerate(starts):
+            for ahead in range(number + len(pending), min(number + n_ahead + 1, len(starts))):
+                begin = starts[ahead]
+                pending.append(
+                    _submit(pool, (left, right), range(begin, min(begin + block, stop)), ring[ahead % len(ring)])
+                )
+            unreadable = [image for future in pending.pop(0) for image in future.result()]
+            frames = np.arange(first, min(first + block, stop))
+            yield PairBlock(frames, ring[number % len(ring)][: len(frames)], tuple(unreadable))
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _submit(
+    pool: ThreadPoolExecutor, readers: tuple[FrameReader, FrameReader], frames: range, images: NDArray
+) -> list[Future[list[Unreadable]]]:
+    """Reading of one block as tasks: a few frames each, or a camera's whole block where files are read in order."""
+    tasks = []
+    for camera, reader in enumerate(readers):
+        size = 4 if reader.random_access else len(frames)
+        for i in range(0, len(frames), size):
+            tasks.append(pool.submit(_fill, images[i : i + size, camera], reader, camera, frames[i : i + size]))
+    return tasks
+
+
+def _fill(images: NDArray, reader: FrameReader, camera: int, frames: range) -> list[Unreadable]:
+    """Fill images (n, height, width) with the reader's frames; those that could not be read are 0 and returned."""
+    failed = []
+    for image, frame in zip(images, frames, strict=False):
+        try:
+            reader.read(frame, image)
+        except RecordingError as error:
+            image[...] = 0
+            failed.append(Unreadable(frame, camera, str(error)))
+    return failed

@@ -1,0 +1,214 @@
+"""Image sequences: one PNG, TIFF, BMP or JPEG file per frame."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.errors import RecordingError
+from disctrack.readers import Frame
+from disctrack.readers._png import PngHeader, decode_plain_grey
+from disctrack.readers.files import with_gaps
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# A header may claim any size; no camera of this kind has more pixels, and decoding one must not exhaust the memory.
+_MOST_PIXELS = 1 << 27
+
+
+def open_image_sequence(files: Sequence[Path], camera: str) -> ImageSequence:
+    """Sequence of the files given in order; a missing number among them is a frame that cannot be read.
+
+    Size and depth are those of the first frame that can be read. Raises RecordingError if there is none.
+    """
+    slots, gap_note = with_gaps(files)
+    first, stored, problem = None, None, ""
+    for file in files:
+        try:
+            stored = decode(file.read_bytes(), str(file))
+            first = as_grey(stored, str(file))
+            break
+        except (RecordingError, OSError) as error:
+            problem = problem or str(error)
+    if first is None or stored is None:
+        raise RecordingError(f"none of the {len(files)} {camera} images can be read; the first: {problem}")
+    notes = [f"{camera} camera: {note}" for note in (gap_note, *_depth_notes(stored, first)) if note]
+    size = first.shape[1], first.shape[0]
+    return ImageSequence(slots, camera, size, first.dtype, tuple(notes))
+
+
+def _depth_notes(stored: NDArray, grey: Frame) -> list[str]:
+    notes = []
+    if stored.ndim == 3:
+        notes.append(f"images are stored with {stored.shape[2]} channels of equal value; one is used, without loss")
+    if grey.dtype == np.uint16:
+        notes.append(f"images have 16 bits per pixel (first frame: up to {grey.max()}); used as they are")
+    return notes
+
+
+class ImageSequence:
+    """One file per frame; see FrameReader. Files are opened when a frame is read, and never written."""
+
+    timestamps: NDArray[np.float64] | None = None
+    random_access = True
+
+    def __init__(
+        self,
+        files: Sequence[Path | None],
+        camera: str,
+        image_size: tuple[int, int],
+        dtype: np.dtype,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self.files = list(files)
+        self.camera = camera
+        self.image_size = image_size
+        self.dtype = dtype
+        self.bit_depth = dtype.itemsize * 8
+        self.notes = notes
+        self._digests: list[bytes | None] = [None] * len(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def describe(self, index: int) -> str:
+        """The file's name, or that there is none."""
+        file = self.files[index]
+        return f"missing file of {self.camera} frame {index}" if file is None else str(file)
+
+    def read(self, index: int, out: Frame | None = None) -> Frame:
+        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
+        where = f"{self.describe(index)} ({self.camera} camera, frame {index})"
+        content = self._content(index, where)
+        self._digests[index] = hashlib.sha256(content).digest()
+        image = as_grey(decode(content, where, out), where)
+        if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
+            width, height = self.image_size
+            raise RecordingError(
+                f"{where}: {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit, but the sequence has "
+                f"{width} x {height} px of {self.bit_depth} bit. Export this frame again."
+            )
+        if out is None or image is out:
+            return image
+        out[...] = image
+        return out
+
+    def _content(self, index: int, where: str) -> bytes:
+        file = self.files[index]
+        if file is None:
+            raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
+        try:
+            return file.read_bytes()
+        except OSError as error:
+            raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy it again.") from error
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """SHA-256 of the files of frames start..stop-1; those already read are not read again."""
+        total = hashlib.sha256()
+        for index in range(start, stop):
+            digest = self._digests[index]
+            if digest is None:
+                try:
+                    digest = hashlib.sha256(self._content(index, "")).digest()
+                except RecordingError:
+                    digest = b"unreadable"
+            total.update(digest)
+        return total.hexdigest()
+
+
+def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
+    """Pixels of an image file's content as stored: (h, w) or (h, w, channels), any depth; in `out` where it fits.
+
+    Container and checksums are verified first: a decoder may return a torn image without a word.
+    Raises RecordingError that begins with `where`.
+    """
+    try:
+        header = _checked_container(content)
+    except _Damaged as fault:
+        raise RecordingError(f"{where}: {fault}. Copy or export this image again.") from fault
+    image = None
+    if header is not None and header.is_plain_grey:
+        image = decode_plain_grey(content, header, out)
+    else:
+        try:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        except (cv2.error, MemoryError) as error:
+            raise RecordingError(f"{where}: not a readable image ({error.__class__.__name__}).") from error
+    if image is None:
+        raise RecordingError(f"{where}: not a readable image, or damaged. Copy or export this image again.")
+    return image
+
+
+def as_grey(image: NDArray, where: str) -> Frame:
+    """(h, w) of 8 or 16 bits: equal channels become one. Raises RecordingError where something would be lost."""
+    if image.dtype not in (np.uint8, np.uint16):
+        raise RecordingError(f"{where}: pixels of type {image.dtype}; expected 8 or 16 bit grey values.")
+    if image.ndim == 2:
+        return image
+    if image.shape[2] in (2, 4) and (image[..., -1] != np.iinfo(image.dtype).max).any():
+        raise RecordingError(f"{where}: has transparent pixels; expected grey values. Export it without alpha channel.")
+    colours = image[..., : 3 if image.shape[2] >= 3 else 1]
+    if (colours != colours[..., :1]).any():
+        raise RecordingError(
+            f"{where}: a colour image; expected grey values. Export the camera's grey values: a conversion here would "
+            "mix what the sensor measured."
+        )
+    return np.ascontiguousarray(colours[..., 0])
+
+
+class _Damaged(Exception):
+    """The text says what is wrong with the file as a container."""
+
+
+def _checked_container(content: bytes) -> PngHeader | None:
+    """Header of a PNG, None for other formats; only PNG has checksums, the others an end or a length to check."""
+    if not content:
+        raise _Damaged("the file is empty")
+    if content.startswith(_PNG_SIGNATURE):
+        return _checked_png(content)
+    if content.startswith(b"\xff\xd8") and b"\xff\xd9" not in content[-1024:]:
+        raise _Damaged("the JPEG file is truncated (no end marker)")
+    if content.startswith(b"BM") and len(content) >= 26:
+        declared = struct.unpack_from("<I", content, 2)[0]
+        if declared > len(content):
+            raise _Damaged(f"the BMP file ends after {len(content)} of {declared} bytes")
+        width, height = struct.unpack_from("<ii", content, 18)
+        _check_size(abs(width), abs(height))
+    return None
+
+
+def _checked_png(content: bytes) -> PngHeader:
+    position, end, view = 8, len(content), memoryview(content)
+    ihdr: tuple[int, ...] = ()
+    data: list[tuple[int, int]] = []
+    transparent = False
+    while position + 12 <= end:
+        (length,) = struct.unpack_from(">I", content, position)
+        kind = content[position + 4 : position + 8]
+        start, stop = position + 8, position + 8 + length
+        if stop + 4 > end:
+            break
+        if zlib.crc32(view[position + 4 : stop]) != struct.unpack_from(">I", content, stop)[0]:
+            raise _Damaged(f"the PNG is damaged: wrong checksum of chunk {kind.decode('latin-1')!r} at byte {position}")
+        if kind == b"IHDR" and length == 13:
+            ihdr = struct.unpack_from(">IIBBBBB", content, start)
+            _check_size(ihdr[0], ihdr[1])
+        elif kind == b"IDAT":
+            data.append((start, stop))
+        elif kind == b"tRNS":
+            transparent = True
+        elif kind == b"IEND" and ihdr:
+            return PngHeader(ihdr[0], ihdr[1], ihdr[2], ihdr[3], ihdr[6] != 0, transparent, tuple(data))
+        position = stop + 4
+    raise _Damaged(f"the PNG file is truncated after {end} bytes (no end chunk)")
+
+
+def _check_size(width: int, height: int) -> None:
+    if width * height > _MOST_PIXELS:
+        raise _Damaged(f"the header claims {width} x {height} px, more than any such camera has")

@@ -1,0 +1,282 @@
+"""A recording on disk: a folder with `recording.toml`, read into frozen dataclasses in SI units."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disctrack.disc import Disc, disc_from_mm
+from disctrack.errors import RecordingError
+
+FILE_NAME = "recording.toml"
+
+# Every key that a recording.toml may hold, in the order of the reference example.
+KEYS: dict[str, tuple[str, ...]] = {
+    "": ("name",),
+    "cameras": ("frame_rate_hz", "left", "right"),
+    "disc": ("radius_mm", "thickness_mm", "mass_g"),
+    "markers": ("diameter_mm", "centres_mm"),
+    "calibration": ("left", "right", "inner_corners", "square_mm", "rig"),
+    "table": ("view", "board_thickness_mm"),
+    "gravity": ("g_m_s2",),
+}
+
+
+@dataclass(frozen=True)
+class ChessboardViews:
+    """Synchronised views of a flat chessboard."""
+
+    left: str  # file pattern relative to the recording's folder
+    right: str
+    inner_corners: tuple[int, int]  # along the long side, along the short side
+    square: float  # [m]
+
+
+@dataclass(frozen=True)
+class TableView:
+    """The view whose board lies flat on the table: it defines the lab frame."""
+
+    view: int  # index among the calibration views
+    board_thickness: float  # [m] the printed face lies at this height
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What recording.toml declares, in SI units; exactly one of `chessboard` and `rig_file` is given."""
+
+    folder: Path
+    name: str
+    frame_rate: float  # [Hz]
+    left: str  # file pattern, or one video file, relative to the folder
+    right: str
+    disc: Disc
+    chessboard: ChessboardViews | None
+    table: TableView | None  # None only where a rig file brings the lab frame with it
+    rig_file: Path | None
+    gravity: float  # [m/s^2]
+    declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
+
+    @property
+    def file(self) -> Path:
+        """The recording.toml itself."""
+        return self.folder / FILE_NAME
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Recording from its folder (or from its recording.toml).
+
+    Raises RecordingError that names the file, the key, what was found, what was expected and what to do.
+    """
+    file = _recording_file(Path(path))
+    declared = _parse_toml(file)
+    _refuse_unknown_keys(file, declared)
+    cameras, disc, markers = (_Section(file, declared, name) for name in ("cameras", "disc", "markers"))
+    calibration = _Section(file, declared, "calibration")
+    chessboard, rig_file = _calibration_source(calibration)
+    return Recording(
+        folder=file.parent,
+        name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,
+        frame_rate=cameras.get("frame_rate_hz", _positive),
+        left=cameras.get("left", _pattern),
+        right=cameras.get("right", _pattern),
+        disc=_disc(disc, markers),
+        chessboard=chessboard,
+        table=_table(file, declared, required=rig_file is None),
+        rig_file=rig_file,
+        gravity=_Section(file, declared, "gravity").get("g_m_s2", _positive),
+        declared=declared,
+    )
+
+
+def _recording_file(path: Path) -> Path:
+    try:
+        if path.is_dir():
+            path = path / FILE_NAME
+        elif not path.exists() and path.name != FILE_NAME:
+            raise RecordingError(f"{path}: no such folder. Give the folder that holds {FILE_NAME}.")
+        if not path.is_file():
+            raise RecordingError(f"{path}: not found. A recording is a folder with a {FILE_NAME} beside its images.")
+    except (OSError, ValueError) as error:  # a name too long, or with a null character
+        raise RecordingError(f"{path!s:.200}: not a usable path ({error}). Give a recording's folder.") from error
+    return path
+
+
+def _parse_toml(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_bytes().decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{file}: byte {error.start} is not UTF-8 text. Save the file as UTF-8.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise RecordingError(f"{file}: not valid TOML: {error}. Correct that line.") from error
+    except RecursionError as error:
+        raise RecordingError(f"{file}: nested too deeply to be a {FILE_NAME}.") from error
+    except ValueError as error:  # e.g. an integer of thousands of digits, a date that does not exist
+        raise RecordingError(f"{file}: a value cannot be read: {error}.") from error
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}.") from error
+
+
+def _refuse_unknown_keys(file: Path, declared: Mapping[str, Any]) -> None:
+    for key, value in declared.items():
+        if key in KEYS and key != "":
+            if not isinstance(value, dict):
+                raise RecordingError(f"{file}: '{key}' is {_shown(value)}; expected a section [{key}].")
+            for name in value:
+                if name not in KEYS[key]:
+                    raise RecordingError(f"{file}: unknown key '{name}' in [{key}]. {_nearest(name, key)}")
+        elif key not in KEYS[""]:
+            kind = "section" if isinstance(value, dict) else "key"
+            raise RecordingError(f"{file}: unknown {kind} '{key}'. {_nearest(key, '', kind)}")
+
+
+def _nearest(name: str, section: str, kind: str = "key") -> str:
+    """What the writer probably meant: a name in the same section first, then anywhere."""
+    here = list(KEYS[section]) if section else ([s for s in KEYS if s] if kind == "section" else list(KEYS[""]))
+    close = difflib.get_close_matches(name, here, 1)
+    if close:
+        return f"Did you mean '{close[0]}'?"
+    homes = {key: home for home, keys in KEYS.items() for key in keys if home}
+    close = difflib.get_close_matches(name, homes, 1)
+    if close:
+        return f"Did you mean '{close[0]}' of [{homes[close[0]]}]?"
+    return f"Known here: {', '.join(here)}."
+
+
+class _Section:
+    """One section of a recording.toml; `get` converts a value or says what is wrong with it."""
+
+    def __init__(self, file: Path, declared: Mapping[str, Any], name: str) -> None:
+        self.file, self.name = file, name
+        if name and name not in declared:
+            raise RecordingError(f"{file}: section [{name}] is missing; it holds {', '.join(KEYS[name])}.")
+        self.values: Mapping[str, Any] = declared[name] if name else declared
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def get(self, key: str, convert: Callable[[Any], Any]) -> Any:
+        where = f"[{self.name}] {key}" if self.name else key
+        if key not in self.values:
+            raise RecordingError(f"{self.file}: {where} is missing. Add it: every length in mm, mass in g, time in s.")
+        try:
+            return convert(self.values[key])
+        except (_Unfit, OverflowError) as error:
+            expected = error if isinstance(error, _Unfit) else "a smaller number"
+            raise RecordingError(f"{self.file}: {where} is {_shown(self.values[key])}; expected {expected}.") from error
+
+    def error(self, message: str) -> RecordingError:
+        return RecordingError(f"{self.file}: [{self.name}] {message}")
+
+
+class _Unfit(Exception):
+    """The text says what was expected instead."""
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # integers of thousands of digits, arrays in arrays in arrays
+        text = type(value).__name__
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise _Unfit("a number")
+    if not math.isfinite(value):
+        raise _Unfit("a finite number")
+    return float(value)
+
+
+def _positive(value: Any) -> float:
+    number = _number(value)
+    if number <= 0:
+        raise _Unfit("a number above 0")
+    return number
+
+
+def _not_negative(value: Any) -> float:
+    number = _number(value)
+    if number < 0:
+        raise _Unfit("a number of at least 0")
+    return number
+
+
+def _index(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise _Unfit("a whole number of at least 0")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise _Unfit('text in quotes, e.g. "rec_a"')
+    return value
+
+
+def _pattern(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
+        raise _Unfit('a file pattern in quotes, e.g. "left/*.png"')
+    return value
+
+
+def _corner_counts(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int and 2 <= n <= 1000 for n in value):
+        raise _Unfit("two whole numbers, inner corners along the long and the short side, e.g. [9, 6]")
+    return value[0], value[1]
+
+
+def _centres(value: Any) -> list[list[float]]:
+    expected = "a list of [x, y] pairs, at least 3 of them, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
+    if not isinstance(value, list) or len(value) < 3:
+        raise _Unfit(expected)
+    if not all(isinstance(centre, list) and len(centre) == 2 for centre in value):
+        raise _Unfit(expected)
+    try:
+        return [[_number(x), _number(y)] for x, y in value]
+    except _Unfit as error:
+        raise _Unfit(expected) from error
+
+
+def _disc(disc: _Section, markers: _Section) -> Disc:
+    radius_mm = disc.get("radius_mm", _positive)
+    diameter_mm = markers.get("diameter_mm", _positive)
+    centres_mm = markers.get("centres_mm", _centres)
+    for number, (x, y) in enumerate(centres_mm):
+        if math.hypot(x, y) + diameter_mm / 2 > radius_mm:
+            raise markers.error(
+                f"centres_mm: dot {number} at ({x:g}, {y:g}) with diameter {diameter_mm:g} reaches over the disc's rim "
+                f"(radius {radius_mm:g}). Centres are in mm from the disc's centre."
+            )
+        for other, (u, v) in enumerate(centres_mm[:number]):
+            if math.hypot(x - u, y - v) < diameter_mm:
+                raise markers.error(
+                    f"centres_mm: dots {other} and {number} overlap: {math.hypot(x - u, y - v):g} mm apart with "
+                    f"diameter {diameter_mm:g}. Give each dot once."
+                )
+    return disc_from_mm(
+        radius_mm, disc.get("thickness_mm", _positive), disc.get("mass_g", _positive), centres_mm, diameter_mm
+    )
+
+
+def _calibration_source(section: _Section) -> tuple[ChessboardViews | None, Path | None]:
+    views = [key for key in ("left", "right", "inner_corners", "square_mm") if key in section]
+    if "rig" in section:
+        if views:
+            raise section.error(f"has both rig and {', '.join(views)}. Keep the rig file, or the chessboard views.")
+        return None, section.file.parent / section.get("rig", _pattern)
+    left, right = section.get("left", _pattern), section.get("right", _pattern)
+    corners = section.get("inner_corners", _corner_counts)
+    return ChessboardViews(left, right, corners, section.get("square_mm", _positive) * 1e-3), None
+
+
+def _table(file: Path, declared: Mapping[str, Any], required: bool) -> TableView | None:
+    if "table" not in declared and not required:
+        return None
+    table = _Section(file, declared, "table")
+    return TableView(table.get("view", _index), table.get("board_thickness_mm", _not_negative) * 1e-3)

@@ -1,0 +1,188 @@
+"""recording.toml: what is read is what was declared, and whatever is wrong with it is said in one line."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from disctrack.errors import DiscTrackError, RecordingError
+from disctrack.recording import KEYS, read_recording
+
+REFERENCE = """
+name = "clip"
+[cameras]
+frame_rate_hz = 1000.0
+left = "left/*.png"
+right = "right/*.png"
+[disc]
+radius_mm = 37.5
+thickness_mm = 6
+mass_g = 209.69
+[markers]
+diameter_mm = 7.0
+centres_mm = [[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167]]
+[calibration]
+left = "calibration/left/*.png"
+right = "calibration/right/*.png"
+inner_corners = [9, 6]
+square_mm = 8.0
+[table]
+view = 0
+board_thickness_mm = 3.0
+[gravity]
+g_m_s2 = 9.81
+"""
+
+
+def write(folder: Path, text: str | bytes) -> Path:
+    (folder / "recording.toml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    return folder
+
+
+def message(folder: Path, text: str | bytes) -> str:
+    with pytest.raises(RecordingError) as caught:
+        read_recording(write(folder, text))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_lengths_and_masses_become_si(tmp_path):
+    recording = read_recording(write(tmp_path, REFERENCE))
+    assert recording.disc.radius == pytest.approx(0.0375)
+    assert recording.disc.half_thickness == pytest.approx(0.003)
+    assert recording.disc.mass == pytest.approx(0.20969)
+    assert_allclose(recording.disc.marker_centres_body[0], [0.026, 0, 0.003])
+    assert recording.chessboard is not None
+    assert recording.chessboard.square == pytest.approx(0.008)
+    assert recording.table is not None
+    assert recording.table.board_thickness == pytest.approx(0.003)
+
+
+def test_every_key_of_the_reference_recording_is_known(shared_data):
+    recording = read_recording(shared_data / "rec_a")
+    assert recording.frame_rate == 1000.0
+    assert recording.disc.n_markers == 6
+    named = {(section, key) for section in KEYS for key in KEYS[section] if section and key != "rig"}
+    assert named == {(s, k) for s, values in recording.declared.items() if isinstance(values, dict) for k in values}
+
+
+def test_a_shared_rig_replaces_views_and_table(tmp_path):
+    start, end = REFERENCE.index("[calibration]"), REFERENCE.index("[gravity]")
+    text = REFERENCE[:start] + '[calibration]\nrig = "../rig.h5"\n' + REFERENCE[end:]
+    recording = read_recording(write(tmp_path, text))
+    assert recording.chessboard is None
+    assert recording.rig_file == tmp_path / ".." / "rig.h5"
+    assert recording.table is None
+
+
+@pytest.mark.parametrize(("section", "key"), [(s, k) for s in KEYS for k in KEYS[s] if k not in ("name", "rig")])
+def test_each_missing_key_is_named_with_its_section(tmp_path, section, key):
+    lines = REFERENCE.splitlines()
+    start = lines.index(f"[{section}]")
+    dropped = next(i for i in range(start, len(lines)) if lines[i].startswith(key + " "))
+    text = "\n".join(lines[:dropped] + lines[dropped + 1 :])
+    assert re.search(rf"\[{section}\] {key} is missing", message(tmp_path, text))
+
+
+@pytest.mark.parametrize("section", [section for section in KEYS if section])
+def test_each_missing_section_is_named(tmp_path, section):
+    start = REFERENCE.index(f"[{section}]")
+    end = REFERENCE.find("\n[", start)
+    assert f"section [{section}] is missing" in message(
+        tmp_path, REFERENCE[:start] + (REFERENCE[end:] if end > 0 else "")
+    )
+
+
+@pytest.mark.parametrize(
+    ("written", "found", "meant"),
+    [
+        ("radius_mm", "radus_mm", "radius_mm"),
+        ("frame_rate_hz", "framerate_hz", "frame_rate_hz"),
+        ("[gravity]", "[gravitiy]", "gravity"),
+        ("name =", "nane =", "name"),
+        ("mass_g = 209.69", "mass_g = 209.69\nframe_rate_hz = 5", "'frame_rate_hz' of [cameras]"),
+        ("square_mm = 8.0", "square_mm = 8.0\ntemperature = 20", "Known here: left, right"),
+    ],
+)
+def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path, written, found, meant):
+    text = message(tmp_path, REFERENCE.replace(written, found, 1))
+    assert "unknown" in text
+    assert meant in text
+
+
+@pytest.mark.parametrize(
+    ("written", "found", "expected"),
+    [
+        ("frame_rate_hz = 1000.0", 'frame_rate_hz = "fast"', "a number"),
+        ("frame_rate_hz = 1000.0", "frame_rate_hz = true", "a number"),
+        ("frame_rate_hz = 1000.0", "frame_rate_hz = 0", "above 0"),
+        ("frame_rate_hz = 1000.0", "frame_rate_hz = nan", "finite"),
+        ("frame_rate_hz = 1000.0", f"frame_rate_hz = 1{'0' * 400}", "smaller"),
+        ("radius_mm = 37.5", "radius_mm = -37.5", "above 0"),
+        ('left = "left/*.png"', "left = 3", "file pattern"),
+        ("inner_corners = [9, 6]", "inner_corners = [9]", "two whole numbers"),
+        ("inner_corners = [9, 6]", "inner_corners = 9", "two whole numbers"),
+        ("view = 0", "view = -1", "whole number"),
+        ("view = 0", "view = 0.5", "whole number"),
+        ("[[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167]]", "[[26.0, 0.0]]", "at least 3"),
+        ("[[26.0, 0.0], [13.0, 22.5167]", "[[36.0, 0.0], [13.0, 22.5167]", "rim"),
+        ("[[26.0, 0.0], [13.0, 22.5167]", "[[13.0, 22.0], [13.0, 22.5167]", "overlap"),
+        ("square_mm = 8.0", 'square_mm = 8.0\nrig = "rig.h5"', "both rig and"),
+        ("[gravity]\n", "gravity = 9.81\n[other]\n", "unknown"),
+    ],
+)
+def test_a_wrong_value_is_shown_with_what_was_expected(tmp_path, written, found, expected):
+    assert expected in message(tmp_path, REFERENCE.replace(written, found, 1))
+
+
+def test_a_syntax_error_is_told_with_its_line(tmp_path):
+    assert "line 3" in message(tmp_path, 'name = "a"\n[cameras]\nframe_rate_hz = = 3\n')
+
+
+def test_a_missing_folder_and_a_folder_without_recording_are_told_apart(tmp_path):
+    with pytest.raises(RecordingError, match="no such folder"):
+        read_recording(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match=r"a folder with a recording\.toml"):
+        read_recording(tmp_path)
+
+
+_fuzz = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+_values = st.recursive(
+    st.one_of(
+        st.booleans().map(lambda b: str(b).lower()),
+        st.integers().map(str),
+        st.floats().map(lambda x: repr(x).replace("inf", "inf")),
+        st.text(st.characters(codec="ascii", categories=["L", "N"]), max_size=8).map(lambda s: f'"{s}"'),
+    ),
+    lambda children: st.lists(children, max_size=4).map(lambda items: f"[{', '.join(items)}]"),
+    max_leaves=8,
+)
+
+
+@_fuzz
+@given(content=st.binary(max_size=400))
+def test_any_bytes_are_read_or_refused_with_a_message(tmp_path, content):
+    _read_or_refuse(write(tmp_path, content))
+
+
+@_fuzz
+@given(data=st.data())
+def test_any_value_at_any_key_is_read_or_refused_with_a_message(tmp_path, data):
+    lines = REFERENCE.splitlines()
+    number = data.draw(st.sampled_from([i for i, line in enumerate(lines) if "=" in line]))
+    key = data.draw(st.one_of(st.just(lines[number].split("=")[0].strip()), st.sampled_from("abc")))
+    lines[number] = f"{key} = {data.draw(_values)}"
+    _read_or_refuse(write(tmp_path, "\n".join(lines)))
+
+
+def _read_or_refuse(folder: Path) -> None:
+    try:
+        recording = read_recording(folder)
+    except DiscTrackError:
+        return
+    assert recording.frame_rate > 0
+    assert np.isfinite(recording.disc.marker_centres_body).all()
