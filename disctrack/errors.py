@@ -8,6 +8,7 @@ __all__ = [
     "OutputError",
     "RecordingError",
     "RigFileError",
+    "SceneError",
     "TrackingError",
     "TrajectoryFileError",
 ]
@@ -15,6 +16,10 @@ __all__ = [
 
 class RecordingError(DiscTrackError):
     """A recording folder, its recording.toml or its images cannot be used as they are."""
+
+
+class SceneError(DiscTrackError):
+    """A scene file cannot be read, or asks for something impossible."""
 
 
 class TrackingError(DiscTrackError):

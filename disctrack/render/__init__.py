@@ -1,0 +1,11 @@
+"""Synthetic recordings with known truth: what the two cameras would see, down to photons and quantisation.
+
+rays (own inverse of the lens) -> raster (areas of surfaces) -> optics (blur, lamp) -> sensor (noise, numbers)
+-> images (disc, chessboard) -> cameras (true rig, board poses) -> recording (folder and truth.h5).
+It shares no code with the location of markers and corners, so that those can be judged by it.
+"""
+
+from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
+from disctrack.render.images import expected_disc, render_board, render_disc
+
+__all__ = ["board_poses", "expected_disc", "render_board", "render_disc", "rig_after_faults", "rig_of"]

@@ -1,0 +1,39 @@
+"""From light to the numbers in a file: photons, read noise, hot pixels, quantisation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.scene import SensorSettings
+
+Grey = NDArray[np.float32]
+
+
+def digitise(
+    expected: Grey, settings: SensorSettings, bit_depth: int, rng: np.random.Generator | None, hot: Grey | None = None
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Image as the camera writes it, from the expected 8-bit grey values (..., height, width).
+
+    Electrons are Poisson with mean gain * grey, read noise is Gaussian, the sum is scaled to the bit depth, rounded and
+    clipped. Without `rng` the image is quantised only.
+    """
+    grey = expected if hot is None else expected + hot
+    if rng is not None:
+        if settings.gain_e_per_dn > 0:
+            electrons = rng.poisson(np.maximum(grey, 0.0) * np.float32(settings.gain_e_per_dn))
+            grey = electrons.astype(np.float32) / np.float32(settings.gain_e_per_dn)
+        grey = grey + np.float32(settings.read_noise_dn) * rng.standard_normal(grey.shape, dtype=np.float32)
+    top = 2**bit_depth - 1
+    levels = np.rint((grey + np.float32(settings.black_level_dn)) * np.float32(top / 255.0))
+    return np.clip(levels, 0, top).astype(np.uint8 if bit_depth == 8 else np.uint16)
+
+
+def hot_pixels(settings: SensorSettings, image_size: tuple[int, int], rng: np.random.Generator) -> Grey | None:
+    """Excess grey of the sensor's hot pixels (height, width), the same in every frame; None without any."""
+    if settings.hot_pixels == 0:
+        return None
+    excess = np.zeros((image_size[1], image_size[0]), np.float32)
+    where = rng.choice(excess.size, settings.hot_pixels, replace=False)
+    excess.flat[where] = rng.exponential(settings.hot_pixel_dn, settings.hot_pixels)
+    return excess
