@@ -8,6 +8,7 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 
 from __future__ import annotations
 
+import math
 import tomllib
 import types
 import typing
@@ -147,14 +148,18 @@ class BoardSettings:
 
 @dataclass(frozen=True)
 class RollingMotion:
-    """Motion from the rolling model; `effects` and `start` are handed on to disctrack.rolling."""
+    """Motion from the rolling model: regular precession with a nutation oscillation, losing energy to the effects."""
 
     theta_deg: float = 20.0
     psi_deg: float = 0.0
     phi_deg: float = 0.0
     centre_mm: Pair = (32.0, 20.0)  # of the disc at the first frame
-    nutation_deg: float = 0.05  # oscillation on top of steady precession
-    effects: dict[str, dict[str, float]] = field(default_factory=lambda: {"paper": {}})
+    omega3_rad_s: float = math.nan  # spin about the axis; nan: as much as keeps the centre at rest
+    nutation_deg: float = 0.05  # amplitude of the oscillation on top of regular precession
+    nutation_phase_deg: float = 0.0
+    state: dict[str, float] = field(default_factory=dict)  # components of rolling.State [SI] that replace the above
+    effects: dict[str, dict[str, float]] = field(default_factory=lambda: {"km": {}, "kn": {}, "kz": {}})
+    # by their names in rolling.CATALOGUE; parameters not given take their nominal value, for these three the paper's
 
 
 @dataclass(frozen=True)
@@ -218,6 +223,7 @@ class RenderSettings:
 
     subpixels: int = 6  # cells per pixel and axis where an edge passes
     threads: int = 2
+    png_compression: int = 3  # 0 to 9
 
 
 @dataclass(frozen=True)

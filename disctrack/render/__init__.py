@@ -1,11 +1,27 @@
 """Synthetic recordings with known truth: what the two cameras would see, down to photons and quantisation.
 
 rays (own inverse of the lens) -> raster (areas of surfaces) -> optics (blur, lamp) -> sensor (noise, numbers)
--> images (disc, chessboard) -> cameras (true rig, board poses) -> recording (folder and truth.h5).
+-> images (disc, chessboard) -> cameras (true rig, board poses) -> recording (folder) and truth (truth.h5).
 It shares no code with the location of markers and corners, so that those can be judged by it.
 """
 
 from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.render.images import expected_disc, render_board, render_disc
+from disctrack.render.recording import recording_toml, run_render, true_disc_of, write_recording
+from disctrack.render.truth import Truth, read_truth, rig_parameters
 
-__all__ = ["board_poses", "expected_disc", "render_board", "render_disc", "rig_after_faults", "rig_of"]
+__all__ = [
+    "Truth",
+    "board_poses",
+    "expected_disc",
+    "read_truth",
+    "recording_toml",
+    "render_board",
+    "render_disc",
+    "rig_after_faults",
+    "rig_of",
+    "rig_parameters",
+    "run_render",
+    "true_disc_of",
+    "write_recording",
+]

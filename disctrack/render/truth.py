@@ -1,0 +1,161 @@
+"""truth.h5: what a synthetic recording really shows; for validation only, no stage of the measurement reads it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
+from disctrack.disc import Disc
+from disctrack.errors import OutputError
+from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_vector, vector_from_rotation
+from disctrack.render.rays import View, image_of
+from disctrack.scene import Scene
+
+Array = NDArray[np.float64]
+
+SCHEMA = "disctrack truth"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of a recording, SI and radians."""
+
+    time: Array  # (n,) mid exposure of the left camera's frames [s]
+    q: Array  # (n, 6) at `time`, angles not wrapped
+    q_right: Array  # (n, 6) at the right camera's mid exposure; equals q unless that camera is delayed
+    frame_rate: float  # true one [Hz]
+    rig: StereoRig  # while the chessboard was shown
+    rig_while_filming: StereoRig  # while the disc was filmed
+    disc: Disc  # with the true centres of the dots
+    paper_centre_body: Array  # (2,) [m]
+    markers_printed: NDArray[np.bool_]  # (m,) False for dots that have come off
+    R_world_board: Array  # (v, 3, 3) of the calibration views
+    t_world_board: Array  # (v, 3) [m]
+    effects: dict[str, float]  # "effect.parameter" of the rolling model, SI
+
+    @property
+    def markers_px(self) -> Array:
+        """(n, 2, m, 2) images of the dots' own centres at mid exposure, whether visible or not."""
+        views = zip(self.rig_while_filming.cameras, self.rig_while_filming.camera_poses(), strict=True)
+        pixels = []
+        for q, (camera, (R_camera_world, t)) in zip((self.q, self.q_right), views, strict=True):
+            R = rotation_from_euler(q[:, 3], q[:, 4], q[:, 5])
+            points = self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[:, None, :3]
+            pixels.append(image_of(points, View(camera, R_camera_world, t)))
+        return np.stack(pixels, axis=1)
+
+
+def rig_parameters(rig: StereoRig) -> Array:
+    """(30,) in the order of RIG_PARAMETERS; rotations as rotation vectors from the identity."""
+    return np.concatenate(
+        [
+            rig.left.parameters,
+            rig.right.parameters,
+            vector_from_rotation(rig.R_right_left),
+            rig.t_right_left,
+            vector_from_rotation(rig.R_left_world),
+            rig.t_left_world,
+        ]
+    )
+
+
+def write_truth(path: Path, truth: Truth, scene: Scene) -> None:
+    """Write `truth` and the scene it was rendered from."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
+        file.attrs["scene"] = json.dumps(asdict(scene), default=str)
+        file.attrs["frame_rate_hz"] = truth.frame_rate
+        _put(file, "time", truth.time, "s", "mid exposure of the left camera")
+        units = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES)
+        _put(file, "q", truth.q, units, "pose at time, world frame = table")
+        _put(file, "q_right", truth.q_right, units, "pose at the right camera's mid exposure")
+        _put(file, "markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)")
+        disc = file.create_group("disc")
+        for name in ("radius", "half_thickness", "mass", "marker_diameter"):
+            disc.attrs[name] = getattr(truth.disc, name)
+        _put(disc, "marker_centres_body", truth.disc.marker_centres_body, "m", "true centres of the dots")
+        _put(disc, "declared_marker_centres_body", scene.declared_disc.marker_centres_body, "m", "as in recording.toml")
+        _put(disc, "paper_centre_body", truth.paper_centre_body, "m", "centre of the paper on the upper face")
+        _put(disc, "markers_printed", truth.markers_printed.astype(np.uint8), "1", "0: the dot has come off")
+        for name, rig in (("rig", truth.rig), ("rig_while_filming", truth.rig_while_filming)):
+            _put_rig(file.create_group(name), rig)
+        board = file.create_group("board")
+        _put(board, "R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views")
+        _put(board, "t_world_board", truth.t_world_board, "m", "lower left inner corner in the calibration views")
+        effects = file.create_group("effects")
+        for name, value in truth.effects.items():
+            effects.attrs[name] = value
+
+
+def _put(group: Any, name: str, values: NDArray[Any], units: str, text: str) -> None:
+    data = group.create_dataset(name, data=values, compression="gzip" if values.size > 1000 else None)
+    data.attrs["units"], data.attrs["description"] = units, text
+
+
+def _put_rig(group: Any, rig: StereoRig) -> None:
+    _put(group, "parameters", rig_parameters(rig), "px, 1, rad, m", "in the order of the attribute names")
+    group["parameters"].attrs["names"] = list(RIG_PARAMETERS)
+    group.attrs["image_size"] = [rig.left.image_size, rig.right.image_size]
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        _put(group, f"{name}_camera_matrix", camera.camera_matrix, "px", "K")
+        _put(group, f"{name}_distortion", np.array(camera.distortion), "1", "k1, k2, p1, p2, k3")
+    for name in ("R_right_left", "t_right_left", "R_left_world", "t_left_world"):
+        _put(group, name, getattr(rig, name), "m" if name[0] == "t" else "1", "camera frames as in disctrack.frames")
+
+
+def read_truth(path: str | Path) -> Truth:
+    """Truth of a file that `write_truth` wrote; raises OutputError for anything else."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("schema") != SCHEMA:
+                raise OutputError(
+                    f"{path}: schema {file.attrs.get('schema')!r}; expected {SCHEMA!r}, as `render` writes"
+                )
+            disc = file["disc"]
+            return Truth(
+                time=file["time"][:],
+                q=file["q"][:],
+                q_right=file["q_right"][:],
+                frame_rate=float(file.attrs["frame_rate_hz"]),
+                rig=_get_rig(file["rig"]),
+                rig_while_filming=_get_rig(file["rig_while_filming"]),
+                disc=Disc(
+                    radius=float(disc.attrs["radius"]),
+                    half_thickness=float(disc.attrs["half_thickness"]),
+                    mass=float(disc.attrs["mass"]),
+                    marker_centres_body=disc["marker_centres_body"][:],
+                    marker_diameter=float(disc.attrs["marker_diameter"]),
+                ),
+                paper_centre_body=disc["paper_centre_body"][:],
+                markers_printed=disc["markers_printed"][:].astype(bool),
+                R_world_board=file["board/R_world_board"][:],
+                t_world_board=file["board/t_world_board"][:],
+                effects={name: float(value) for name, value in file["effects"].attrs.items()},
+            )
+    except (OSError, KeyError) as error:
+        raise OutputError(f"{path}: not a truth file ({error}); render the recording again") from error
+
+
+def _get_rig(group: Any) -> StereoRig:
+    p = group["parameters"][:]
+    (w_left, h_left), (w_right, h_right) = group.attrs["image_size"]
+    return StereoRig(
+        left=Camera.from_parameters(p[0:9], (int(w_left), int(h_left))),
+        right=Camera.from_parameters(p[9:18], (int(w_right), int(h_right))),
+        R_right_left=rotation_from_vector(p[18:21]),
+        t_right_left=p[21:24],
+        R_left_world=rotation_from_vector(p[24:27]),
+        t_left_world=p[27:30],
+        world_is_table=True,
+    )

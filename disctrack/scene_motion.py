@@ -1,0 +1,134 @@
+"""From the motion section of a scene to the pose of the disc at any instant: at rest, by a table, or rolling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.errors import SceneError
+from disctrack.scene import Scene
+
+if TYPE_CHECKING:
+    from disctrack.rolling import Model, Motion, State
+
+Array = NDArray[np.float64]
+
+_SAMPLES_PER_FRAME = 4  # of the simulated motion; a cubic between them errs by 3e-8 of a nutation oscillation
+
+
+@dataclass(frozen=True)
+class SceneMotion:
+    """Pose of the disc over time, and for which frames it is known."""
+
+    pose: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) q, SI and radians, angles not wrapped
+    n_frames: int
+    simulated: Motion | None = None  # the rolling model's own result, where the motion is one
+
+
+def true_frame_rate(scene: Scene) -> float:
+    """Frames per second that the cameras really took [Hz]."""
+    return scene.faults.frame_rate_hz or scene.cameras.frame_rate_hz
+
+
+def motion_of(scene: Scene) -> SceneMotion:
+    """Motion that the scene asks for; raises SceneError where it cannot be had."""
+    return {"static": _static, "table": _table, "rolling": _rolling}[scene.motion.kind](scene)
+
+
+def _static(scene: Scene) -> SceneMotion:
+    q = np.array(scene.motion.poses) * np.r_[np.full(3, 1e-3), np.full(3, np.pi / 180)]
+    rate = true_frame_rate(scene)
+
+    def pose(time: Array) -> Array:
+        return q[np.clip(np.rint(np.asarray(time) * rate).astype(int), 0, len(q) - 1)]
+
+    return SceneMotion(pose, len(q))
+
+
+def _table(scene: Scene) -> SceneMotion:
+    from scipy.interpolate import CubicSpline
+
+    path = scene.folder / scene.motion.table
+    try:
+        rows = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: no table of motion ({error}); expected rows t, x, y, z, psi, theta, phi") from error
+    if rows.ndim != 2 or rows.shape[1] != 7 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0).all():
+        raise SceneError(f"{path}: shape {rows.shape}; expected 2 or more rows of 7 with increasing t [s]")
+    spline = CubicSpline(rows[:, 0], rows[:, 1:])
+    return SceneMotion(lambda time: spline(np.asarray(time)), _frames_within(scene, rows[0, 0], rows[-1, 0], str(path)))
+
+
+def _rolling(scene: Scene) -> SceneMotion:
+    from scipy.interpolate import CubicHermiteSpline
+
+    motion = simulate_scene(scene)
+    spline = CubicHermiteSpline(motion.time, motion.q, motion.qdot)
+    last = motion.time[-1]
+    n = _frames_within(scene, motion.time[0], last, "the rolling model")
+    return SceneMotion(lambda time: spline(np.asarray(time)), n, motion)
+
+
+def _margin(scene: Scene) -> tuple[float, float]:
+    """Time needed before the first and after the last mid exposure of the left camera [s]."""
+    half, delay = scene.cameras.exposure_s / 2, scene.faults.right_delay_s
+    return half + max(-delay, 0.0), half + max(delay, 0.0)
+
+
+def _frames_within(scene: Scene, start: float, end: float, source: str) -> int:
+    before, after = _margin(scene)
+    if start > -before + 1e-9:
+        raise SceneError(f"{source}: begins at {start:g} s, after the first exposure at {-before:g} s; begin earlier")
+    n = int(np.floor((end - after) * true_frame_rate(scene) + 1e-6)) + 1
+    if n < 1:
+        raise SceneError(f"{source}: ends at {end:g} s, before the first frame is exposed")
+    return min(n, scene.cameras.n_frames)
+
+
+def rolling_model(scene: Scene) -> Model:
+    """Declared disc and gravity with the scene's effects; raises ModelError for an effect that does not exist."""
+    from disctrack.rolling import Model
+    from disctrack.rolling.effects import effect_class
+
+    effects = tuple(effect_class(name)(**values) for name, values in scene.motion.rolling.effects.items())
+    return Model(scene.declared_disc, scene.gravity_m_s2, effects)
+
+
+def rolling_start(scene: Scene) -> State:
+    """State at the beginning: regular precession with a nutation oscillation, changed by the scene's `state`."""
+    from disctrack.rolling import State, steady_precession
+
+    start = scene.motion.rolling
+    unknown = set(start.state) - set(State.__dataclass_fields__)
+    if unknown:
+        known = ", ".join(State.__dataclass_fields__)
+        raise SceneError(f"motion.rolling.state: unknown {', '.join(sorted(unknown))}; a state has {known}")
+    regular = steady_precession(
+        np.radians(start.theta_deg),
+        scene.declared_disc,
+        scene.gravity_m_s2,
+        omega3=None if np.isnan(start.omega3_rad_s) else start.omega3_rad_s,
+        nutation_amplitude=np.radians(start.nutation_deg),
+        nutation_phase=np.radians(start.nutation_phase_deg),
+        psi=np.radians(start.psi_deg),
+        phi=np.radians(start.phi_deg),
+        x=start.centre_mm[0] * 1e-3,
+        y=start.centre_mm[1] * 1e-3,
+    )
+    return regular.moved(**start.state)
+
+
+def simulate_scene(scene: Scene) -> Motion:
+    """The rolling model's motion, four samples per frame; it ends early where the disc comes to rest."""
+    from disctrack.rolling import simulate
+
+    before, after = _margin(scene)
+    step = 1 / (_SAMPLES_PER_FRAME * true_frame_rate(scene))
+    first = -int(np.ceil(before / step + 1e-9))
+    last = _SAMPLES_PER_FRAME * (scene.cameras.n_frames - 1) + int(np.ceil(after / step + 1e-9))
+    times = np.arange(first, max(last, first + 1) + 1) * step
+    return simulate(rolling_model(scene), rolling_start(scene), times=times)
