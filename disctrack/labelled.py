@@ -1,0 +1,87 @@
+"""Arrays with names, axes and units in HDF5: what xarray, netCDF and pandas open without being told anything.
+
+Every axis is a dimension scale at the root of the file; a variable of any group refers to it by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CHUNK_ROWS = 1024
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array with its axes and its unit, as one dataset of a file."""
+
+    data: ArrayLike
+    dims: tuple[str, ...]
+    units: str  # "1" where there is none
+    long_name: str
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_variables(
+    group: h5py.Group, variables: Mapping[str, Variable], axes: Mapping[str, Variable] | None = None
+) -> None:
+    """Datasets with dimension scales. Axes that the file's root does not have yet come from `axes`.
+
+    Raises ValueError if an axis is unknown or a length does not fit.
+    """
+    root = group.file["/"]
+    for name, axis in (axes or {}).items():
+        if name not in root:
+            _create(root, name, axis).make_scale(name)
+    for name, variable in variables.items():
+        dataset = _create(group, name, variable)
+        for position, axis_name in enumerate(variable.dims):
+            if axis_name not in root:
+                raise ValueError(f"{name}: no axis {axis_name} at the root of the file")
+            if root[axis_name].shape[0] != dataset.shape[position]:
+                raise ValueError(f"{name}: {dataset.shape[position]} along {axis_name} of {root[axis_name].shape[0]}")
+            dataset.dims[position].attach_scale(root[axis_name])
+
+
+def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
+    data = np.asarray(variable.data)
+    if data.ndim != len(variable.dims):
+        raise ValueError(f"{name}: {data.ndim} axes, but {len(variable.dims)} names for them")
+    if data.dtype == bool or data.dtype.kind not in "iufU":
+        raise ValueError(f"{name}: arrays of {data.dtype} are not written; use uint8 or a float")
+    if data.dtype.kind == "U":
+        dataset = group.create_dataset(name, data=data.astype(object), dtype=h5py.string_dtype())
+    elif data.ndim == 0 or data.size == 0:
+        dataset = group.create_dataset(name, data=data)
+    else:
+        chunks = (min(CHUNK_ROWS, data.shape[0]), *data.shape[1:])
+        dataset = group.create_dataset(name, data=data, chunks=chunks, compression="gzip", compression_opts=1,
+                                       shuffle=True, fletcher32=True)  # fmt: skip
+    dataset.attrs["units"] = variable.units
+    dataset.attrs["long_name"] = variable.long_name
+    for key, value in variable.attributes.items():
+        dataset.attrs[key] = value
+    return dataset
+
+
+def read_variables(group: h5py.Group) -> dict[str, NDArray]:
+    """Every dataset of a group (not of its subgroups) as an array; text as str."""
+    return {
+        name: item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
+        for name, item in group.items()
+        if isinstance(item, h5py.Dataset)
+    }
+
+
+def flags(enum: type) -> dict[str, Any]:
+    """CF attributes of an array that holds members of an IntEnum."""
+    members = list(enum)  # type: ignore[call-overload]
+    return {
+        "flag_values": np.array([int(member) for member in members], np.uint8),
+        "flag_meanings": " ".join(member.name.lower() for member in members),
+    }

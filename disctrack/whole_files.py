@@ -1,0 +1,101 @@
+"""Files that are either whole or not there: written under another name, closed, flushed to the disk, renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+from disctrack.errors import OutputError
+
+_REMEDIES = {
+    errno.ENOSPC: "the disk is full. Free some space, or choose another place with -o",
+    errno.EDQUOT: "your quota is used up. Free some space, or choose another place with -o",
+    errno.EFBIG: "the file would exceed the size limit of this account or disk. Choose another place with -o",
+    errno.EROFS: "the disk is read-only. Choose another place with -o",
+    errno.EACCES: "no permission to write there. Choose another place with -o",
+    errno.EPERM: "no permission to write there. Choose another place with -o",
+}
+
+
+@contextlib.contextmanager
+def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
+    """Path to write to; when the block ends without an error it becomes `path` in one step, otherwise it is removed.
+
+    A killed process leaves `<name>.<host>-<process>.part`, which the next one on this host clears away.
+    suffix : end of the temporary name, for writers that derive the format from it
+    Raises OutputError if the disk is full, read-only or not ours.
+    """
+    part = path.with_name(f"{path.name}.{_host()}-{os.getpid()}.part{suffix}")
+    try:
+        make_folder(path.parent)
+        _clear_abandoned(path)
+        yield part
+        with part.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        os.replace(part, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise output_error(path, error) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: bytes | memoryview) -> None:
+    """Write `content` to `path`, whole or not at all. Raises OutputError."""
+    with whole_file(path) as part, part.open("wb") as stream:
+        stream.write(content)
+
+
+def make_folder(folder: Path) -> None:
+    """Create the folder and its parents. Raises OutputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(folder, error) from error
+
+
+def output_error(path: Path, error: OSError) -> OutputError:
+    """What to tell when `path` cannot be written."""
+    remedy = _REMEDIES.get(error.errno or 0, f"{error.strerror or error}. Choose another place with -o")
+    return OutputError(f"{path}: cannot be written: {remedy}.")
+
+
+def _host() -> str:
+    return re.sub(r"[^A-Za-z0-9_]", "_", socket.gethostname())
+
+
+def _clear_abandoned(path: Path) -> None:
+    """Remove what processes of this host that no longer live have left half-written under this name."""
+    for part in path.parent.glob("*.part*"):
+        found = re.fullmatch(rf"{re.escape(path.name)}\.{_host()}-(\d+)\.part.*", part.name)
+        if found and not _alive(int(found[1])):
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _alive(process: int) -> bool:
+    if os.name == "nt":  # signal 0 would end the process there; another's remains are left alone
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _sync_folder(folder: Path) -> None:
+    """The new name reaches the disk, too; not every file system can do that for a folder."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
