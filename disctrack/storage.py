@@ -143,9 +143,7 @@ def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> No
     names = [f"{name}_{unit}" for name, unit in zip(COORDINATES, units, strict=True)]
     header = ["frame", "time_s", *names, *(n.replace("_", "_sigma_") for n in names)]
     header += [*(f"reprojection_rms_{camera}_px" for camera in CAMERAS), "status"]
-    table = np.column_stack(
-        [trajectory.q * scale, trajectory.coordinate_sigma * scale, trajectory.reprojection_rms_px]
-    )
+    table = np.column_stack([trajectory.q * scale, trajectory.coordinate_sigma * scale, trajectory.reprojection_rms_px])
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(header)
@@ -242,9 +240,7 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
         "reduced_chi_square": Variable(
             trajectory.reduced_chi_square, ("time",), "1", "squared residuals over their predicted variance"
         ),
-        "status": Variable(
-            trajectory.frame_status, ("time",), "1", "why there is a pose, or none", flags(FrameStatus)
-        ),
+        "status": Variable(trajectory.frame_status, ("time",), "1", "why there is a pose, or none", flags(FrameStatus)),
     }
 
 
@@ -360,7 +356,9 @@ class _Reading:
 
     def _damaged(self, error: Exception) -> TrajectoryFileError:
         reason = " ".join(str(error).split())[:200]
-        return TrajectoryFileError(f"{self.path}: not a readable trajectory file ({reason}). Run disctrack track again.")
+        return TrajectoryFileError(
+            f"{self.path}: not a readable trajectory file ({reason}). Run disctrack track again."
+        )
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
@@ -411,8 +409,16 @@ def _rig(values: Mapping[str, NDArray], world_is_table: bool) -> StereoRig:
         )
     ]
     left, right = cameras
-    names = ("R_right_left", "t_right_left", "R_left_world", "t_left_world", "covariance")
-    return StereoRig(left, right, *(values[name] for name in names), world_is_table=world_is_table)
+    return StereoRig(
+        left,
+        right,
+        R_right_left=values["R_right_left"],
+        t_right_left=values["t_right_left"],
+        R_left_world=values["R_left_world"],
+        t_left_world=values["t_left_world"],
+        covariance=values["covariance"],
+        world_is_table=world_is_table,
+    )
 
 
 def _check_shapes(trajectory: Trajectory) -> None:

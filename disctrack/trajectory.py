@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
+from disctrack.frames import euler_jacobian
 
 Array = NDArray[np.float64]
 
@@ -91,10 +92,29 @@ class Trajectory:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """(n,) True where there is a pose."""
-        return np.isfinite(self.q).all(axis=1)
+        return np.asarray(np.isfinite(self.q).all(axis=1))
 
     @property
     def calibration_covariance(self) -> Array:
         """(n, 6, 6) part of the pose's covariance that comes from the rig and is common to all frames."""
         S = self.calibration_sensitivity
         return S @ self.rig.covariance @ np.swapaxes(S, -1, -2)
+
+    @property
+    def coordinate_sigma(self) -> Array:
+        """(n, 6) standard deviation of q from this frame's noise alone [m, rad]; psi and phi grow as 1/sin theta."""
+        return _coordinate_sigma(self.q, self.pose_covariance)
+
+    @property
+    def calibration_sigma(self) -> Array:
+        """(n, 6) standard deviation of q from the rig's covariance [m, rad]; an error that all frames share."""
+        return _coordinate_sigma(self.q, self.calibration_covariance)
+
+
+def _coordinate_sigma(q: Array, pose_covariance: Array) -> Array:
+    """Square roots of the diagonal, rotation vector converted to Euler angles; NaN where q is or an angle is free."""
+    J = euler_jacobian(q[:, 3], q[:, 4])
+    rotation = np.einsum("nij,njk,nik->ni", J, pose_covariance[:, 3:, 3:], J)
+    position = np.einsum("nii->ni", pose_covariance[:, :3, :3])
+    variance = np.concatenate([position, rotation], axis=1)
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))

@@ -1,0 +1,404 @@
+"""The trajectory file: equal when read back, open to other programs, whole or not there, honest about its origin."""
+
+import csv
+import dataclasses
+import errno
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from calibration.camera import N_RIG, Camera, StereoRig
+from disctrack import storage
+from disctrack.disc import MA_2014
+from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
+from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
+from disctrack.labelled import Variable
+from disctrack.storage import (
+    Provenance,
+    is_result_of,
+    read_group,
+    read_provenance,
+    read_trajectory,
+    write_csv,
+    write_group,
+    write_trajectory,
+)
+from disctrack.trajectory import FrameStatus, Trajectory
+
+PROVENANCE = Provenance("clip", {"images": "ab" * 32}, {"refine": True})
+
+
+def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
+    """A disc that turns, with noise of every kind and two frames without an answer."""
+    m = MA_2014.n_markers
+    t = np.arange(n) / 1000
+    q = np.column_stack([1e-3 * np.sin(t), 2e-3 * t, 0.02 + 0 * t, 30 * t, 0.4 + 0 * t, -25 * t])
+    halves = rng.normal(0, 1e-6, (n, 6, 6))
+    status = np.zeros(n, np.uint8)
+    status[[3, n - 1]] = FrameStatus.UNREADABLE, FrameStatus.MARKERS_NOT_FOUND
+    lost = status != 0
+    q[lost] = np.nan
+    quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*q[:, 3:].T)))
+    markers = rng.uniform(100, 400, (n, 2, m, 2))
+    markers[lost] = np.nan
+    rig_part = rng.normal(0, 1e-3, (N_RIG, N_RIG))
+    left = Camera(1500.0, 1501.0, 255.1, 256.2, (0.1, -0.2, 1e-4, 2e-4, 0.0), (512, 512))
+    right = Camera(1490.0, 1491.0, 250.1, 259.2, (0.1, -0.2, 1e-4, 2e-4, 0.3), (512, 512))
+    return Trajectory(
+        time=t,
+        frame=np.arange(n),
+        q=q,
+        pose_covariance=np.where(lost[:, None, None], np.nan, halves @ np.swapaxes(halves, 1, 2)),
+        calibration_sensitivity=rng.normal(size=(n, 6, N_RIG)),
+        quaternion=quaternion,
+        frame_status=status,
+        reprojection_rms_px=rng.uniform(0, 0.05, (n, 2)),
+        reduced_chi_square=rng.uniform(0.8, 1.2, n),
+        markers_px=markers,
+        markers_covariance_px2=rng.normal(size=(n, 2, m, 2, 2)),
+        markers_residual_px=rng.normal(size=(n, 2, m, 2)),
+        marker_status=rng.integers(0, 8, (n, 2, m), dtype=np.uint8),
+        disc=MA_2014,
+        rig=StereoRig(
+            left,
+            right,
+            rotation_from_euler(0.1, 0.2, 0.3),
+            np.array([-0.3, 0.01, 0.02]),
+            rotation_from_euler(1.1, 2.2, 0.3),
+            np.array([0.01, 0.02, 0.7]),
+            rig_part @ rig_part.T,
+            True,
+        ),
+        frame_rate=1000.0,
+        gravity=9.81,
+    )
+
+
+@pytest.fixture
+def trajectory(rng):
+    return make_trajectory(rng)
+
+
+@pytest.fixture
+def file(tmp_path, trajectory):
+    path = tmp_path / "trajectory.h5"
+    write_trajectory(path, trajectory, PROVENANCE)
+    return path
+
+
+def assert_equal(a, b, name=""):
+    """Equality of dataclasses to the last bit, arrays and their types included; NaN equals NaN."""
+    if dataclasses.is_dataclass(a):
+        assert type(a) is type(b)
+        for field in dataclasses.fields(a):
+            assert_equal(getattr(a, field.name), getattr(b, field.name), f"{name}.{field.name}")
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype, name
+        assert_array_equal(a, b, err_msg=name)
+    else:
+        assert a == b, name
+        assert type(a) is type(b), name
+
+
+def test_reading_back_gives_an_equal_trajectory(file, trajectory):
+    assert_equal(read_trajectory(file), trajectory)
+
+
+def test_a_changed_number_is_noticed_by_the_comparison(file, trajectory):
+    q = trajectory.q.copy()
+    q[5, 2] = np.nextafter(q[5, 2], 1)
+    with pytest.raises(AssertionError):
+        assert_equal(read_trajectory(file), dataclasses.replace(trajectory, q=q))
+
+
+def test_an_empty_trajectory_is_kept_as_one(tmp_path, rng):
+    full = make_trajectory(rng)
+    empty = dataclasses.replace(
+        full, **{f.name: v[:0] for f in dataclasses.fields(full) if isinstance(v := getattr(full, f.name), np.ndarray)}
+    )
+    write_trajectory(tmp_path / "empty.h5", empty, PROVENANCE)
+    assert_equal(read_trajectory(tmp_path / "empty.h5"), empty)
+
+
+def test_h5py_finds_units_axes_and_whole_chunks(file):
+    with h5py.File(file) as h5:
+        assert h5.attrs["complete"] == 1
+        for name in ("x", "psi", "x_sigma", "phi_sigma_calibration", "pose_covariance", "status", "markers/centre_px"):
+            dataset = h5[name]
+            assert dataset.attrs["units"]
+            assert dataset.attrs["long_name"]
+            assert dataset.dims[0][0].name == "/time"
+            assert dataset.shuffle
+            assert dataset.fletcher32
+            assert dataset.compression == "gzip"
+        assert h5["x"].attrs["units"] == "m"
+        assert h5["theta"].attrs["units"] == "rad"
+        kinds = set()
+        h5.visititems(lambda _, item: kinds.add(item.dtype.kind) if isinstance(item, h5py.Dataset) else None)
+        assert kinds <= set("iufO")  # O: text
+        meanings = dict(
+            zip(h5["status"].attrs["flag_values"], h5["status"].attrs["flag_meanings"].split(), strict=True)
+        )
+        assert meanings[h5["status"][3]] == "unreadable"
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
+def test_xarray_opens_root_and_groups_with_their_axes(file, trajectory, engine):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
+    with xarray.open_dataset(file, engine=engine) as data:
+        assert data["x"].dims == ("time",)
+        assert data["x"].attrs["units"] == "m"
+        assert data["pose_covariance"].dims == ("time", "pose_component", "pose_component_2")
+        assert list(data["camera"].values) == ["left", "right"]
+        assert_array_equal(data["time"].values, trajectory.time)
+        assert_array_equal(data["theta"].values, trajectory.q[:, 4])
+        assert float(data["reprojection_rms_px"].sel(camera="right")[2]) == trajectory.reprojection_rms_px[2, 1]
+    with xarray.open_dataset(file, engine=engine, group="markers") as data:
+        assert data["centre_px"].dims == ("time", "camera", "marker", "axis")
+        assert_array_equal(data["centre_px"].values, trajectory.markers_px)
+    with xarray.open_dataset(file, engine=engine, group="calibration") as data:
+        assert_array_equal(data["covariance"].values, trajectory.rig.covariance)
+
+
+def test_pandas_makes_a_table_of_the_coordinates(file, trajectory):
+    pandas = pytest.importorskip("pandas")
+    with h5py.File(file) as h5:
+        columns = {name: item[()] for name, item in h5.items() if isinstance(item, h5py.Dataset) and item.ndim == 1}
+        n = len(columns["time"])
+        table = pandas.DataFrame({name: values for name, values in columns.items() if len(values) == n}).set_index(
+            "time"
+        )
+    assert_array_equal(table["z"], trajectory.q[:, 2])
+    assert {"frame", "x_sigma", "phi", "status"} <= set(table.columns)
+
+
+def test_the_csv_is_in_millimetres_and_degrees_with_gaps_empty(tmp_path, trajectory):
+    write_csv(tmp_path / "trajectory.csv", trajectory)
+    with (tmp_path / "trajectory.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(trajectory)
+    # seven digits are written
+    assert_allclose(float(rows[7]["theta_deg"]), np.degrees(trajectory.q[7, 4]), rtol=1e-6)
+    assert_allclose(float(rows[7]["z_sigma_mm"]), 1e3 * trajectory.coordinate_sigma[7, 2], rtol=1e-6)
+    assert rows[3]["x_mm"] == ""
+    assert rows[3]["status"] == "unreadable"
+
+
+def test_sigmas_of_angles_agree_with_perturbed_poses(trajectory, rng):
+    from disctrack.frames import euler_from_rotation, rotation_from_vector
+
+    i, count = 5, 20000
+    small = trajectory.pose_covariance[i] / np.abs(trajectory.pose_covariance[i]).max() * 1e-8
+    draws = rng.multivariate_normal(np.zeros(6), small, count)
+    R = rotation_from_euler(*trajectory.q[i, 3:])
+    turned = euler_from_rotation(rotation_from_vector(draws[:, 3:]) @ R)
+    spread = np.std(np.unwrap(turned, axis=0), axis=0)
+    scaled = dataclasses.replace(trajectory, pose_covariance=np.broadcast_to(small, trajectory.pose_covariance.shape))
+    # relative scatter of a standard deviation of 20000 draws is 0.5 %: four of them
+    assert_allclose(scaled.coordinate_sigma[i, 3:], spread, rtol=0.02)
+
+
+def test_a_stage_adds_its_group_and_leaves_the_rest_untouched(file, trajectory):
+    speed = Variable(np.arange(len(trajectory), dtype=float), ("time",), "m/s", "speed")
+    for scale in (1.0, 2.0):  # the second time it replaces its own
+        variables = {"speed": dataclasses.replace(speed, data=scale * np.asarray(speed.data))}
+        write_group(file, "motion", variables, attributes={"window_s": 0.01})
+    arrays, attributes = read_group(file, "motion")
+    assert_array_equal(arrays["speed"], 2.0 * np.arange(len(trajectory)))
+    assert attributes["window_s"] == 0.01
+    assert_equal(read_trajectory(file), trajectory)
+    assert is_result_of(file, PROVENANCE)
+
+
+def test_a_missing_group_is_told_with_those_that_are_there(file):
+    with pytest.raises(TrajectoryFileError, match=r"no group 'energy'.*markers"):
+        read_group(file, "energy")
+
+
+def test_an_existing_file_is_kept_unless_told_otherwise(file, trajectory):
+    before = file.read_bytes()
+    with pytest.raises(OutputError, match="--overwrite"):
+        write_trajectory(file, trajectory, PROVENANCE)
+    assert file.read_bytes() == before
+    write_trajectory(file, trajectory, dataclasses.replace(PROVENANCE, recording="other"), overwrite=True)
+    assert read_provenance(file).recording == "other"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"inputs": {"images": "cd" * 32}},
+        {"settings": {"refine": False}},
+        {"version": "0.0.0"},
+    ],
+)
+def test_a_result_is_reused_only_for_the_same_inputs_settings_and_version(file, change):
+    assert is_result_of(file, PROVENANCE)
+    assert not is_result_of(file, dataclasses.replace(PROVENANCE, **change))
+
+
+def test_an_incomplete_file_is_no_result(file):
+    with h5py.File(file, "r+") as h5:
+        h5.attrs["complete"] = 0
+    assert not is_result_of(file, PROVENANCE)
+    with pytest.raises(TrajectoryFileError, match="not complete"):
+        read_trajectory(file)
+
+
+def test_a_file_of_another_program_is_refused(tmp_path):
+    with h5py.File(tmp_path / "other.h5", "w") as h5:
+        h5["x"] = np.arange(3.0)
+    with pytest.raises(TrajectoryFileError, match="not a trajectory"):
+        read_trajectory(tmp_path / "other.h5")
+    with pytest.raises(TrajectoryFileError, match="no such file"):
+        read_trajectory(tmp_path / "nowhere.h5")
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_disk_that_refuses_leaves_no_file_and_the_old_result(file, trajectory, monkeypatch, error):
+    before = file.read_bytes()
+
+    def refuse(descriptor):
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(OutputError, match=r"cannot be written.*-o"):
+        write_trajectory(file, trajectory, PROVENANCE, overwrite=True)
+    assert os.listdir(file.parent) == [file.name]
+    assert file.read_bytes() == before
+
+
+def run_python(code: str, folder, *arguments) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of file sizes are POSIX")
+def test_a_file_cut_off_by_the_system_is_removed(file, trajectory):
+    """The kernel itself refuses the write after 20 kB, as a full disk does."""
+    code = """
+        import resource, signal, sys
+        from pathlib import Path
+        from disctrack.errors import OutputError
+        from disctrack.storage import read_provenance, read_trajectory, write_trajectory
+        path = Path(sys.argv[1])
+        trajectory, provenance = read_trajectory(path), read_provenance(path)
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+        try:
+            write_trajectory(path.with_name("second.h5"), trajectory, provenance)
+        except OutputError as error:
+            print(error)
+    """
+    assert file.stat().st_size > 20_000
+    process = run_python(code, file.parent, file)
+    output, errors = process.communicate(timeout=60)
+    assert "second.h5: cannot be written" in output, errors
+    assert os.listdir(file.parent) == [file.name]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+def test_a_killed_writer_leaves_nothing_that_looks_whole(file, trajectory):
+    """Killed while the bytes are on their way; the next writer also clears away what was left."""
+    code = """
+        import os, sys, time
+        from pathlib import Path
+        from disctrack.storage import read_provenance, read_trajectory, write_trajectory
+        path = Path(sys.argv[1])
+        trajectory, provenance = read_trajectory(path), read_provenance(path)
+        def wait(descriptor):
+            print("written", flush=True)
+            time.sleep(60)
+        os.fsync = wait
+        write_trajectory(path.with_name("second.h5"), trajectory, provenance)
+    """
+    process = run_python(code, file.parent, file)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "written\n"
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)
+    second = file.with_name("second.h5")
+    assert not second.exists()
+    assert len(list(file.parent.glob("*.part"))) == 1
+    write_trajectory(second, trajectory, PROVENANCE)
+    assert sorted(os.listdir(file.parent)) == ["second.h5", file.name]
+
+
+_fuzz = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@_fuzz
+@given(content=st.binary(max_size=600), signature=st.booleans())
+def test_any_bytes_are_refused_with_a_message(tmp_path, content, signature):
+    path = tmp_path / "any.h5"
+    path.write_bytes((b"\x89HDF\r\n\x1a\n" if signature else b"") + content)
+    with pytest.raises(TrajectoryFileError):
+        read_trajectory(path)
+
+
+@pytest.fixture(scope="session")
+def whole_content(tmp_path_factory) -> bytes:
+    path = tmp_path_factory.mktemp("whole") / "trajectory.h5"
+    write_trajectory(path, make_trajectory(np.random.default_rng(1)), PROVENANCE)
+    return path.read_bytes()
+
+
+@_fuzz
+@given(cut=st.floats(0, 0.999))
+def test_a_truncated_file_is_refused_wherever_it_is_cut(tmp_path, whole_content, cut):
+    path = tmp_path / "cut.h5"
+    path.write_bytes(whole_content[: int(cut * len(whole_content))])
+    with pytest.raises(TrajectoryFileError):
+        read_trajectory(path)
+    assert not is_result_of(path, PROVENANCE)
+
+
+@_fuzz
+@given(
+    keys=st.lists(
+        st.sampled_from(["x", "time", "markers", "markers/status", "calibration/covariance", "disc"]), min_size=1
+    )
+)
+def test_a_file_without_some_of_its_parts_is_refused(tmp_path, whole_content, keys):
+    path = tmp_path / "parts.h5"
+    path.write_bytes(whole_content)
+    with h5py.File(path, "r+") as h5:
+        for key in keys:
+            if key in h5:
+                del h5[key]
+    with pytest.raises(DiscTrackError):
+        read_trajectory(path)
+
+
+def test_a_wrong_shape_is_refused(file):
+    with h5py.File(file, "r+") as h5:
+        del h5["quaternion"]
+        h5["quaternion"] = np.zeros((30, 3))
+    with pytest.raises(TrajectoryFileError, match="quaternion has shape"):
+        read_trajectory(file)
+
+
+def test_a_trajectory_of_5000_frames_is_written_within_seconds(tmp_path, rng):
+    """Guard against an accidental slow path (per-row chunks, unbuffered writes); 0.5-1 s where this was written."""
+    trajectory = make_trajectory(rng, 5000)
+    start = time.perf_counter()
+    write_trajectory(tmp_path / "long.h5", trajectory, PROVENANCE)
+    assert time.perf_counter() - start < 20
+    assert storage.read_trajectory(tmp_path / "long.h5").time[-1] == trajectory.time[-1]
