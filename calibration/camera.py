@@ -121,7 +121,7 @@ def normalise(pixels: Array, camera: Camera, iterations: int = 20) -> Array:
             axis=-1,
         )
         ab = ab + step
-        if not np.any(np.abs(step) > 1e-14):
+        if not np.any(np.abs(step) > 1e-13):
             break
     found = project(np.concatenate([ab, ones], axis=-1), camera)
     bad = ~(np.linalg.norm(found - target, axis=-1) < 1e-6)

@@ -1,0 +1,183 @@
+"""What all frames of a recording share, refined over the whole sequence: the dots' places, the rig within its sigma.
+
+Printed dots are off by tens of micrometres, the rig by its calibration's sigma; both leave the same residual in every
+frame, and a few hundred frames of a moving disc determine them far better than the calibration did. Shared parameters
+s and one pose per frame are fitted together; the poses are eliminated frame by frame (Schur complement):
+
+    (sum_i C_i^T C_i - C_i^T P_i (P_i^T P_i)^-1 P_i^T C_i + prior^-1) ds = sum_i C_i^T (1 - P_i (...)^-1 P_i^T) r_i
+
+P, C: whitened Jacobians by the pose and by s. Priors: the rig's own covariance; DOT_SIGMA for every dot in the plane
+of the face. Gauge: moving or turning the whole pattern on the disc cannot be told from moving the disc, so the prior
+keeps the mean displacement and turn of the pattern at zero: the centre of mass is taken to lie where the declared
+pattern says; the cameras do not see it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import N_RIG, StereoRig
+from disctrack.disc import Disc
+from disctrack.pose import fit_poses, marker_pixels, whitening
+
+Array = NDArray[np.float64]
+
+DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
+# The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
+# not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
+SYSTEMATIC_PX = 0.002
+ITERATIONS = 4
+MIN_FRAMES = 10
+
+
+@dataclass(frozen=True)
+class AsBuilt:
+    """Rig and disc after the refinement, and what it changed."""
+
+    rig: StereoRig  # with the covariance that remains
+    disc: Disc
+    marker_shift: Array  # (m, 3) [m] refined minus declared, body axes; third component 0
+    marker_shift_sigma: Array  # (m, 2) [m]
+    rig_shift_sigmas: Array  # (30,) change of the rig's parameters in units of their prior sigma; 0 where fixed
+    reduced_chi_square_before: float
+    reduced_chi_square_after: float
+    n_frames: int  # that entered
+
+
+def refine_as_built(
+    markers_px: Array,
+    markers_covariance_px2: Array,
+    rig: StereoRig,
+    disc: Disc,
+    R: Array,
+    t: Array,
+    *,
+    refine_markers: bool = True,
+    refine_rig: bool = True,
+    max_frames: int = 2000,
+) -> AsBuilt:
+    """Refine dots and rig from the marker centres of n frames; shapes as in `pose.fit_poses`.
+
+    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared.
+    """
+    good = np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4))
+    rows = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).astype(int))] if len(good) else good
+    m = disc.n_markers
+    unchanged = AsBuilt(
+        rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA), np.zeros(N_RIG), np.nan, np.nan, len(rows)
+    )
+    if len(rows) < MIN_FRAMES or not (refine_markers or refine_rig):
+        return unchanged
+
+    prior_sigma = np.concatenate([np.sqrt(np.diag(rig.covariance)), np.full(2 * m, DOT_SIGMA)])
+    free = np.concatenate([(prior_sigma[:N_RIG] > 0) & refine_rig, np.full(2 * m, refine_markers)])
+    information = _prior_information(rig.covariance, free, m)
+    observed, covariance = markers_px[rows], markers_covariance_px2[rows]
+    R, t = R[rows], t[rows]
+    shift = np.zeros(N_RIG + 2 * m)
+    current_rig, current_disc = rig, disc
+    before = after = np.nan
+    for iteration in range(ITERATIONS):
+        fits = fit_poses(
+            observed, covariance, current_rig, current_disc.marker_centres_body, R, t,
+            reject_outliers=iteration > 0, with_sensitivity=False,
+        )  # fmt: skip
+        ok = fits.converged
+        R, t = np.where(ok[:, None, None], fits.R_world_body, R), np.where(ok[:, None], fits.t_world_body, t)
+        after = float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1))
+        if iteration == 0:
+            before = after
+        used = fits.used & ok[:, None, None]
+        normal, gradient = _shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
+        # common errors: the data's information is bounded by what SYSTEMATIC_PX allows
+        scale = _information_scale(covariance, used)
+        matrix = scale * normal + information
+        rhs = scale * gradient - information @ shift[free]
+        step = np.zeros_like(shift)
+        step[free] = np.linalg.solve(matrix, rhs)
+        shift += step
+        current_rig = rig.perturbed(shift[:N_RIG])
+        current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + _body_shift(shift, m))
+        if np.all(np.abs(step[free]) < 0.02 * prior_sigma[free]) and iteration > 0:
+            break
+    remaining = np.zeros((len(shift), len(shift)))
+    remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
+    rig_covariance = remaining[:N_RIG, :N_RIG] if refine_rig else rig.covariance
+    with np.errstate(invalid="ignore", divide="ignore"):
+        in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
+    return AsBuilt(
+        rig=replace(current_rig, covariance=rig_covariance),
+        disc=current_disc,
+        marker_shift=_body_shift(shift, m),
+        marker_shift_sigma=np.sqrt(np.diag(remaining)[N_RIG:]).reshape(m, 2),
+        rig_shift_sigmas=in_sigmas,
+        reduced_chi_square_before=before,
+        reduced_chi_square_after=after,
+        n_frames=len(rows),
+    )
+
+
+def _prior_information(rig_covariance: Array, free: NDArray[np.bool_], m: int) -> Array:
+    information = np.zeros((len(free), len(free)))
+    rig_free = np.flatnonzero(free[:N_RIG])
+    if rig_free.size:
+        block = rig_covariance[np.ix_(rig_free, rig_free)]
+        scale = np.sqrt(np.diag(block))
+        correlation = block / np.outer(scale, scale)
+        information[np.ix_(rig_free, rig_free)] = np.linalg.pinv(correlation, hermitian=True, rcond=1e-13) / np.outer(
+            scale, scale
+        )
+    dots = np.arange(N_RIG, N_RIG + 2 * m)
+    information[dots, dots] = DOT_SIGMA**-2
+    return information[np.ix_(free, free)]
+
+
+def _body_shift(shift: Array, m: int) -> Array:
+    return np.column_stack([shift[N_RIG:].reshape(m, 2), np.zeros(m)])
+
+
+def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:
+    """Factor on the data's information: n frames of sigma count at most as (sigma / SYSTEMATIC_PX)^2 frames."""
+    variance = float(np.median(0.5 * np.trace(covariance, axis1=-2, axis2=-1)[used]))
+    independent = variance / SYSTEMATIC_PX**2
+    n = len(used)
+    return 1.0 / (1.0 + n / max(independent, 1e-9))
+
+
+def _shared_normal_equations(
+    observed: Array,
+    covariance: Array,
+    used: NDArray[np.bool_],
+    rig: StereoRig,
+    disc: Disc,
+    R: Array,
+    t: Array,
+    free: NDArray[np.bool_],
+) -> tuple[Array, Array]:
+    size = int(free.sum())
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    m = disc.n_markers
+    for block in np.array_split(np.arange(len(R)), max(1, len(R) // 256)):
+        pixels, P = marker_pixels(R[block], t[block], rig, disc.marker_centres_body)
+        _, d_world, d_rig = rig.project_with_jacobians(
+            disc.marker_centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None]
+        )
+        d_body = d_world @ R[block][:, None, None]
+        C = np.zeros((len(block), 2, m, 2, N_RIG + 2 * m))
+        C[..., :N_RIG] = d_rig
+        for k in range(m):
+            C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
+        seen = used[block]
+        W = np.where(seen[..., None, None], whitening(np.where(seen[..., None, None], covariance[block], np.eye(2))), 0)
+        r = (W @ np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None])[..., 0].reshape(len(block), -1)
+        P = (W @ P).reshape(len(block), -1, 6)
+        C = (W @ C[..., free]).reshape(len(block), -1, size)
+        PtP = np.swapaxes(P, 1, 2) @ P + 1e-12 * np.eye(6)
+        projected = C - P @ np.linalg.solve(PtP, np.swapaxes(P, 1, 2) @ C)
+        flat = projected.reshape(-1, size)
+        normal += flat.T @ C.reshape(-1, size)
+        gradient += flat.T @ r.reshape(-1)
+    return 0.5 * (normal + normal.T), gradient

@@ -1,0 +1,393 @@
+"""From pairs of images to the trajectory: acquisition, tracking by prediction, pose of every frame.
+
+The loop over frames is one compiled call per block (`_kernels.track_frames`); here stands what happens at its ends:
+finding the disc at the start and after a loss, measuring blur and noise, fitting all poses, and saying why a frame has
+none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import StereoRig
+from disctrack import _kernels as kernels
+from disctrack import frames
+from disctrack.acquisition import acquire, symmetry_order
+from disctrack.as_built import AsBuilt, refine_as_built
+from disctrack.disc import Disc
+from disctrack.errors import TrackingError
+from disctrack.markers import (
+    TYPICAL_BLUR_PX,
+    DotCentres,
+    NoiseModel,
+    TemplateLimits,
+    dot_centres,
+    measure_noise,
+    normalised_maps,
+)
+from disctrack.pose import PoseFits, fit_poses
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+Array = NDArray[np.float64]
+Images = NDArray[np.uint8] | NDArray[np.uint16]
+PairBlock = tuple[int, Images, NDArray[np.bool_]]  # first index, (n, 2, H, W), readable (n, 2)
+
+# A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
+MAX_PREDICTION_RMS_PX = 2.0
+NOISE_FRAMES = 12
+MIN_GOOD_DOT_IMAGES = 6
+SHARED_FRAMES = 2000  # frames that enter the refinement of what all frames share; more add nothing but time
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """What a user may choose; the whole of it is written into the result."""
+
+    limits: TemplateLimits = field(default_factory=TemplateLimits)
+    refine_markers: bool = True  # the dots' places on the disc, over the whole sequence
+    refine_rig: bool = True  # the rig within its own calibration covariance
+    reject_outliers: bool = True
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """A trajectory and what the run found out on the way."""
+
+    trajectory: Trajectory
+    noise: tuple[NoiseModel, NoiseModel]  # left, right
+    blur_px: tuple[float, float]
+    as_built: AsBuilt
+    acquisitions: int  # times the disc had to be searched for without a prior and was found
+    warnings: tuple[str, ...]
+
+
+@dataclass
+class _Tables:
+    """What the loop over frames fills."""
+
+    results: Array  # (n, 2, m, 12)
+    status: NDArray[np.uint8]  # (n, 2, m)
+    R: Array  # (n, 3, 3)
+    t: Array  # (n, 3)
+    frame_status: NDArray[np.uint8]  # (n,)
+
+
+@dataclass
+class _Follower:
+    """The state of the compiled loop between blocks."""
+
+    rig: StereoRig
+    disc: Disc
+    limits: TemplateLimits
+    maps_x: Array
+    maps_y: Array
+    noise: list[NoiseModel]
+    blur: list[float]
+    last: tuple[Array, Array]
+    before: tuple[Array, Array]
+    tracking: bool = False
+    measured: bool = False  # blur and noise known
+    acquisitions: int = 0
+    first_reason: str = ""
+
+    def run(self, images: Images, readable: NDArray[np.bool_], tables: _Tables, at: slice) -> int:
+        """Follow the disc through images; returns the number of frames before it was lost."""
+        poses = self.rig.camera_poses()
+        return int(
+            kernels.track_frames(
+                images,
+                readable,
+                self.maps_x,
+                self.maps_y,
+                np.stack([camera.parameters for camera in self.rig.cameras]),
+                np.stack([R for R, _ in poses]),
+                np.stack([t for _, t in poses]),
+                np.ascontiguousarray(self.disc.marker_centres_body),
+                0.5 * self.disc.marker_diameter,
+                self.disc.radius,
+                np.array(self.blur),
+                np.stack([noise.parameters for noise in self.noise]),
+                self.limits.array(),
+                *self.last,
+                *self.before,
+                tables.results[at],
+                tables.status[at],
+                tables.R[at],
+                tables.t[at],
+                MAX_PREDICTION_RMS_PX,
+            )
+        )
+
+    def start_from(self, pose: tuple[Array, Array], following: tuple[Array, Array] | None) -> None:
+        """Set the last two poses so that the next prediction is `pose`, with the velocity that leads on to the next."""
+        R, t = (np.ascontiguousarray(part) for part in pose)
+        turn, shift = np.eye(3), np.zeros(3)
+        if following is not None:
+            turn, shift = following[0] @ R.T, following[1] - t
+        self.last = (np.ascontiguousarray(turn.T @ R), t - shift)
+        self.before = (np.ascontiguousarray(turn.T @ self.last[0]), t - 2 * shift)
+
+
+def track(
+    blocks: Iterable[PairBlock],
+    n_frames: int,
+    rig: StereoRig,
+    disc: Disc,
+    frame_rate: float,
+    *,
+    gravity: float = 9.81,
+    settings: TrackingSettings | None = None,
+    timestamps: Array | None = None,
+    first_frame: int = 0,
+    progress: Callable[[int], None] = lambda n: None,
+) -> Tracking:
+    """Measure the disc's pose in every pair of a recording.
+
+    blocks: (first index, images (n, 2, H, W), readable (n, 2)) in order, index 0 being the first pair to measure;
+    n_frames: their total. frame_rate [Hz]; timestamps (n_frames,) [s] where the camera wrote them; first_frame: number
+    of pair 0 in its sequence. progress is called with the number of pairs done.
+    Raises TrackingError if the images do not belong to the rig or if the disc is found in no frame at all.
+    """
+    settings = settings or TrackingSettings()
+    m = disc.n_markers
+    tables = _Tables(
+        results=np.full((n_frames, 2, m, kernels.N_RESULT), np.nan),
+        status=np.full((n_frames, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
+        R=np.full((n_frames, 3, 3), np.nan),
+        t=np.full((n_frames, 3), np.nan),
+        frame_status=np.full(n_frames, FrameStatus.NOT_PROCESSED, np.uint8),
+    )
+    maps = [normalised_maps(camera) for camera in rig.cameras]
+    follower = _Follower(
+        rig,
+        disc,
+        settings.limits,
+        np.stack([x for x, _ in maps]),
+        np.stack([y for _, y in maps]),
+        [NoiseModel(1.0, 0.02), NoiseModel(1.0, 0.02)],
+        [TYPICAL_BLUR_PX, TYPICAL_BLUR_PX],
+        (np.eye(3), np.zeros(3)),
+        (np.eye(3), np.zeros(3)),
+    )
+    for start, images, readable in blocks:
+        _check_images(images, rig)
+        _follow_block(follower, images, readable, tables, start)
+        progress(len(images))
+    if not np.isfinite(tables.t).any():
+        raise TrackingError(
+            f"the disc was found in none of {n_frames} pairs. First pair: "
+            + (follower.first_reason or "no image could be read")
+        )
+    return _assemble(follower, tables, settings, frame_rate, gravity, timestamps, first_frame)
+
+
+def _check_images(images: Images, rig: StereoRig) -> None:
+    height, width = images.shape[-2:]
+    for name, camera in zip(frames.CAMERAS, rig.cameras, strict=True):
+        if camera.image_size != (width, height):
+            raise TrackingError(
+                f"images are {width} x {height} px, but the rig's {name} camera was calibrated at "
+                f"{camera.image_size[0]} x {camera.image_size[1]} px: calibrate with views of the recording's own "
+                "size, or name the rig that belongs to it"
+            )
+
+
+def _follow_block(
+    follower: _Follower, images: Images, readable: NDArray[np.bool_], tables: _Tables, start: int
+) -> None:
+    n, i = len(images), 0
+    while i < n:
+        if not readable[i].any():
+            tables.frame_status[start + i] = FrameStatus.UNREADABLE
+            follower.tracking = False
+            i += 1
+            continue
+        fresh = not follower.tracking
+        if fresh and not _acquire(follower, images[i:], readable[i:]):
+            tables.frame_status[start + i] = FrameStatus.MARKERS_NOT_FOUND
+            i += 1
+            continue
+        done = follower.run(images[i:], readable[i:], tables, slice(start + i, start + n))
+        tables.frame_status[start + i : start + i + done] = FrameStatus.MEASURED
+        i += done
+        if i < n:
+            follower.tracking = False
+            if fresh and done == 0:  # found by its blobs, but its dots are refused: this frame has no answer
+                tables.frame_status[start + i] = FrameStatus.MARKERS_NOT_FOUND
+                i += 1
+
+
+def _acquire(follower: _Follower, images: Images, readable: NDArray[np.bool_]) -> bool:
+    """Search the first pair (and the second, for the velocity); the first time also measure blur and noise."""
+    found = [
+        acquire(
+            np.where(readable[k, 0], images[k, 0], 0),
+            np.where(readable[k, 1], images[k, 1], 0),
+            follower.rig,
+            follower.disc,
+        )
+        for k in range(min(2, len(images)))
+        if readable[k].any()
+    ]
+    first = found[0]
+    if first.R_world_body is None or first.t_world_body is None:
+        follower.first_reason = follower.first_reason or first.reason
+        return False
+    pose = (first.R_world_body, first.t_world_body)
+    following = None
+    if len(found) == 2 and found[1].R_world_body is not None and found[1].t_world_body is not None:
+        following = (found[1].R_world_body, found[1].t_world_body)
+    if not follower.measured:
+        _measure_blur_and_noise(follower, images, readable, pose, following)
+    follower.start_from(pose, following)
+    follower.tracking = True
+    follower.acquisitions += 1
+    return True
+
+
+def _measure_blur_and_noise(
+    follower: _Follower,
+    images: Images,
+    readable: NDArray[np.bool_],
+    pose: tuple[Array, Array],
+    following: tuple[Array, Array] | None,
+) -> None:
+    n, m = min(NOISE_FRAMES, len(images)), follower.disc.n_markers
+    for _ in range(2):  # the second time with the blur and the noise of the first
+        follower.start_from(pose, following)
+        trial = _Tables(
+            np.full((n, 2, m, kernels.N_RESULT), np.nan),
+            np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
+            np.full((n, 3, 3), np.nan),
+            np.full((n, 3), np.nan),
+            np.zeros(n, np.uint8),
+        )
+        done = follower.run(images[:n], readable[:n], trial, slice(0, n))
+        if done == 0:
+            return
+        for camera, (R_cw, t_cw) in enumerate(follower.rig.camera_poses()):
+            good = trial.status[:done, camera] == MarkerStatus.MEASURED
+            if not good.any():
+                continue
+            follower.blur[camera] = float(np.median(trial.results[:done, camera, :, kernels.FIT_SIGMA][good]))
+            follower.noise[camera] = measure_noise(
+                [images[k, camera] for k in range(done)],
+                follower.rig.cameras[camera],
+                [(R_cw @ trial.R[k], R_cw @ trial.t[k] + t_cw) for k in range(done)],
+                follower.disc,
+                (follower.maps_x[camera], follower.maps_y[camera]),
+            )
+    follower.measured = True
+
+
+def _assemble(
+    follower: _Follower,
+    tables: _Tables,
+    settings: TrackingSettings,
+    frame_rate: float,
+    gravity: float,
+    timestamps: Array | None,
+    first_frame: int,
+) -> Tracking:
+    dots = dot_centres(tables.results, tables.status)
+    n = len(tables.t)
+    as_built = refine_as_built(
+        dots.pixels,
+        dots.covariance_px2,
+        follower.rig,
+        follower.disc,
+        tables.R,
+        tables.t,
+        refine_markers=settings.refine_markers,
+        refine_rig=settings.refine_rig,
+        max_frames=SHARED_FRAMES,
+    )
+    fits = fit_poses(
+        dots.pixels,
+        dots.covariance_px2,
+        as_built.rig,
+        as_built.disc.marker_centres_body,
+        tables.R,
+        tables.t,
+        reject_outliers=settings.reject_outliers,
+    )
+    time = np.asarray(timestamps, float) if timestamps is not None else (first_frame + np.arange(n)) / frame_rate
+    trajectory = _trajectory(dots, fits, tables, as_built, time, first_frame, frame_rate, gravity)
+    return Tracking(
+        trajectory=trajectory,
+        noise=(follower.noise[0], follower.noise[1]),
+        blur_px=(follower.blur[0], follower.blur[1]),
+        as_built=as_built,
+        acquisitions=follower.acquisitions,
+        warnings=_warnings(follower, trajectory),
+    )
+
+
+def _trajectory(
+    dots: DotCentres,
+    fits: PoseFits,
+    tables: _Tables,
+    as_built: AsBuilt,
+    time: Array,
+    first_frame: int,
+    frame_rate: float,
+    gravity: float,
+) -> Trajectory:
+    n = len(time)
+    euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
+    euler[~fits.converged] = np.nan
+    status = tables.frame_status.copy()
+    followed = status == FrameStatus.MEASURED
+    per_camera = fits.used.sum(axis=2)
+    total = per_camera.sum(axis=1)
+    status[followed & (total < MIN_GOOD_DOT_IMAGES)] = FrameStatus.FEW_MARKERS
+    status[followed & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
+    status[followed & (total < 3)] = FrameStatus.MARKERS_NOT_FOUND
+    status[followed & (total >= 3) & ~fits.converged] = FrameStatus.NOT_CONVERGED
+    marker_status = dots.status.copy()
+    seen = dots.status == MarkerStatus.MEASURED
+    marker_status[seen & ~fits.used & fits.converged[:, None, None]] = MarkerStatus.REJECTED
+    squared = np.where(fits.used, np.sum(fits.residuals_px**2, axis=-1), 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.sqrt(squared.sum(axis=2) / per_camera)
+        quaternion = frames.continuous_quaternions(frames.quaternion_from_rotation(fits.R_world_body))
+    return Trajectory(
+        time=time,
+        frame=first_frame + np.arange(n),
+        q=np.column_stack([fits.t_world_body, euler]),
+        pose_covariance=fits.covariance,
+        calibration_sensitivity=fits.sensitivity,
+        quaternion=quaternion,
+        frame_status=status,
+        reprojection_rms_px=rms,
+        reduced_chi_square=fits.reduced_chi_square,
+        markers_px=dots.pixels,
+        markers_covariance_px2=dots.covariance_px2,
+        markers_residual_px=fits.residuals_px,
+        marker_status=marker_status,
+        disc=as_built.disc,
+        rig=as_built.rig,
+        frame_rate=frame_rate,
+        gravity=gravity,
+    )
+
+
+def _warnings(follower: _Follower, trajectory: Trajectory) -> tuple[str, ...]:
+    warnings = []
+    order = symmetry_order(follower.disc)
+    if order > 1:
+        warnings.append(
+            f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
+            f"multiples of that (its rate is not affected)"
+        )
+    chi2 = np.nanmedian(trajectory.reduced_chi_square)
+    if chi2 > 2.0:
+        warnings.append(
+            f"the dots miss their fitted places by {np.sqrt(chi2):.1f} times their own sigma: the calibration or the "
+            "declared marker centres are off, or a camera moved after the calibration"
+        )
+    return tuple(warnings)
