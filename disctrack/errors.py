@@ -3,6 +3,7 @@
 from calibration.errors import CalibrationError, DiscTrackError, RigFileError
 
 __all__ = [
+    "AnalysisError",
     "CalibrationError",
     "DiscTrackError",
     "OutputError",
@@ -12,6 +13,10 @@ __all__ = [
     "TrackingError",
     "TrajectoryFileError",
 ]
+
+
+class AnalysisError(DiscTrackError):
+    """A trajectory does not hold enough for what was asked of it."""
 
 
 class RecordingError(DiscTrackError):

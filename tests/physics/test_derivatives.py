@@ -1,0 +1,238 @@
+"""Velocities and accelerations against true motions, with the noise of real poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.derivatives import differentiate
+from disctrack.errors import AnalysisError
+from disctrack.frames import rotation_from_vector, vector_from_rotation
+from disctrack.propagation import propagate, rates
+
+QUANTITIES = ("position", "rotation", "velocity", "omega", "acceleration", "alpha")
+MOTIONS = {
+    "from 9 degrees to rest": dict(theta_deg=9, duration=3.0),
+    "25 degrees, nutating": dict(theta_deg=25, duration=0.6, nutation=0.1),
+    "60 degrees, nutating": dict(theta_deg=60, duration=0.8, nutation=0.2),
+}
+
+
+def errors(motion, truth):
+    turn = vector_from_rotation(truth.R @ np.swapaxes(motion.R_world_body, 1, 2))
+    return np.concatenate(
+        [
+            motion.position - truth.position,
+            -turn,
+            motion.velocity - truth.velocity,
+            motion.omega_world - truth.omega,
+            motion.acceleration - truth.acceleration,
+            motion.alpha_world - truth.alpha,
+        ],
+        axis=1,
+    )
+
+
+def squared_error_over_variance(motion, truth, frames=slice(None)):
+    """Per quantity, squared error over predicted covariance per degree of freedom, mean over the frames."""
+    e = errors(motion, truth)[frames]
+    C = motion.covariance[frames]
+    result = {}
+    for i, name in enumerate(QUANTITIES):
+        part = slice(3 * i, 3 * i + 3)
+        result[name] = np.mean(np.einsum("ni,nij,nj->n", e[:, part], np.linalg.inv(C[:, part, part]), e[:, part]) / 3)
+    return result
+
+
+def mean_ratio(name, seeds, true_motion, as_tracked):
+    truth = true_motion(**MOTIONS[name])[-700:]
+    found = [
+        squared_error_over_variance(differentiate(as_tracked(truth, np.random.default_rng(seed))), truth)
+        for seed in range(seeds)
+    ]
+    return {quantity: np.mean([f[quantity] for f in found]) for quantity in QUANTITIES}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_squared_error_is_near_the_predicted_variance(name, true_motion, as_tracked):
+    # smoothed noise is correlated over 20 frames: a copy holds 100 values and scatters by 15 %, the mean of 4 by 8 %
+    for quantity, ratio in mean_ratio(name, 4, true_motion, as_tracked).items():
+        assert 0.7 <= ratio <= 1.3, (quantity, ratio)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOTIONS)
+def test_squared_error_equals_the_predicted_variance(name, true_motion, as_tracked):
+    for quantity, ratio in mean_ratio(name, 24, true_motion, as_tracked).items():  # scatter 3 %
+        assert 0.8 <= ratio <= 1.25, (quantity, ratio)
+
+
+def test_covariance_that_is_too_small_is_noticed(true_motion, as_tracked, rng):
+    """Negative control of the test above, and the data's own noise is preferred to a wrong statement about it."""
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
+    honest = as_tracked(truth, rng)
+    boasting = replace(honest, pose_covariance=honest.pose_covariance / 4)
+    motion = differentiate(boasting)
+    assert_allclose(motion.noise_scale, 4, rtol=0.2)  # 600 frames, 1 or 2 channels: 3-6 % of scatter, grid 3.5 %
+    shrunk = replace(motion, covariance=motion.covariance / 4)
+    assert squared_error_over_variance(motion, truth)["velocity"] < 1.35
+    assert squared_error_over_variance(shrunk, truth)["velocity"] > 2.5
+
+
+@pytest.mark.parametrize("frequency", [10.0, 60.0, 80.0])
+def test_amplitude_of_an_oscillation_is_kept(frequency, true_motion, as_tracked, rng):
+    """To 0.5 % at 60 Hz in value, velocity and acceleration, for shifts and for tilts, with the noise of real poses."""
+    time = np.arange(400) * 1e-3
+    w = 2 * np.pi * frequency
+    wave = [np.sin(w * time), w * np.cos(w * time), -w * w * np.sin(w * time)]
+    amplitude, tilt = 1e-3, np.radians(1.0)
+    base = true_motion(theta_deg=9, duration=3.0)[:400]
+    x, v, a = (np.outer(f, [amplitude, 0, 0]) for f in wave)
+    spin, omega, alpha = (np.outer(f, [0, tilt, 0]) for f in wave)
+    truth = replace(
+        base, position=x, velocity=v, acceleration=a, R=rotation_from_vector(spin), omega=omega, alpha=alpha
+    )
+    motion = differentiate(as_tracked(truth, rng))
+    for found, true in (
+        (motion.position[:, 0], x[:, 0]),
+        (motion.velocity[:, 0], v[:, 0]),
+        (motion.acceleration[:, 0], a[:, 0]),
+        (motion.omega_world[:, 1], omega[:, 1]),
+        (motion.alpha_world[:, 1], alpha[:, 1]),
+    ):
+        gain = (found[20:-20] @ true[20:-20]) / (true[20:-20] @ true[20:-20])
+        # an unbiased gain still scatters with the noise, at 10 Hz most in the second derivative: 1e-3
+        assert abs(gain - 1) < 0.005
+
+
+def test_gap_is_bridged_with_honest_sigma(true_motion, as_tracked):
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
+    gap = np.r_[300:320]
+    found = []
+    for seed in range(6):
+        motion = differentiate(as_tracked(truth, np.random.default_rng(seed), missing=gap))
+        assert motion.known.all()
+        assert not motion.measured[gap].any()
+        found.append(squared_error_over_variance(motion, truth, gap))
+        middle, beside = motion.covariance[310], motion.covariance[200]
+        assert middle[6, 6] > 2 * beside[6, 6]
+    for quantity in QUANTITIES:  # about 6 * 4 independent values: 30 % of scatter
+        assert 0.3 < np.mean([f[quantity] for f in found]) < 2.0
+
+
+def test_ends_are_included_with_honest_sigma(true_motion, as_tracked):
+    truth = true_motion(theta_deg=9, duration=3.0)[-400:]
+    ends = np.r_[0:8, 392:400]
+    found = []
+    for seed in range(6):
+        motion = differentiate(as_tracked(truth, np.random.default_rng(seed)))
+        assert motion.known.all()
+        found.append(squared_error_over_variance(motion, truth, ends))
+    for quantity in QUANTITIES:  # 6 * 2 ends * 3 axes * about 2 independent values: 15 %
+        assert 0.6 < np.mean([f[quantity] for f in found]) < 1.6, quantity
+
+
+def test_motion_across_a_gap_too_long_to_bridge_is_unknown(true_motion, as_tracked, rng):
+    truth = true_motion(theta_deg=9, duration=3.0)[:600]
+    motion = differentiate(as_tracked(truth, rng, missing=range(200, 400)))
+    assert not motion.known[230:370].any()
+    assert motion.known[:195].all()
+    assert motion.known[405:].all()
+    ratio = squared_error_over_variance(motion, truth, motion.known)
+    assert all(0.6 < value < 1.6 for value in ratio.values()), ratio
+
+
+def test_disc_at_rest_has_no_velocity_beyond_its_sigma(true_motion, as_tracked, rng):
+    base = true_motion(theta_deg=9, duration=3.0)[:300]
+    zero = np.zeros((300, 3))
+    still = replace(
+        base,
+        position=np.tile([0.05, 0.04, 0.003], (300, 1)),
+        R=np.tile(np.eye(3), (300, 1, 1)),
+        velocity=zero,
+        omega=zero,
+        acceleration=zero,
+        alpha=zero,
+    )
+    motion = differentiate(as_tracked(still, rng))
+    assert np.abs(motion.velocity).max() < 2e-5
+    sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
+    assert np.all(np.abs(errors(motion, still)) < 6 * sigma)
+    # flat on the table there is no direction of precession: NaN, not a number
+    assert np.isnan(propagate(motion, rates).value[:, 0]).all()
+
+
+def test_euler_rates_come_with_honest_sigma_that_grows_as_the_disc_flattens(true_motion, as_tracked):
+    truth = true_motion(theta_deg=9, duration=3.0)[-700:]
+    ratios = []
+    for seed in range(4):
+        found = propagate(differentiate(as_tracked(truth, np.random.default_rng(seed))), rates)
+        variance = np.diagonal(found.covariance, axis1=1, axis2=2)
+        ratios.append(np.mean((found.value - truth.rates) ** 2 / variance, axis=0))
+    assert np.all(np.mean(ratios, axis=0) > 0.7), ratios
+    assert np.all(np.mean(ratios, axis=0) < 1.35), ratios
+    sigma = np.sqrt(variance[:, 0])
+    assert sigma[-50:-20].mean() > 5 * sigma[100:200].mean()
+
+
+def test_fast_spin_is_followed(true_motion, as_tracked, rng):
+    """A coin that turns about the vertical at 60 rad/s turns by several radians inside one window."""
+    time = np.arange(300) * 1e-3
+    base = true_motion(theta_deg=60, duration=0.8, nutation=0.2)[:300]
+    zero = np.zeros((300, 3))
+    spin = np.tile([0.0, 0.0, 60.0], (300, 1))
+    R = rotation_from_vector(time[:, None] * spin) @ base.R[0]
+    truth = replace(base, position=zero, R=R, velocity=zero, omega=spin, acceleration=zero, alpha=zero)
+    motion = differentiate(as_tracked(truth, rng))
+    ratio = squared_error_over_variance(motion, truth)
+    assert 0.6 < ratio["omega"] < 1.5, ratio
+    assert_allclose(motion.omega_world, spin, atol=0.02)
+
+
+def test_calibration_error_is_carried_as_one_common_error(true_motion, as_tracked, rng):
+    """A rig parameter that turns and shifts all poses alike changes the found motion as the sensitivity says."""
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:300]
+    turn = np.array([2e-4, -1e-4, 3e-4])
+    shift = np.cross(turn, truth.position)  # the world turned about its origin
+    sensitivity = np.zeros((300, 6, 30))
+    sensitivity[:, :3, 24], sensitivity[:, 3:, 24] = shift, turn
+    trajectory = as_tracked(truth, rng, noise=0.0, sensitivity=sensitivity)
+    turned = replace(truth, position=truth.position + shift, R=rotation_from_vector(turn) @ truth.R)
+    before, after = differentiate(trajectory), differentiate(as_tracked(turned, rng, noise=0.0))
+    S = before.calibration_sensitivity[:, :, 24]
+    pairs = {
+        "velocity": (after.velocity - before.velocity, S[:, 6:9]),
+        "omega": (after.omega_world - before.omega_world, S[:, 9:12]),
+        "acceleration": (after.acceleration - before.acceleration, S[:, 12:15]),
+        "alpha": (after.alpha_world - before.alpha_world, S[:, 15:18]),
+    }
+    for name, (found, predicted) in pairs.items():
+        # second order in a turn of 4e-4 rad
+        assert_allclose(found, predicted, atol=2e-3 * np.abs(predicted).max(), err_msg=name)
+
+
+def test_uneven_times_are_respected(true_motion, as_tracked, rng):
+    base = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:200]
+    time = np.sort(base.time + rng.uniform(-2e-4, 2e-4, 200))
+    w = 2 * np.pi * 20
+    x = np.outer(np.sin(w * time), [1e-3, 0, 0])
+    v = np.outer(w * np.cos(w * time), [1e-3, 0, 0])
+    truth = replace(base, time=time, position=x, velocity=v)
+    motion = differentiate(as_tracked(truth, rng))
+    assert_allclose(motion.velocity[10:-10], v[10:-10], atol=2e-4)  # sigma is 3e-5 to 5e-5 m/s
+
+
+@pytest.mark.parametrize("missing", [range(0, 195), range(0, 200)])
+def test_too_few_poses_are_an_error_that_says_so(missing, true_motion, as_tracked, rng):
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:200]
+    with pytest.raises(AnalysisError, match="of 200 frames have a pose"):
+        differentiate(as_tracked(truth, rng, missing=missing))
+
+
+def test_time_that_runs_backwards_is_an_error(true_motion, as_tracked, rng):
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:100]
+    time = truth.time.copy()
+    time[[50, 51]] = time[[51, 50]]
+    with pytest.raises(AnalysisError, match="time does not increase"):
+        differentiate(as_tracked(replace(truth, time=time), rng))
