@@ -138,18 +138,18 @@ class InertiaProduct(Effect):
     """Products of inertia with the axis: dynamic imbalance of a wedge-shaped disc."""
 
     name = "inertia_product"
-    title = "products of inertia J_13 = e_13 J3, J_23 = e_23 J3"
+    title = "products of inertia J_13, J_23"
     source = "wedge, dynamic imbalance"
     parameters = (
-        Parameter("e_13", "1", 1e-4, "J_13 / J3", lower=-0.2, upper=0.2),
-        Parameter("e_23", "1", 1e-4, "J_23 / J3", lower=-0.2, upper=0.2),
+        Parameter("J_13", "kg m^2", 1e-8, "moment of deviation between the first body axis and e3"),
+        Parameter("J_23", "kg m^2", 1e-8, "moment of deviation between the second body axis and e3"),
     )
     passive = False
 
     @staticmethod
     def adjust(body: Any, p: Any) -> None:
-        body.J_13 = body.J_13 + p.e_13 * body.J_33
-        body.J_23 = body.J_23 + p.e_23 * body.J_33
+        body.J_13 = body.J_13 + p.J_13
+        body.J_23 = body.J_23 + p.J_23
 
 
 class Slip(Effect):

@@ -1,0 +1,65 @@
+"""The law of an effect on given motions, in plain NumPy: which moment and force it would supply there."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from disctrack.disc import Disc
+from disctrack.rolling.effects import Effect
+from disctrack.rolling.records import KINEMATICS, WRENCH, record_dtype
+
+Array = NDArray[np.float64]
+
+
+def kinematics(q: Array, qdot: Array, disc: Disc, gravity: float = 9.81, time: ArrayLike = 0.0) -> np.recarray:
+    """Kinematic quantities (...) of records.KINEMATICS from coordinates and rates (..., 6); a record array.
+
+    The slip is that of the disc's material point at the contact, from the velocity of O given in qdot.
+    """
+    x, y, z, psi, theta, phi = np.moveaxis(np.asarray(q, float), -1, 0)
+    v_x, v_y, v_z, psidot, thetadot, phidot = np.moveaxis(np.asarray(qdot, float), -1, 0)
+    s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
+    v_n, v_m = v_x * cp + v_y * sp, v_y * cp - v_x * sp
+    omega2, omega3 = psidot * s, psidot * c + phidot
+    r, h = disc.radius, disc.half_thickness
+    quantities = {
+        "time": time,
+        **dict(x=x, y=y, z=z, psi=psi, theta=theta, phi=phi, sin_theta=s, cos_theta=c),
+        **dict(
+            thetadot=thetadot, psidot=psidot, phidot=phidot, omega2=omega2, omega3=omega3, v_n=v_n, v_m=v_m, v_z=v_z
+        ),
+        "omega_z": psidot + phidot * c,
+        "slip_n": v_n - h * omega2 + r * omega3,
+        "slip_m": v_m + (r * s + h * c) * thetadot,
+        **dict(radius=r, half_thickness=h, mass=disc.mass, gravity=gravity),
+    }
+    result = np.empty(theta.shape, record_dtype(KINEMATICS, float))
+    for name in KINEMATICS:
+        result[name] = quantities[name]
+    return result.view(np.recarray)
+
+
+def effect_wrench(effect: Effect, motion: Any, load: ArrayLike) -> tuple[Array, Array]:
+    """Contact moment and force on O of one effect, each (..., 3) in (n0, m0, k) [N m, N].
+
+    motion : records.KINEMATICS by attribute, as `kinematics` gives them.   load : (...) normal force F_z [N]
+    """
+    load = np.asarray(load, float)
+    shape = np.broadcast_shapes(np.shape(motion.theta), load.shape)
+    w = SimpleNamespace(**{name: np.zeros(shape) for name in WRENCH})
+    if effect.law is not None:
+        effect.law(SimpleNamespace(**effect.values), motion, w)
+    moment = [getattr(w, f"M_{a}") + load * getattr(w, f"load_{a}") for a in "nmz"]
+    return np.stack(moment, axis=-1), np.stack([w.X_n, w.X_m, w.X_z], axis=-1)
+
+
+def effect_power(effect: Effect, motion: Any, load: ArrayLike) -> Array:
+    """Power of an effect's moment and force (...) [W]: never positive for a passive one."""
+    moment, force = effect_wrench(effect, motion, load)
+    rates = np.stack([motion.thetadot, -motion.phidot * motion.sin_theta, motion.omega_z], axis=-1)
+    velocity = np.stack([motion.v_n, motion.v_m, motion.v_z], axis=-1)
+    return np.sum(moment * rates, axis=-1) + np.sum(force * velocity, axis=-1)

@@ -1,0 +1,185 @@
+"""Rolling and slipping disc in world vectors: one linear system of Newton, Euler and constraint, quaternions, SciPy.
+
+Independent of disctrack.rolling: no nodal frame, no Euler angles, no eliminated equations, another integrator, laws
+written once more from their published form. Slow, and meant to be.
+
+State: O (3), quaternion (4), velocity of O (3), omega (3), all in world axes; psi and phi by quadrature (2).
+"""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+K = np.array([0.0, 0.0, 1.0])
+
+
+class Disc:
+    """Numbers of the body; defaults are the homogeneous disc with a sharp edge."""
+
+    def __init__(self, r, h, m, gravity=(0, 0, -9.81), J_body=None, com_body=(0, 0, 0), edge=0.0, mu=np.inf, laws=()):
+        self.r, self.h, self.m, self.edge, self.mu, self.laws = r, h, m, edge, mu, laws
+        self.g = np.array(gravity, float)
+        J1 = m * r * r / 4 + m * h * h / 3
+        self.J = np.diag([J1, J1, m * r * r / 2]) if J_body is None else np.array(J_body, float)
+        self.com = np.array(com_body, float)
+
+
+def matrix_of(quaternion):
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def cross_matrix(v):
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def quaternion_from_angles(psi, theta, phi):
+    """Product of the three half-angle quaternions of Rz(psi) Rx(theta) Rz(phi)."""
+    c, s = np.cos(theta / 2), np.sin(theta / 2)
+    plus, minus = (psi + phi) / 2, (psi - phi) / 2
+    return np.array([c * np.cos(plus), s * np.cos(minus), s * np.sin(minus), c * np.sin(plus)])
+
+
+class Instant:
+    """Geometry and rates at one state."""
+
+    def __init__(self, disc, state):
+        self.O, self.v, self.omega = state[:3], state[7:10], state[10:13]
+        self.R = matrix_of(state[3:7])
+        d = self.R[:, 2]
+        d_rate = np.cross(self.omega, d)
+        up = K - d[2] * d  # towards the highest point of the face, length sin(theta)
+        up_rate = -d_rate[2] * d - d[2] * d_rate
+        sine = np.linalg.norm(up)
+        e2 = up / sine
+        e2_rate = up_rate / sine - up * (up @ up_rate) / sine**3
+        self.d, self.sine, self.cosine = d, sine, d[2]
+        rim, height = disc.r - disc.edge, disc.h - disc.edge
+        self.arm = -rim * e2 - height * d - disc.edge * K
+        self.arm_rate = -rim * e2_rate - height * d_rate
+        self.n0 = np.cross(e2, d)  # e1 = e2 x e3
+        self.m0 = np.cross(K, self.n0)
+        self.psidot = (d[0] * d_rate[1] - d[1] * d_rate[0]) / sine**2
+        self.phidot = self.omega @ d - self.psidot * d[2]
+        self.thetadot = self.omega @ self.n0
+        self.v_contact = self.v + np.cross(self.omega, self.arm)
+
+
+def accelerations(disc, state, regime):
+    """(a_O, omegadot, F) from the balance of momentum, of angular momentum about O, and the constraint."""
+    now = Instant(disc, state)
+    rho = now.R @ disc.com
+    J_G = now.R @ disc.J @ now.R.T
+    J_O = J_G + disc.m * (rho @ rho * np.eye(3) - np.outer(rho, rho))
+    w = now.omega
+    M_fixed, M_load, X = np.zeros(3), np.zeros(3), np.zeros(3)
+    for law in disc.laws:
+        fixed, load, force = law(disc, now)
+        M_fixed, M_load, X = M_fixed + fixed, M_load + load, X + force
+    A, b = np.zeros((9, 9)), np.zeros(9)
+    m, S = disc.m, cross_matrix
+    # m (a + wd x rho) - F = m g + X - m w x (w x rho)
+    A[0:3, 0:3], A[0:3, 3:6], A[0:3, 6:9] = m * np.eye(3), -m * S(rho), -np.eye(3)
+    b[0:3] = m * disc.g + X - m * np.cross(w, np.cross(w, rho))
+    # J_O wd + m rho x a - arm x F - M_load F_z = M_fixed + rho x m g - w x J_O w
+    A[3:6, 0:3], A[3:6, 3:6], A[3:6, 6:9] = m * S(rho), J_O, -S(now.arm) - np.outer(M_load, K)
+    b[3:6] = M_fixed + np.cross(rho, m * disc.g) - np.cross(w, J_O @ w)
+    # a + wd x arm + w x arm_rate = 0, all of it (rolling) or its vertical part (slipping), or F = 0
+    constraint = np.hstack([np.eye(3), -S(now.arm), np.zeros((3, 3))])
+    right = -np.cross(w, now.arm_rate)
+    if regime == "rolling":
+        A[6:9], b[6:9] = constraint, right
+    elif regime == "slipping":
+        A[6], b[6] = constraint[2], right[2]
+        direction = now.v_contact / np.linalg.norm(now.v_contact)
+        for row, axis in ((7, 0), (8, 1)):
+            A[row, 6 + axis], A[row, 8] = 1.0, disc.mu * direction[axis]
+    else:
+        A[6:9, 6:9] = np.eye(3)
+    solution = np.linalg.solve(A, b)
+    return solution[:3], solution[3:6], solution[6:], now
+
+
+def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, velocity=None):
+    """State of a disc in contact; rolling unless the horizontal velocity of O is given."""
+    R = matrix_of(quaternion_from_angles(psi, theta, phi))
+    e1 = np.array([np.cos(psi), np.sin(psi), 0])
+    omega = thetadot * e1 + omega2 * np.cross(R[:, 2], e1) + omega3 * R[:, 2]
+    state = np.zeros(15)
+    state[3:7], state[10:13], state[13], state[14] = quaternion_from_angles(psi, theta, phi), omega, psi, phi
+    now = Instant(disc, state)
+    state[:3] = x, y, -now.arm[2]
+    state[7:10] = -np.cross(omega, now.arm)
+    if velocity is not None:
+        state[7:9] = velocity
+    return state
+
+
+def rate(disc, state, regime):
+    a, omegadot, _, now = accelerations(disc, state, regime)
+    w, x, y, z = state[3:7]
+    ox, oy, oz = now.omega
+    spin = 0.5 * np.array(
+        [-ox * x - oy * y - oz * z, ox * w + oy * z - oz * y, oy * w + oz * x - ox * z, oz * w + ox * y - oy * x]
+    )
+    return np.concatenate([now.v, spin, a, omegadot, [now.psidot, now.phidot]])
+
+
+def follow(disc, state, times, regime="rolling", rtol=1e-11, atol=1e-12, events=None):
+    """solve_ivp over the times; returns its result."""
+    return solve_ivp(
+        lambda t, s: rate(disc, s, regime),
+        (times[0], times[-1]),
+        state,
+        "DOP853",
+        times,
+        rtol=rtol,
+        atol=atol,
+        events=events,
+    )
+
+
+def coordinates(disc, states):
+    """q (n, 6) of states (15, n): the nutation from the axis, psi and phi from quadrature."""
+    q = np.zeros((states.shape[1], 6))
+    for i, s in enumerate(states.T):
+        now = Instant(disc, s)
+        q[i] = *s[:3], s[13], np.arctan2(now.sine, now.cosine), s[14]
+    return q
+
+
+# Laws: functions of (disc, instant) -> moment independent of the load, moment per load, force at O; world axes.
+ZERO = np.zeros(3)
+
+
+def precession_friction(k_m):
+    return lambda disc, now: (ZERO, -k_m * now.psidot * abs(now.psidot) * now.m0, ZERO)
+
+
+def nutation_friction(k_n):
+    return lambda disc, now: (ZERO, -k_n * now.thetadot * abs(now.thetadot) * now.n0, ZERO)
+
+
+def pivoting_friction(k_z):
+    return lambda disc, now: (ZERO, -k_z * np.sign(now.omega[2]) * K, ZERO)
+
+
+def classical_rolling_friction(delta):
+    def law(disc, now):
+        horizontal = now.omega - now.omega[2] * K
+        return ZERO, -delta * horizontal / np.linalg.norm(horizontal), ZERO
+
+    return law
+
+
+def linear_drag(c):
+    return lambda disc, now: (ZERO, ZERO, -c * now.v)
+
+
+def moffatt(viscosity):
+    return lambda disc, now: (-np.pi * viscosity * disc.r**3 / 4 * now.psidot / now.sine**2 * now.m0, ZERO, ZERO)

@@ -1,0 +1,132 @@
+"""Slip, stick, loss of contact and the other ends of a motion."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import simpson
+
+from disctrack import rolling
+from disctrack.disc import MA_2014
+from disctrack.rolling import CATALOGUE, EndReason, Model, Regime, State, steady_precession
+from tests.oracles import newton_euler
+
+
+def slippery(mu, *effects):
+    return Model(MA_2014, effects=(*effects, CATALOGUE["slip"](mu=mu)))
+
+
+def sliding_start():
+    """A disc at 40 deg whose centre moves 0.3 m/s too fast for rolling."""
+    rolling_state = steady_precession(np.radians(40), MA_2014, nutation_amplitude=0.05)
+    qdot = rolling.simulate(Model(MA_2014), rolling_state, times=[0.0]).qdot[0]
+    return rolling_state.moved(v_x=qdot[0] + 0.3, v_y=qdot[1] - 0.1)
+
+
+def test_slip_opposes_the_sliding_velocity_and_lies_on_the_cone():
+    motion = rolling.simulate(slippery(0.3), sliding_start(), 0.3, rate=4000)
+    slipping = motion.regime == Regime.SLIPPING
+    assert slipping[0]
+    F, v = motion.contact_force[slipping], motion.slip_velocity[slipping]
+    assert_allclose(np.hypot(F[:, 0], F[:, 1]), 0.3 * F[:, 2], rtol=1e-12)
+    speed = np.hypot(*v.T)
+    assert_allclose(np.sum(F[:, :2] * v, axis=1), -0.3 * F[:, 2] * speed, rtol=1e-9)
+    rolls = motion.regime == Regime.ROLLING
+    assert (motion.friction_needed[rolls] <= 0.3).all()
+    assert (motion.slip_velocity[rolls] == 0).all()
+
+
+def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on():
+    state, mu = sliding_start(), 0.35
+    motion = rolling.simulate(slippery(mu), state, 0.15)
+    assert [s.after for s in motion.switches] == [Regime.ROLLING]
+    oracle = newton_euler.Disc(MA_2014.radius, MA_2014.half_thickness, MA_2014.mass, mu=mu)
+    start = newton_euler.state_from_angles(oracle, *state.array[:8], velocity=state.array[8:])
+
+    def slip_left(t, y):
+        return np.linalg.norm(newton_euler.Instant(oracle, y).v_contact) - 1e-6
+
+    slip_left.terminal = True
+    slide = newton_euler.follow(oracle, start, [0.0, 0.15], "slipping", events=slip_left)
+    stick = slide.t_events[0][0]
+    # both stop at a small slip speed, 1e-7 and 1e-6 m/s, with a deceleration of some m/s^2
+    assert_allclose(motion.switches[0].time, stick, atol=1e-6)
+    rest = newton_euler.follow(oracle, slide.y_events[0][0], [stick, 0.15], "rolling")
+    expected = newton_euler.coordinates(oracle, rest.y[:, -1:])[0]
+    assert_allclose(motion.q[-1, :3], expected[:3], atol=1e-7)
+    assert_allclose(motion.q[-1, 3:], expected[3:], atol=1e-5)
+
+
+def test_slip_starts_when_rolling_needs_more_than_the_cone_and_energy_falls_by_its_work():
+    state = steady_precession(np.radians(50), MA_2014, nutation_amplitude=np.radians(12), nutation_phase=0.5)
+    free = rolling.simulate(Model(MA_2014), state, 0.3)
+    mu = 0.85 * free.friction_needed.max()
+    assert free.friction_needed[0] < mu
+    motion = rolling.simulate(slippery(mu), state, 0.3, rate=8000)
+    assert motion.switches[0].before is Regime.ROLLING
+    assert motion.switches[0].after is Regime.SLIPPING
+    assert len(motion.switches) > 1
+    before = motion.time < motion.switches[0].time
+    assert_allclose(motion.energy[before], motion.energy[0], rtol=1e-11)
+    lost = motion.energy[-1] - motion.energy[0]
+    assert lost < 0
+    # the power has kinks at the switches: Simpson's rule errs there by (1/8 ms)^2 x slope
+    assert_allclose(simpson(motion.power, x=motion.time), lost, rtol=1e-3)
+
+
+def test_enough_friction_never_slips():
+    state = steady_precession(np.radians(40), MA_2014, nutation_amplitude=0.02)
+    free = rolling.simulate(Model(MA_2014), state, 0.2)
+    motion = rolling.simulate(slippery(1.05 * free.friction_needed.max()), state, 0.2)
+    assert motion.switches == ()
+    assert_allclose(motion.q, free.q, atol=1e-12)
+
+
+@pytest.fixture
+def jump():
+    """A disc flung upwards about its edge so fast that the table would have to pull."""
+    return State(theta=np.radians(30), thetadot=35.0, omega2=10.0, omega3=1.0)
+
+
+def test_contact_is_lost_where_the_table_would_have_to_pull_and_the_flight_keeps_energy_and_momentum(jump):
+    motion = rolling.simulate(Model(MA_2014), jump, 0.5, rate=4000)
+    assert motion.switches[0].after is Regime.FLYING
+    flying = motion.regime == Regime.FLYING
+    assert flying.sum() > 10
+    assert_allclose(motion.energy, motion.energy[0], rtol=1e-10)
+    assert_allclose(motion.acceleration_world[flying], np.tile([0, 0, -9.81], (flying.sum(), 1)), atol=1e-12)
+    gap = motion.q[:, 2] - MA_2014.radius * np.sin(motion.q[:, 4]) - MA_2014.half_thickness * np.cos(motion.q[:, 4])
+    assert_allclose(gap[~flying], 0, atol=1e-15)
+    assert (gap[flying] >= -1e-12).all()
+    assert gap.max() > 1e-4
+    assert motion.end in (EndReason.LANDED, EndReason.UPRIGHT)
+    assert (motion.contact_force[~flying, 2] > 0).all()
+
+
+def test_load_is_never_negative_in_contact(rng):
+    for _ in range(20):
+        theta = np.radians(rng.uniform(5, 80))
+        state = State(theta=theta, thetadot=rng.normal() * 20, omega2=rng.normal() * 20, omega3=rng.normal() * 20)
+        motion = rolling.simulate(slippery(0.3), state, 0.1)
+        contact = motion.regime != Regime.FLYING
+        assert (motion.contact_force[contact, 2] >= 0).all()
+        assert motion.end is not EndReason.FAILED
+
+
+def test_every_end_has_its_reason():
+    model = Model(MA_2014, effects=(CATALOGUE["km"](k_m=1e-6),))
+    state = steady_precession(np.radians(8), MA_2014)
+    assert rolling.simulate(model, state, 0.01).end is EndReason.TIME
+    stopped = rolling.simulate(model, state, 1.0, theta_end=np.radians(2))
+    assert stopped.end is EndReason.NUTATION
+    assert_allclose(stopped.end_state[3], np.radians(2), atol=1e-12)
+    assert stopped.time[-1] <= stopped.end_time < stopped.time[-1] + 1e-3
+    upright = rolling.simulate(Model(MA_2014), State(theta=np.radians(80), thetadot=9.0), 1.0)
+    assert upright.end is EndReason.UPRIGHT
+    assert_allclose(upright.end_state[3], np.pi / 2, atol=1e-12)
+
+
+def test_end_time_does_not_depend_on_the_output_rate():
+    model = Model(MA_2014, effects=(CATALOGUE["km"](),))
+    state = steady_precession(np.radians(4), MA_2014)
+    ends = [rolling.simulate(model, state, 2.0, rate=rate).end_time for rate in (10.0, 333.0, 5000.0)]
+    assert_allclose(ends, ends[0], atol=1e-10)

@@ -1,0 +1,131 @@
+"""Derivatives of the motion against central differences of separate simulations."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack import rolling
+from disctrack.disc import MA_2014
+from disctrack.rolling import CATALOGUE, Model, ModelError, Regime, State, steady_precession
+from disctrack.rolling.records import ROLLING_COMPONENTS
+
+STATE = steady_precession(np.radians(15), MA_2014, omega3=2.5, nutation_amplitude=0.03, psi=0.4, phi=-1.0, x=0.02)
+TIMES = np.linspace(0, 0.3, 31)
+MODEL = Model(MA_2014, effects=(CATALOGUE["km"](), CATALOGUE["slip"](mu=0.8)))
+PARAMETERS = [f"{e.name}.{p.name}" for e in CATALOGUE.values() for p in e.parameters if e.name != "slip"]
+
+
+def differences(function, value, step):
+    """Central differences of order 4."""
+    f = [function(value + i * step) for i in (-2, -1, 1, 2)]
+    return (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * step)
+
+
+def q_and_rates(model, state, times=TIMES):
+    motion = rolling.simulate(model, state, times=times)
+    return np.concatenate([motion.q, motion.qdot], axis=1)
+
+
+def assert_column(sensitivities, j, expected, tolerance, step):
+    """Equal to `tolerance` of each component's largest value, above the rounding of differences of this step."""
+    found = np.concatenate([sensitivities.dq[:, :, j], sensitivities.dqdot[:, :, j]], axis=1)
+    for component in range(12):
+        scale = np.abs(expected[:, component]).max()
+        floor = 1e-10 / step  # rates of 60 rad/s are reproduced to about 1e-10: the step sizes change with the start
+        assert_allclose(found[:, component], expected[:, component], atol=tolerance * scale + floor)
+
+
+@pytest.mark.parametrize("component", ROLLING_COMPONENTS)
+def test_derivative_by_the_initial_state(component):
+    found = rolling.sensitivities(MODEL, STATE, TIMES, components=[component])
+    expected = differences(lambda v: q_and_rates(MODEL, STATE.moved(**{component: v})), getattr(STATE, component), 1e-4)
+    assert_column(found, 0, expected, 1e-6, 1e-4)  # truncation of the differences: (1e-4 x 50)^4
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_derivative_by_every_parameter_of_the_catalogue(name):
+    effect, parameter = name.split(".")
+    step = 0.02 * CATALOGUE[effect]().values[parameter]
+    model = MODEL.with_effects(CATALOGUE[effect]())
+    found = rolling.sensitivities(model, STATE, TIMES, [name], components=[])
+    assert found.names == (name,)
+    expected = differences(lambda v: q_and_rates(model.with_values({name: v}), STATE), model.values[name], step)
+    # weak laws move q by 1e-6 at nominal size, known to the integrator's 1e-11; strong ones suffer from truncation
+    assert_column(found, 0, expected, 2e-4 if np.abs(expected * step).max() > 1e-6 else 2e-2, step)
+
+
+@pytest.mark.parametrize(
+    "name", ["kz.k_z", "table_tilt.tilt_x", "centre_of_mass.c_2", "air_bildsten.beta", "gravity.g_error"]
+)
+def test_an_effect_that_the_model_lacks_has_its_derivative_at_null(name):
+    effect, parameter = name.split(".")
+    found = rolling.sensitivities(MODEL, STATE, TIMES, [name], components=[])
+    step = 1e-3 * CATALOGUE[effect]().values[parameter]
+    moved = q_and_rates(MODEL.with_values({name: step}), STATE)
+    assert_column(
+        found, 0, (moved - q_and_rates(MODEL, STATE)) / step, 0.02, step
+    )  # one-sided: bounds forbid the other side
+
+
+def test_all_columns_at_once_equal_those_one_by_one():
+    together = rolling.sensitivities(MODEL, STATE, TIMES, ["km.k_m", "kz.k_z"])
+    assert together.names == (*ROLLING_COMPONENTS, "km.k_m", "kz.k_z")
+    alone = rolling.sensitivities(MODEL, STATE, TIMES, ["km.k_m"], components=["theta"])
+    assert_allclose(together.dq[:, :, [3, 8]], alone.dq, rtol=1e-13)
+    assert_allclose(together.q, rolling.simulate(MODEL, STATE, times=TIMES).q, rtol=1e-13)
+
+
+def sliding(mu):
+    return MODEL.with_effects(CATALOGUE["slip"](mu=mu))
+
+
+@pytest.mark.parametrize("name", ["v_x", "theta", "omega2", "slip.mu", "km.k_m"])
+def test_derivative_goes_through_the_instant_at_which_slip_ends(name):
+    """The instant of sticking moves with the parameter; a derivative that forgot it would be off by some 10 %."""
+    velocity = rolling.simulate(MODEL, STATE, times=[0.0]).qdot[0]
+    state = STATE.moved(v_x=velocity[0] + 0.05, v_y=velocity[1])
+    model = sliding(0.3)
+    motion = rolling.simulate(model, state, times=TIMES)
+    assert [s.after for s in motion.switches] == [Regime.ROLLING]
+    assert 0.005 < motion.switches[0].time < 0.2
+    if "." in name:
+        found = rolling.sensitivities(model, state, TIMES, [name], components=[])
+        value = model.values[name]
+        expected = differences(lambda v: q_and_rates(model.with_values({name: v}), state), value, 2e-3 * value)
+    else:
+        found = rolling.sensitivities(model, state, TIMES, components=[name])
+        expected = differences(lambda v: q_and_rates(model, state.moved(**{name: v})), getattr(state, name), 1e-5)
+    after = motion.time > motion.switches[0].time + 0.01
+    for j in range(6):
+        scale = np.abs(expected[after, j]).max()
+        # the slip that is dropped at sticking, 1e-7 m/s, leaves 1e-6 of a speed of 0.05 m/s
+        assert_allclose(found.dq[after, j, 0], expected[after, j], atol=2e-4 * scale + 1e-9 * np.abs(expected).max())
+
+
+def test_derivatives_are_nan_after_the_end():
+    model = Model(MA_2014, effects=(CATALOGUE["km"](),))
+    state = steady_precession(np.radians(1.0), MA_2014)
+    found = rolling.sensitivities(model, state, np.linspace(0, 1, 101), ["km.k_m"])
+    ended = np.isnan(found.q[:, 0])
+    assert 0 < ended.sum() < 101
+    assert np.isnan(found.dq[ended]).all()
+    assert np.isfinite(found.dq[~ended]).all()
+
+
+def test_batch_equals_separate_simulations(rng):
+    states = [STATE.moved(theta=STATE.theta + d) for d in rng.normal(size=4) * 1e-3]
+    values = [{"km.k_m": k} for k in rng.uniform(1, 9, 4) * 1e-8]
+    q, qdot = rolling.simulate_batch(MODEL, states, TIMES, values)
+    for i in range(4):
+        motion = rolling.simulate(MODEL.with_values(values[i]), states[i], times=TIMES)
+        assert_allclose(q[i], motion.q, rtol=1e-14)
+        assert_allclose(qdot[i], motion.qdot, rtol=1e-14)
+
+
+def test_a_parameter_that_is_not_there_is_named():
+    with pytest.raises(ModelError, match=r"'kz\.k_z' is not in the model; it has km"):
+        rolling.simulate_batch(MODEL, STATE, TIMES, [{"kz.k_z": 1.0}])
+    with pytest.raises(ModelError, match="no effect 'nothing'"):
+        rolling.sensitivities(MODEL, STATE, TIMES, ["nothing.x"])
+    with pytest.raises(ModelError, match="increasing"):
+        rolling.simulate(MODEL, State(theta=0.3), times=[0.0, 0.0])
