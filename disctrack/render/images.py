@@ -15,7 +15,8 @@ from calibration.camera import Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import rotation_from_euler
 from disctrack.render import optics
-from disctrack.render.raster import draw_board, draw_disc
+from disctrack.render.board_raster import draw_board
+from disctrack.render.disc_raster import draw_disc
 from disctrack.render.rays import View, corner_rays, image_of
 from disctrack.render.sensor import digitise, hot_pixels
 from disctrack.scene import (
@@ -119,7 +120,7 @@ def expected_disc_image(
 ) -> Grey:
     """Expected grey values (height, width) of one exposure [s]; `pose` gives q around mid exposure.
 
-    Light is gathered at the nodes of a Gauss-Legendre rule over the exposure, at least one node per 0.6 px of motion:
+    Light is gathered at the nodes of a Gauss-Legendre rule over the exposure, at least one node per 0.8 px of motion:
     the mean and the variance of the path are exact from two nodes on.
     """
     nodes, weights = _exposure_rule(pose, exposure, stage, true_disc.disc)
@@ -168,7 +169,7 @@ def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: 
     path_px = float(np.max(np.linalg.norm(outline[1] - outline[0], axis=-1)))
     if path_px < 0.02:  # its variance, path^2 / 12, is 5e-5 of the blur's
         return np.zeros(1), np.ones(1)
-    nodes, weights = np.polynomial.legendre.leggauss(2 + int(path_px / 0.6))
+    nodes, weights = np.polynomial.legendre.leggauss(2 + int(path_px / 0.8))
     return nodes / 2, weights / 2
 
 

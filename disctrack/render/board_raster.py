@@ -1,0 +1,119 @@
+"""The chessboard in the cells of one camera's sensor; as `disc_raster`, and cells with two edges sampled 8 x 8."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.render.areas import between, cell_area, plane_point, ray_in_body
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+
+@numba.njit(cache=True, nogil=True)
+def _board_colour(x: float, y: float, n_x: int, n_y: int, margin: float) -> int:
+    """0 outside the board, 1 white, 2 black, at (x, y) in squares from the lower left inner corner."""
+    if x < -1.0 - margin or x > n_x + margin or y < -1.0 - margin or y > n_y + margin:
+        return 0
+    i, j = int(np.floor(x)), int(np.floor(y))
+    if i < -1 or i >= n_x or j < -1 or j >= n_y:
+        return 1
+    return 2 if (i + j) % 2 == 0 else 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_line(x: float, n: int, margin: float) -> float:
+    """The board's straight edge nearest to coordinate x: a line between squares or the paper's edge."""
+    line = min(max(np.round(x), -1.0), float(n))
+    for edge in (-1.0 - margin, n + margin):
+        if abs(x - edge) < abs(x - line):
+            line = edge
+    return line
+
+
+@numba.njit(cache=True, nogil=True)
+def _board_grid(
+    grid: Array, p0: float, q0: float, size: float, corners: tuple[Array, Array, Array, Array], R: Array, eye: Array
+) -> bool:
+    """Board coordinates of 3 x 3 points of a cell (size: of the pixel), and whether the rays all meet the board."""
+    ahead = True
+    for i in range(3):
+        for j in range(3):
+            p, q = p0 + 0.5 * i * size, q0 + 0.5 * j * size
+            rx, ry = between(corners, p, q)
+            dx, dy, dz = ray_in_body(R, rx, ry)
+            x, y, meets = plane_point(eye, dx, dy, dz, 0.0)
+            ahead = ahead and meets
+            grid[i, j, 0], grid[i, j, 1] = x, y
+    return ahead
+
+
+@numba.njit(cache=True, nogil=True)
+def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) -> float:
+    """Mean grey of one cell that lines may cross."""
+    x, y = grid[1, 1]
+    line_x, line_y = _nearest_line(x, n_x, margin), _nearest_line(y, n_y, margin)
+    g = grid - np.array([line_x, line_y])
+    area_x = cell_area(g[1, 1, 0], g[0, 0, 0], g[0, 2, 0], g[2, 0, 0], g[2, 2, 0])
+    area_y = cell_area(g[1, 1, 1], g[0, 0, 1], g[0, 2, 1], g[2, 0, 1], g[2, 2, 1])
+    cut_x, cut_y = 0.0 < area_x < 1.0, 0.0 < area_y < 1.0
+    if cut_x and cut_y:
+        total = 0.0
+        for i in range(8):
+            for j in range(8):
+                p, q = (i + 0.5) / 8, (j + 0.5) / 8
+                point = (1 - p) * ((1 - q) * grid[0, 0] + q * grid[0, 2]) + p * ((1 - q) * grid[2, 0] + q * grid[2, 2])
+                total += colours[_board_colour(point[0], point[1], n_x, n_y, margin)]
+        return total / 64.0
+    if cut_x:
+        high = colours[_board_colour(line_x + 1e-6, y, n_x, n_y, margin)]
+        low = colours[_board_colour(line_x - 1e-6, y, n_x, n_y, margin)]
+        return area_x * high + (1 - area_x) * low
+    if cut_y:
+        high = colours[_board_colour(x, line_y + 1e-6, n_x, n_y, margin)]
+        low = colours[_board_colour(x, line_y - 1e-6, n_x, n_y, margin)]
+        return area_y * high + (1 - area_y) * low
+    return colours[_board_colour(x, y, n_x, n_y, margin)]
+
+
+@numba.njit(cache=True, nogil=True)
+def draw_board(
+    cells: Array32, background: Array32, rays: Array, s: int, R: Array, t: Array, square: float, n_x: int, n_y: int,
+    margin: float, white: float, black: float,
+) -> None:  # fmt: skip
+    """Write the chessboard before the background into `cells`; arguments as in `draw_disc`.
+
+    R, t     : R_camera_board, t_camera_board; the board's origin is its lower left inner corner
+    n_x, n_y : inner corners along the long and the short side; `margin` in squares
+    """
+    eye = -R.T @ t / square
+    colours = np.array([0.0, white, black])
+    grid = np.empty((3, 3, 2))
+    for row in range(cells.shape[0] // s):
+        for column in range(cells.shape[1] // s):
+            corners = (rays[row, column], rays[row, column + 1], rays[row + 1, column], rays[row + 1, column + 1])
+            ahead = _board_grid(grid, 0.0, 0.0, 1.0, corners, R, eye)
+            x, y = grid[1, 1]
+            y0, x0 = row * s, column * s
+            if not ahead or abs(x) > 1e3 or abs(y) > 1e3:
+                cells[y0 : y0 + s, x0 : x0 + s] = background[y0 : y0 + s, x0 : x0 + s]
+                continue
+            reach_x = 1.5 * max(
+                abs(grid[0, 0, 0] - x), abs(grid[0, 2, 0] - x), abs(grid[2, 0, 0] - x), abs(grid[2, 2, 0] - x)
+            )
+            reach_y = 1.5 * max(
+                abs(grid[0, 0, 1] - y), abs(grid[0, 2, 1] - y), abs(grid[2, 0, 1] - y), abs(grid[2, 2, 1] - y)
+            )
+            if abs(x - _nearest_line(x, n_x, margin)) > reach_x and abs(y - _nearest_line(y, n_y, margin)) > reach_y:
+                colour = _board_colour(x, y, n_x, n_y, margin)
+                for i in range(s):
+                    for j in range(s):
+                        cells[y0 + i, x0 + j] = colours[colour] if colour else background[y0 + i, x0 + j]
+                continue
+            for i in range(s):
+                for j in range(s):
+                    _board_grid(grid, i / s, j / s, 1.0 / s, corners, R, eye)
+                    colours[0] = background[y0 + i, x0 + j]
+                    cells[y0 + i, x0 + j] = _board_cell(grid, colours, n_x, n_y, margin)
