@@ -34,7 +34,7 @@ _EDGE = 0.5 * erfc(_z_nodes / math.sqrt(2.0))
 _BELL = np.exp(-0.5 * _z_nodes**2) / math.sqrt(2.0 * math.pi)
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
-_CONVERGED_PX = 1e-3  # a quarter of the noise of the best dots; the step after it is a hundred times smaller
+_CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
 _CLIP_SIGMA = 5.0
 
 
@@ -276,6 +276,7 @@ def _descend(scratch, n, p, G, det, px_per_unit, radius, clip, M, rhs):
     """
     previous, step = p.copy(), np.empty(8)
     damping, last, rejected = 1e-7, np.inf, False
+    before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
     for _ in range(_MAX_ITERATIONS):
         chi2, n_clipped, largest = _normal_equations(scratch, n, p, G, det, clip, M, rhs)
         # the Jacobian leaves out how the curvature moves, so chi-square may creep by a trifle at the minimum
@@ -301,8 +302,16 @@ def _descend(scratch, n, p, G, det, px_per_unit, radius, clip, M, rhs):
         p[SIGMA] = min(max(p[SIGMA], 0.4 * previous[SIGMA], 0.2), 2.0 * previous[SIGMA])
         if not (0.5 * radius < p[RADIUS] < 1.6 * radius and p[SIGMA] < 20.0):
             return False, chi2, n_clipped, largest
-        if length * px_per_unit < _CONVERGED_PX and damping < 1e-3:
+        length *= px_per_unit
+        contraction = min(length / before, 1.0) if before < np.inf else 1.0
+        if length * contraction < _CONVERGED_PX and damping < 1e-3 and length < 0.1:
+            gain = 0.0
+            for i in range(8):
+                gain += step[i] * rhs[i]
+            if gain > 0.5:  # the sums were taken before a step that mattered to them
+                chi2, n_clipped, largest = _whitened_model(scratch, n, p, G, det, clip)
             return True, chi2, n_clipped, largest
+        before = length
     return False, last, 0, np.inf
 
 

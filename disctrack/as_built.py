@@ -93,7 +93,8 @@ def refine_as_built(
         used = fits.used & ok[:, None, None]
         normal, gradient = _shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
         # common errors: the data's information is bounded by what SYSTEMATIC_PX allows
-        scale = _information_scale(covariance, used)
+        # dots that scatter more than the image noise alone makes them tell accordingly less
+        scale = _information_scale(covariance, used) / max(1.0, after)
         matrix = scale * normal + information
         rhs = scale * gradient - information @ shift[free]
         step = np.zeros_like(shift)

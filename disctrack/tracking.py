@@ -8,7 +8,10 @@ none.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +37,29 @@ from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
 Images = NDArray[np.uint8] | NDArray[np.uint16]
-PairBlock = tuple[int, Images, NDArray[np.bool_]]  # first index, (n, 2, H, W), readable (n, 2)
+
+
+class PairBlock(Protocol):
+    """Consecutive pairs as `readers.blocks.iter_pair_blocks` gives them; the images are not kept."""
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """(n,) numbers of the pairs."""
+
+    @property
+    def images(self) -> Images:
+        """(n, 2, height, width)."""
+
+    @property
+    def readable(self) -> NDArray[np.bool_]:
+        """(n, 2)."""
+
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES = 12
 MIN_GOOD_DOT_IMAGES = 6
+MIN_PAIRS_PER_WORKER = 200  # a stretch must outweigh its own search for the disc
 SHARED_FRAMES = 2000  # frames that enter the refinement of what all frames share; more add nothing but time
 
 
@@ -61,6 +81,8 @@ class Tracking:
     noise: tuple[NoiseModel, NoiseModel]  # left, right
     blur_px: tuple[float, float]
     as_built: AsBuilt
+    variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared;
+    # all covariances of the trajectory are multiplied by it (never by less than 1)
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     warnings: tuple[str, ...]
 
@@ -133,8 +155,8 @@ class _Follower:
 
 
 def track(
-    blocks: Iterable[PairBlock],
-    n_frames: int,
+    read_blocks: Callable[[int, int], Iterable[PairBlock]],
+    pairs: range,
     rig: StereoRig,
     disc: Disc,
     frame_rate: float,
@@ -142,25 +164,20 @@ def track(
     gravity: float = 9.81,
     settings: TrackingSettings | None = None,
     timestamps: Array | None = None,
-    first_frame: int = 0,
-    progress: Callable[[int], None] = lambda n: None,
+    workers: int = 1,
+    progress: Callable[[int], object] = lambda n: None,
 ) -> Tracking:
     """Measure the disc's pose in every pair of a recording.
 
-    blocks: (first index, images (n, 2, H, W), readable (n, 2)) in order, index 0 being the first pair to measure;
-    n_frames: their total. frame_rate [Hz]; timestamps (n_frames,) [s] where the camera wrote them; first_frame: number
-    of pair 0 in its sequence. progress is called with the number of pairs done.
-    Raises TrackingError if the images do not belong to the rig or if the disc is found in no frame at all.
+    read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; pairs: which to measure (step 1).
+    frame_rate [Hz]; timestamps (len(pairs),) [s] where the camera wrote them. workers: stretches of the recording
+    followed side by side; more than one pays where frames come at the speed of memory. progress(n) is called when n
+    more pairs are done, from any thread.
+    Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
     settings = settings or TrackingSettings()
-    m = disc.n_markers
-    tables = _Tables(
-        results=np.full((n_frames, 2, m, kernels.N_RESULT), np.nan),
-        status=np.full((n_frames, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
-        R=np.full((n_frames, 3, 3), np.nan),
-        t=np.full((n_frames, 3), np.nan),
-        frame_status=np.full(n_frames, FrameStatus.NOT_PROCESSED, np.uint8),
-    )
+    n = len(pairs)
+    tables = _empty_tables(n, disc.n_markers)
     maps = [normalised_maps(camera) for camera in rig.cameras]
     follower = _Follower(
         rig,
@@ -173,16 +190,44 @@ def track(
         (np.eye(3), np.zeros(3)),
         (np.eye(3), np.zeros(3)),
     )
-    for start, images, readable in blocks:
-        _check_images(images, rig)
-        _follow_block(follower, images, readable, tables, start)
-        progress(len(images))
+
+    def follow(stretch: _Follower, start: int, stop: int) -> _Follower:
+        for block in read_blocks(start, stop):
+            _check_images(block.images, rig)
+            _follow_block(stretch, block.images, block.readable, tables, int(block.frames[0]) - pairs.start)
+            progress(len(block.images))
+        return stretch
+
+    workers = max(1, min(workers, n // MIN_PAIRS_PER_WORKER))
+    edges = [pairs.start + k * n // workers for k in range(workers + 1)]
+    if workers == 1:
+        followers = [follow(follower, pairs.start, pairs.stop)]
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            # every stretch searches for the disc at its own start; each keeps its own blur and noise
+            stretches = [
+                pool.submit(follow, replace(follower, noise=list(follower.noise), blur=list(follower.blur)), a, b)
+                for a, b in pairwise(edges)
+            ]
+            followers = [stretch.result() for stretch in stretches]
     if not np.isfinite(tables.t).any():
+        reason = next((f.first_reason for f in followers if f.first_reason), "no image could be read")
         raise TrackingError(
-            f"the disc was found in none of {n_frames} pairs. First pair: "
-            + (follower.first_reason or "no image could be read")
+            f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. First search: {reason}"
         )
-    return _assemble(follower, tables, settings, frame_rate, gravity, timestamps, first_frame)
+    if timestamps is None:
+        timestamps = np.array(pairs) / frame_rate
+    return _assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
+
+
+def _empty_tables(n: int, m: int) -> _Tables:
+    return _Tables(
+        results=np.full((n, 2, m, kernels.N_RESULT), np.nan),
+        status=np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
+        R=np.full((n, 3, 3), np.nan),
+        t=np.full((n, 3), np.nan),
+        frame_status=np.full(n, FrameStatus.NOT_PROCESSED, np.uint8),
+    )
 
 
 def _check_images(images: Images, rig: StereoRig) -> None:
@@ -259,13 +304,7 @@ def _measure_blur_and_noise(
     n, m = min(NOISE_FRAMES, len(images)), follower.disc.n_markers
     for _ in range(2):  # the second time with the blur and the noise of the first
         follower.start_from(pose, following)
-        trial = _Tables(
-            np.full((n, 2, m, kernels.N_RESULT), np.nan),
-            np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
-            np.full((n, 3, 3), np.nan),
-            np.full((n, 3), np.nan),
-            np.zeros(n, np.uint8),
-        )
+        trial = _empty_tables(n, m)
         done = follower.run(images[:n], readable[:n], trial, slice(0, n))
         if done == 0:
             return
@@ -285,21 +324,21 @@ def _measure_blur_and_noise(
 
 
 def _assemble(
-    follower: _Follower,
+    followers: list[_Follower],
     tables: _Tables,
     settings: TrackingSettings,
     frame_rate: float,
     gravity: float,
-    timestamps: Array | None,
-    first_frame: int,
+    time: Array,
+    pairs: range,
 ) -> Tracking:
+    first = followers[0]
     dots = dot_centres(tables.results, tables.status)
-    n = len(tables.t)
     as_built = refine_as_built(
         dots.pixels,
         dots.covariance_px2,
-        follower.rig,
-        follower.disc,
+        first.rig,
+        first.disc,
         tables.R,
         tables.t,
         refine_markers=settings.refine_markers,
@@ -315,16 +354,29 @@ def _assemble(
         tables.t,
         reject_outliers=settings.reject_outliers,
     )
-    time = np.asarray(timestamps, float) if timestamps is not None else (first_frame + np.arange(n)) / frame_rate
-    trajectory = _trajectory(dots, fits, tables, as_built, time, first_frame, frame_rate, gravity)
+    factor = max(1.0, _variance_factor(fits))
+    dots = replace(dots, covariance_px2=dots.covariance_px2 * factor)
+    fits = replace(fits, covariance=fits.covariance * factor, chi_square=fits.chi_square / factor)
+    trajectory = _trajectory(dots, fits, tables, as_built, time, pairs, frame_rate, gravity)
     return Tracking(
         trajectory=trajectory,
-        noise=(follower.noise[0], follower.noise[1]),
-        blur_px=(follower.blur[0], follower.blur[1]),
+        noise=(first.noise[0], first.noise[1]),
+        blur_px=(first.blur[0], first.blur[1]),
         as_built=as_built,
-        acquisitions=follower.acquisitions,
-        warnings=_warnings(follower, trajectory),
+        variance_factor=factor,
+        acquisitions=sum(f.acquisitions for f in followers),
+        warnings=_warnings(first, factor),
     )
+
+
+def _variance_factor(fits: PoseFits) -> float:
+    """Mean reduced chi-square of the frames, without the twentieth that fits worst (smears, objects in view)."""
+    reduced = np.sort(fits.reduced_chi_square[fits.degrees_of_freedom >= 6])
+    if len(reduced) < 20:
+        return 1.0
+    kept = reduced[: int(0.95 * len(reduced))]
+    # the 5 % that are cut hold more than 5 % of the sum: 18 degrees of freedom lose 4 % of their mean
+    return float(kept.mean() / 0.96)
 
 
 def _trajectory(
@@ -333,11 +385,10 @@ def _trajectory(
     tables: _Tables,
     as_built: AsBuilt,
     time: Array,
-    first_frame: int,
+    pairs: range,
     frame_rate: float,
     gravity: float,
 ) -> Trajectory:
-    n = len(time)
     euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
     euler[~fits.converged] = np.nan
     status = tables.frame_status.copy()
@@ -357,7 +408,7 @@ def _trajectory(
         quaternion = frames.continuous_quaternions(frames.quaternion_from_rotation(fits.R_world_body))
     return Trajectory(
         time=time,
-        frame=first_frame + np.arange(n),
+        frame=np.array(pairs, dtype=np.int64),
         q=np.column_stack([fits.t_world_body, euler]),
         pose_covariance=fits.covariance,
         calibration_sensitivity=fits.sensitivity,
@@ -376,18 +427,17 @@ def _trajectory(
     )
 
 
-def _warnings(follower: _Follower, trajectory: Trajectory) -> tuple[str, ...]:
+def _warnings(follower: _Follower, variance_factor: float) -> tuple[str, ...]:
     warnings = []
     order = symmetry_order(follower.disc)
     if order > 1:
         warnings.append(
             f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
-            f"multiples of that (its rate is not affected)"
+            "multiples of that (its rate is not affected)"
         )
-    chi2 = np.nanmedian(trajectory.reduced_chi_square)
-    if chi2 > 2.0:
+    if variance_factor > 4.0:
         warnings.append(
-            f"the dots miss their fitted places by {np.sqrt(chi2):.1f} times their own sigma: the calibration or the "
-            "declared marker centres are off, or a camera moved after the calibration"
+            f"the dots miss their fitted places by {np.sqrt(variance_factor):.1f} times what the image noise explains: "
+            "the calibration is off, or a camera moved or lags since, or the dots are not round"
         )
     return tuple(warnings)
