@@ -1,0 +1,231 @@
+"""Compiled fit of one inner corner of a chessboard to the grey values around it.
+
+The image of a corner is sign(u) sign(v), u and v the signed distances from its two edges, seen through a Gaussian blur:
+with h = u / sigma, k = v / sigma and rho the cosine between the edges' normals,
+
+    S(h, k; rho) = E[sign(h + n1) sign(k + n2)] = 4 Phi2(h, k; rho) - 2 Phi(h) - 2 Phi(k) + 1,
+
+exact for any angle between the edges (the product of two error functions is so only at 90 degrees). sigma^2 holds the
+variance 1/12 of the square pixel; its fourth cumulant, which a Gaussian lacks, is added by Edgeworth's term. Lines stay
+lines under perspective, so the corner is where they cross, without bias; lens distortion bends them by a known
+curvature.
+
+numba, because one view is some 10^6 evaluations of this model: 0.05 s compiled.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+N_CORNER = (
+    9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
+)
+FLAT = 0.995  # |S| above which a pixel lies inside a square and shows the image's noise alone
+_FAR = 5.0  # sigmas from an edge: S has reached its level to 6e-7
+_X, _W = np.polynomial.legendre.leggauss(8)
+_N_NODES = 8
+_SQRT_HALF = math.sqrt(0.5)
+
+
+@numba.njit(cache=True, nogil=True)
+def nodes(rho):  # type: ignore[no-untyped-def]
+    """Quadrature over the angle 0..asin(rho): weight, sine and 1 / (2 cos^2) at each node."""
+    table = np.empty((_N_NODES, 3))
+    half = 0.5 * math.asin(rho)
+    for n in range(_N_NODES):
+        sine = math.sin(half * (1.0 + _X[n]))
+        table[n, 0] = _W[n] * half * 2.0 / math.pi
+        table[n, 1] = sine
+        table[n, 2] = 0.5 / (1.0 - sine * sine)
+    return table
+
+
+@numba.njit(cache=True, nogil=True)
+def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
+    """S and its derivatives with respect to h, k and rho, into out (4,); table from `nodes(rho)`."""
+    near_h, near_k = abs(h) < _FAR, abs(k) < _FAR
+    erf_h = math.erf(h * _SQRT_HALF) if near_h else (1.0 if h > 0 else -1.0)
+    erf_k = math.erf(k * _SQRT_HALF) if near_k else (1.0 if k > 0 else -1.0)
+    S = erf_h * erf_k
+    S_h = S_k = S_rho = 0.0
+    s = math.sqrt(1.0 - rho * rho)
+    if near_h:
+        S_h = 0.7978845608028654 * math.exp(-0.5 * h * h) * math.erf((k - rho * h) / s * _SQRT_HALF)
+    if near_k:
+        S_k = 0.7978845608028654 * math.exp(-0.5 * k * k) * math.erf((h - rho * k) / s * _SQRT_HALF)
+    square = h * h + k * k
+    if square - 2.0 * abs(rho * h * k) < 30.0:  # elsewhere the integrand stays below exp(-15)
+        S_rho = 2.0 / (math.pi * s) * math.exp(-0.5 * (square - 2.0 * rho * h * k) / (s * s))
+        for n in range(_N_NODES):
+            S += table[n, 0] * math.exp(-(square - 2.0 * h * k * table[n, 1]) * table[n, 2])
+    out[0], out[1], out[2], out[3] = S, S_h, S_k, S_rho
+
+
+@numba.njit(cache=True, nogil=True)
+def normal_equations(image, window, p, curvature, noise, H, g):  # type: ignore[no-untyped-def]
+    """Weighted sums of one corner; H (9, 9) and g (9,) are filled. Returns chi-square, and sums over pixels.
+
+    window (13,): x0, x1, y0, y1 [px, inclusive]; centre x, y; inverse of the local axes, row by row; half widths along
+    i and j [squares]; largest step [px].
+    """
+    gradient, S4 = np.zeros(N_CORNER), np.empty(4)
+    H[:] = 0.0
+    g[:] = 0.0
+    sums = np.zeros(9)  # chi2, n; dark: r2, grey, n; light: r2, grey, n; edge chi2
+    c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
+    bend1, bend2 = curvature[0], curvature[1]
+    rho, turn, inverse_sigma = math.cos(p[3] - p[2]), math.sin(p[3] - p[2]), 1.0 / p[4]
+    table = nodes(rho)
+    # Edgeworth: kappa4 of a unit box along the normal is -(nx^4 + ny^4) / 120
+    box1 = (s1**4 + c1**4) / (120.0 * 12.0 * p[4] ** 4)
+    box2 = (s2**4 + c2**4) / (120.0 * 12.0 * p[4] ** 4)
+    x0, x1, y0, y1 = int(window[0]), int(window[1]), int(window[2]), int(window[3])
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            wx, wy = x - window[4], y - window[5]
+            if abs(window[6] * wx + window[7] * wy) > window[10] or abs(window[8] * wx + window[9] * wy) > window[11]:
+                continue
+            dx, dy = x - p[0], y - p[1]
+            along1, across1 = c1 * dx + s1 * dy, -s1 * dx + c1 * dy
+            along2, across2 = c2 * dx + s2 * dy, -s2 * dx + c2 * dy
+            h = (across1 - bend1 * along1 * along1) * inverse_sigma
+            k = (across2 - bend2 * along2 * along2) * inverse_sigma
+            light = 1.0 + p[7] * dx + p[8] * dy
+            first = 0
+            if abs(h) > _FAR and abs(k) > _FAR:
+                S = 1.0 if h * k > 0 else -1.0
+                base = p[5] + p[6] * S
+                first = 5  # an even level tells nothing of the edges
+            else:
+                blurred_saddle(h, k, rho, table, S4)
+                S, S_h, S_k = S4[0], S4[1], S4[2]
+                if abs(h) < _FAR:
+                    e = 0.3989422804014327 * math.exp(-0.5 * h * h) * (1.0 if k > 0 else -1.0) * min(abs(k), 1.0)
+                    S += box1 * (h * h * h - 3.0 * h) * e
+                    S_h += box1 * (6.0 * h * h - h**4 - 3.0) * e
+                if abs(k) < _FAR:
+                    e = 0.3989422804014327 * math.exp(-0.5 * k * k) * (1.0 if h > 0 else -1.0) * min(abs(h), 1.0)
+                    S += box2 * (k * k * k - 3.0 * k) * e
+                    S_k += box2 * (6.0 * k * k - k**4 - 3.0) * e
+                base = p[5] + p[6] * S
+                slope = p[6] * light
+                a, b = slope * S_h * inverse_sigma, slope * S_k * inverse_sigma
+                gradient[0] = a * (s1 + 2 * bend1 * along1 * c1) + b * (s2 + 2 * bend2 * along2 * c2) - base * p[7]
+                gradient[1] = a * (-c1 + 2 * bend1 * along1 * s1) + b * (-c2 + 2 * bend2 * along2 * s2) - base * p[8]
+                gradient[2] = -a * along1 * (1 + 2 * bend1 * across1) + slope * S4[3] * turn
+                gradient[3] = -b * along2 * (1 + 2 * bend2 * across2) - slope * S4[3] * turn
+                gradient[4] = -(a * h + b * k)
+            gradient[5], gradient[6], gradient[7], gradient[8] = light, light * S, base * dx, base * dy
+            model = base * light
+            residual = image[y, x] - model
+            weight = 1.0 / (noise[0] + noise[1] * max(model, 0.0))
+            for i in range(first, N_CORNER):
+                gi = gradient[i] * weight
+                g[i] += gi * residual
+                for j in range(first, i + 1):
+                    H[i, j] += gi * gradient[j]
+            chi2 = residual * residual * weight
+            sums[0] += chi2
+            sums[1] += 1.0
+            level = S if p[6] > 0 else -S
+            if level < -FLAT:
+                sums[2] += residual * residual
+                sums[3] += model
+                sums[4] += 1.0
+            elif level > FLAT:
+                sums[5] += residual * residual
+                sums[6] += model
+                sums[7] += 1.0
+            else:
+                sums[8] += chi2
+    return sums
+
+
+@numba.njit(cache=True, nogil=True)
+def cholesky_solve(H, damping, rhs, L):  # type: ignore[no-untyped-def]
+    """Solve (H + damping diag H) x = rhs in place, H given by its lower triangle; False if not positive definite."""
+    n = H.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = H[i, j] * (1.0 + damping) if i == j else H[i, j]
+            for m in range(j):
+                total -= L[i, m] * L[j, m]
+            if i == j:
+                if not total > 1e-13 * H[i, i]:
+                    return False
+                L[i, i] = math.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(n):
+        for m in range(i):
+            rhs[i] -= L[i, m] * rhs[m]
+        rhs[i] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for m in range(i + 1, n):
+            rhs[i] -= L[m, i] * rhs[m]
+        rhs[i] /= L[i, i]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covariance):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt on p (9,) in place; covariance (2, 2) of x, y is filled. Returns sums and success."""
+    H, g = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
+    H_new, g_new = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
+    L = np.zeros((N_CORNER, N_CORNER))
+    covariance[:] = np.nan
+    sums = normal_equations(image, window, p, curvature, noise, H, g)
+    if sums[1] < 4 * N_CORNER:
+        return sums, False
+    damping, converged = 1e-3, False
+    for _ in range(iterations):
+        step = g.copy()
+        if not cholesky_solve(H, damping, step, L):
+            damping = 10.0 * damping
+            if damping > 1e8:
+                break
+            continue
+        trial = p + step
+        trial[4] = min(max(trial[4], 0.5 * p[4], 0.3), 2.0 * p[4])
+        reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
+        accepted = reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
+        if accepted:
+            sums_new = normal_equations(image, window, trial, curvature, noise, H_new, g_new)
+            accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
+        if accepted:
+            p[:], sums = trial, sums_new
+            H, H_new = H_new, H
+            g, g_new = g_new, g
+            damping = max(damping * 0.1, 1e-9)
+            if abs(step[0]) < tolerance and abs(step[1]) < tolerance and abs(step[4]) < 10 * tolerance:
+                converged = True
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    for axis in range(2):
+        unit = np.zeros(N_CORNER)
+        unit[axis] = 1.0
+        if not cholesky_solve(H, 0.0, unit, L):
+            return sums, False
+        covariance[0, axis], covariance[1, axis] = unit[0], unit[1]
+    return sums, converged
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_corners(image, windows, starts, curvatures, noise, iterations, tolerance):  # type: ignore[no-untyped-def]
+    """`fit_corner` for many corners of one image: parameters (n, 9), covariances (n, 2, 2), sums (n, 9), converged."""
+    n = starts.shape[0]
+    found = starts.copy()
+    covariance = np.empty((n, 2, 2))
+    sums = np.empty((n, 9))
+    converged = np.empty(n, np.bool_)
+    for i in range(n):
+        sums[i], converged[i] = fit_corner(
+            image, windows[i], found[i], curvatures[i], noise, iterations, tolerance, covariance[i]
+        )
+    return found, covariance, sums, converged

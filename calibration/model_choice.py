@@ -1,0 +1,156 @@
+"""Which distortion terms and which board shape the data support: by the error on views that the fit has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.camera import Array
+from calibration.refinement import (
+    BOARD_MODELS,
+    DISTORTION_MODELS,
+    N_STEREO,
+    Observations,
+    Problem,
+    Refinement,
+    StereoModel,
+    Terms,
+    minimise,
+    predict,
+    refine_stereo,
+)
+
+FOLDS = 5
+TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
+SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler model may be worse
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One row of the cross-validation table."""
+
+    terms: Terms
+    n_parameters: int  # shared by all views
+    rms_px: float  # on the views that were fitted
+    held_out_rms_px: float  # on views left out, each with its own pose fitted
+    held_out_chi_square: float  # per observation, in units of the common noise, truncated
+    per_view: Array  # (n_views,) the same, NaN where a view was not used
+
+
+def held_out(refinement: Refinement, sigma: float) -> tuple[Array, Array, Array]:
+    """Chi-square (truncated), squared distance [px^2] and number of points per view, each view left out in turn.
+
+    sigma : unexplained noise [px] for the comparison, the same for every candidate
+    """
+    used = refinement.observations[refinement.kept]
+    everything = refinement.observations
+    n_views = refinement.problem.n_views
+    chi2, square, count = np.full(n_views, np.nan), np.full(n_views, np.nan), np.zeros(n_views)
+    views = np.unique(used.view)
+    for fold in range(min(FOLDS, len(views))):
+        left_out = views[fold :: min(FOLDS, len(views))]
+        train = used[~np.isin(used.view, left_out)]
+        problem = replace(refinement.problem, observations=train, weights=_weights(train, sigma))
+        model = minimise(problem, refinement.model, iterations=12, tolerance=1e-6).model
+        test = everything[np.isin(everything.view, left_out)]
+        model = fit_poses(test, model, sigma)
+        residuals = test.pixels - predict(model, test)[0]
+        distance = np.einsum("mi,mij,mj->m", residuals, _weights(test, sigma), residuals)
+        good = distance < TRUNCATE
+        for v in left_out:
+            of_view = test.view == v
+            chi2[v] = np.minimum(distance[of_view], TRUNCATE).sum()
+            square[v] = np.sum(residuals[of_view & good] ** 2) if (of_view & good).any() else np.nan
+            count[v] = of_view.sum()
+    return chi2, square, count
+
+
+def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> StereoModel:
+    """Poses of the target in the views of the observations, everything else held."""
+    problem = Problem(
+        observations,
+        _weights(observations, sigma),
+        np.zeros((N_STEREO, 0)),
+        np.zeros((*model.points.shape, 0)),
+        len(model.R_left_board),
+        huber=3.0,
+    )
+    return minimise(problem, model, iterations=12, tolerance=1e-6).model
+
+
+def _weights(observations: Observations, sigma: float) -> Array:
+    return np.asarray(np.linalg.inv(observations.covariance + sigma**2 * np.eye(2)), np.float64)
+
+
+def candidate(refinement: Refinement, sigma: float) -> Candidate:
+    """The row of one fitted model."""
+    chi2, square, count = held_out(refinement, sigma)
+    with np.errstate(invalid="ignore"):
+        per_view = chi2 / np.where(count > 0, count, np.nan)
+    return Candidate(
+        terms=refinement.terms,
+        n_parameters=refinement.problem.stereo_basis.shape[1] + refinement.problem.shape_basis.shape[-1],
+        rms_px=refinement.rms(),
+        held_out_rms_px=float(np.sqrt(np.nansum(square) / max(count.sum(), 1))),
+        held_out_chi_square=float(np.nansum(chi2) / max(count.sum(), 1)),
+        per_view=per_view,
+    )
+
+
+def best(candidates: list[Candidate]) -> int:
+    """Least held-out chi-square; a simpler model that is not clearly worse comes first."""
+    winner = min(candidates, key=lambda c: c.held_out_chi_square)
+    for i in sorted(range(len(candidates)), key=lambda i: candidates[i].n_parameters):
+        difference = candidates[i].per_view - winner.per_view
+        difference = difference[np.isfinite(difference)]
+        error = float(np.std(difference) / np.sqrt(max(len(difference) - 1, 1)))
+        if np.mean(difference) <= SIMPLER_WITHIN * error:
+            return i
+    return candidates.index(winner)
+
+
+def choose_terms(
+    observations: Observations,
+    start: StereoModel,
+    nominal: Array,
+    distortions: tuple[str, ...] | None = None,
+    boards: tuple[str, ...] = BOARD_MODELS,
+    equal_aspect: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Refinement, tuple[Candidate, ...]]:
+    """Choose distortion terms, then the board's shape, then the distortion again if the board is not flat.
+
+    Returns the refinement of the chosen terms and the table of everything that was compared. Names that are given as
+    one-element tuples are taken, not chosen.
+    """
+    distortions = tuple(DISTORTION_MODELS) if distortions is None else distortions
+    richest = max(distortions, key=lambda name: len(DISTORTION_MODELS[name]))
+    board = boards[0]
+    fits = {(richest, board): refine_stereo(observations, start, nominal, Terms(richest, board, equal_aspect))}
+    table: dict[tuple[str, str], Candidate] = {}
+    sigma = fits[richest, board].unexplained_sigma
+
+    def compare(keys: list[tuple[str, str]], begin: Refinement) -> tuple[str, str]:
+        nonlocal sigma
+        for key in keys:
+            if key not in fits:
+                progress(f"trying distortion {key[0]!r}, {key[1]} board")
+                terms = Terms(key[0], key[1], equal_aspect)
+                fits[key] = refine_stereo(observations, start, nominal, terms, begin=begin)
+        if len(keys) == 1:
+            return keys[0]
+        sigma = min(fits[key].unexplained_sigma for key in keys)
+        for key in keys:
+            table[key] = candidate(fits[key], sigma)
+        return keys[best([table[key] for key in keys])]
+
+    chosen = compare([(d, board) for d in distortions], fits[richest, board])
+    if len(boards) > 1:
+        chosen = compare([(chosen[0], b) for b in boards], fits[chosen])
+        if chosen[1] != board and len(distortions) > 1:
+            chosen = compare([(d, chosen[1]) for d in distortions], fits[chosen])
+    if chosen not in table:
+        table[chosen] = candidate(fits[chosen], fits[chosen].unexplained_sigma)
+    return fits[chosen], tuple(table.values())

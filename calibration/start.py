@@ -1,0 +1,96 @@
+"""Rough cameras and poses to start the refinement from: OpenCV per camera, then the pair that most views agree on."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import Array, Camera, rotation_from_vector
+from calibration.errors import CalibrationError
+from calibration.refinement import Observations, StereoModel
+
+MIN_POINTS = 8  # of one view in one camera, to start its pose
+MIN_VIEWS = 3  # Zhang: fewer do not determine a camera
+
+
+def start_camera(
+    observations: Observations, index: int, nominal: Array, image_size: tuple[int, int]
+) -> tuple[Camera, dict[int, tuple[Array, Array]]]:
+    """One camera and {view: (R, t) of the board in it} by OpenCV's calibrateCamera with k1 alone."""
+    objects, images, views = [], [], []
+    for view in np.unique(observations.view):
+        use = (observations.view == view) & (observations.camera == index)
+        if use.sum() >= MIN_POINTS:
+            objects.append(nominal[observations.point[use]].astype(np.float32))
+            images.append(observations.pixels[use].astype(np.float32))
+            views.append(int(view))
+    name = ("left", "right")[index]
+    if len(views) < MIN_VIEWS:
+        raise CalibrationError(
+            f"{name} camera: the target is found in {len(views)} views, at least {MIN_VIEWS} are needed "
+            "(10 to 20, tilted in several directions, are good)"
+        )
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO
+    w, h = image_size
+    guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])
+    try:
+        _, K, distortion, turns, shifts = cv2.calibrateCamera(
+            objects, images, image_size, guess, np.zeros(5), flags=flags
+        )
+    except cv2.error as error:
+        raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
+    k1 = float(np.ravel(distortion)[0])
+    if not (np.isfinite(K).all() and abs(k1) < 10):
+        raise CalibrationError(f"{name} camera: the views do not determine the focal length; tilt the board more")
+    camera = Camera(
+        float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), (k1, 0.0, 0.0, 0.0, 0.0), image_size
+    )
+    poses = {
+        view: (rotation_from_vector(np.ravel(turn)), np.ravel(shift).astype(float))
+        for view, turn, shift in zip(views, turns, shifts, strict=True)
+    }
+    return camera, poses
+
+
+def rotation_angle(R: Array) -> Array:
+    """Angle [rad] of rotations (..., 3, 3)."""
+    return np.arccos(np.clip(0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1), -1, 1))
+
+
+def common_pair(rotations: Array, translations: Array) -> tuple[int, NDArray[np.bool_]]:
+    """Index of the stereo pose that most others agree with, and who agrees: within 5 deg and 10 % of the baseline."""
+    angle = rotation_angle(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
+    shift = np.linalg.norm(translations[:, None] - translations[None], axis=-1)
+    length = np.linalg.norm(translations, axis=-1)
+    agree = (angle < np.radians(5)) & (shift < 0.1 * length[:, None] + 1e-9)
+    cost = np.sum(np.minimum(angle / np.radians(5), 1) + np.minimum(shift / (0.1 * length[:, None] + 1e-9), 1), axis=1)
+    best = int(np.argmin(cost))
+    return best, agree[best]
+
+
+def start_stereo(
+    observations: Observations, nominal: Array, image_sizes: tuple[tuple[int, int], tuple[int, int]], n_views: int
+) -> tuple[StereoModel, NDArray[np.bool_]]:
+    """Start model, and which views (n_views,) agree with it or were seen by one camera only."""
+    left, left_poses = start_camera(observations, 0, nominal, image_sizes[0])
+    right, right_poses = start_camera(observations, 1, nominal, image_sizes[1])
+    both = sorted(left_poses.keys() & right_poses.keys())
+    if not both:
+        raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
+    rotations = np.stack([right_poses[v][0] @ left_poses[v][0].T for v in both])
+    translations = np.stack([right_poses[v][1] - R @ left_poses[v][1] for v, R in zip(both, rotations, strict=True)])
+    best, agree = common_pair(rotations, translations)
+    R_pair, t_pair = rotations[best], np.median(translations[agree], axis=0)
+    usable = np.ones(n_views, bool)
+    usable[[v for v, ok in zip(both, agree, strict=True) if not ok]] = False
+    R_board, t_board = np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1))
+    for view in range(n_views):
+        if view in left_poses:
+            R_board[view], t_board[view] = left_poses[view]
+        elif view in right_poses:
+            R, t = right_poses[view]
+            R_board[view], t_board[view] = R_pair.T @ R, R_pair.T @ (t - t_pair)
+        else:
+            usable[view] = False
+    return StereoModel((left, right), R_pair, t_pair, R_board, t_board, nominal.copy()), usable

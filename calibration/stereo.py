@@ -1,0 +1,370 @@
+"""From synchronised views of a chessboard to a calibrated stereo rig with its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.assessment import Assessment, assess, consistency_factor, half_set_differences
+from calibration.board import Board
+from calibration.camera import Array, StereoRig
+from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
+from calibration.errors import CalibrationError
+from calibration.model_choice import Candidate, choose_terms
+from calibration.refinement import BOARD_MODELS, DISTORTION_MODELS, Observations, Refinement
+from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
+from calibration.table_frame import rig_with_covariance
+
+CAMERA_NAMES = ("left", "right")
+MAX_VIEW_RATIO = 5.0  # a view's misfit against the median view's: beyond, the board moved between the two exposures
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """What the user may decide; "auto" is decided by held-out error."""
+
+    distortion: str = "auto"  # or a key of refinement.DISTORTION_MODELS
+    board: str = "auto"  # or one of refinement.BOARD_MODELS
+    equal_aspect: bool = False  # fx = fy
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        if self.distortion not in ("auto", *DISTORTION_MODELS):
+            raise CalibrationError(f"distortion {self.distortion!r}: choose auto, {', '.join(DISTORTION_MODELS)}")
+        if self.board not in ("auto", *BOARD_MODELS):
+            raise CalibrationError(f"board model {self.board!r}: choose auto, {', '.join(BOARD_MODELS)}")
+
+
+@dataclass(frozen=True)
+class StereoCalibration:
+    """A calibrated rig and everything needed to judge it, or to do it again without the images."""
+
+    rig: StereoRig  # with covariance (30, 30)
+    refinement: Refinement  # observations, residuals, what was kept
+    board: Board
+    board_points: Array  # (n, 3) [m] as refined; the declared ones where the board is taken as flat
+    settings: CalibrationSettings
+    table_view: int | None
+    board_thickness: float  # [m]
+    view_names: tuple[tuple[str, str], ...]  # (n_views,) left and right name
+    corner_views: tuple[tuple[CornerView | BoardNotFound, ...], tuple[CornerView | BoardNotFound, ...]]
+    rejected_views: dict[int, str]  # view -> reason
+    candidates: tuple[Candidate, ...]  # cross-validation table; the chosen terms are refinement.terms
+    assessment: Assessment
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance between located and predicted corners [px], both cameras."""
+        return self.refinement.rms()
+
+    @property
+    def rms_per_camera_px(self) -> tuple[float, float]:
+        """The same for the left and for the right camera."""
+        camera = self.refinement.observations.camera
+        return self.refinement.rms(camera == 0), self.refinement.rms(camera == 1)
+
+    @property
+    def rms_per_view_px(self) -> Array:
+        """(n_views, 2 cameras) [px]; NaN where a view was not used."""
+        o = self.refinement.observations
+        return np.array(
+            [
+                [self.refinement.rms((o.view == v) & (o.camera == c)) for c in (0, 1)]
+                for v in range(len(self.view_names))
+            ]
+        )
+
+    def rejected_corners(self) -> list[tuple[int, int, int, str]]:
+        """(view, camera, corner, reason) of every corner that was found but not used."""
+        rejected = []
+        for camera, views in enumerate(self.corner_views):
+            for v, view in enumerate(views):
+                if isinstance(view, CornerView):
+                    rejected += [(v, camera, int(i), view.reasons[i]) for i in np.flatnonzero(~view.accepted)]
+        r = self.refinement
+        o = r.observations
+        for i in np.flatnonzero(~r.kept):
+            distance = float(np.linalg.norm(r.residuals[i]))
+            reason = f"{distance:.3f} px from where all other corners put it"
+            rejected.append((int(o.view[i]), int(o.camera[i]), int(o.point[i]), reason))
+        return rejected
+
+
+def calibrate_stereo(
+    left_images: Sequence[NDArray],
+    right_images: Sequence[NDArray],
+    board: Board,
+    settings: CalibrationSettings | None = None,
+    table_view: int | None = None,
+    board_thickness: float = 0.0,
+    names: Sequence[tuple[str, str]] | None = None,
+    progress: Progress | None = None,
+) -> StereoCalibration:
+    """Calibrate from images; image i of the left and of the right show the board in the same place.
+
+    left_images, right_images : grey or colour images as OpenCV reads them unchanged, 8 or 16 bit
+    table_view : index of the view whose board lies flat on the table; None leaves the left camera's axes as the world
+    board_thickness : [m] from the table to the printed face
+    names : (left, right) name of every view, for messages
+    progress : called as progress(stage, done, total)
+
+    Raises CalibrationError when the views do not allow a calibration; single bad views are left out with a reason.
+    """
+    if len(left_images) != len(right_images):
+        raise CalibrationError(
+            f"{len(left_images)} left and {len(right_images)} right images: views are pairs, one image of each camera"
+        )
+    names = names or [(f"left {i}", f"right {i}") for i in range(len(left_images))]
+    _check_sizes(left_images, right_images, names)
+    settings = settings or CalibrationSettings()
+    total = 2 * len(left_images)
+    done = 0
+
+    def locate(image: NDArray) -> CornerView | BoardNotFound:
+        nonlocal done
+        try:
+            found = find_corners(image, board.inner_corners)
+        except ValueError as error:
+            found = BoardNotFound(str(error))
+        done += 1
+        if progress:
+            progress("corners", done, total)
+        return found
+
+    with ThreadPoolExecutor(settings.threads) as pool:
+        views = list(pool.map(locate, [*left_images, *right_images]))
+    n = len(left_images)
+    return calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
+
+
+def _check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:
+    for camera, images in enumerate((left, right)):
+        for i, image in enumerate(images):
+            if np.ndim(image) < 2:
+                raise CalibrationError(f"{names[i][camera]}: not an image, its shape is {np.shape(image)}")
+            (h, w), (h0, w0) = image.shape[:2], images[0].shape[:2]
+            if (h, w) != (h0, w0):
+                raise CalibrationError(
+                    f"{names[i][camera]}: {CAMERA_NAMES[camera]} image is {w} x {h} px, but {names[0][camera]} is "
+                    f"{w0} x {h0} px. One camera has one image size: leave this view out, or export it again."
+                )
+
+
+def calibrate_from_corners(
+    left_views: Sequence[CornerView | BoardNotFound],
+    right_views: Sequence[CornerView | BoardNotFound],
+    board: Board,
+    settings: CalibrationSettings | None = None,
+    table_view: int | None = None,
+    board_thickness: float = 0.0,
+    names: Sequence[tuple[str, str]] | None = None,
+    progress: Progress | None = None,
+) -> StereoCalibration:
+    """`calibrate_stereo` from corners that were located before."""
+    settings = settings or CalibrationSettings()
+    n_views = len(left_views)
+    names = tuple(names or [(f"left {i}", f"right {i}") for i in range(n_views)])
+    if table_view is not None and not 0 <= table_view < n_views:
+        raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {n_views - 1}")
+    views = (list(left_views), list(right_views))
+    rejected, warnings = _views_not_found(views, names)
+    _require_views(views, names, rejected, table_view)
+    if board.symmetry > 1:
+        views, note = _agree_on_order(views, board, names)
+        warnings.append(note)
+    sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
+    observations = _observations(views)
+    start, agrees = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
+    for v in np.flatnonzero(~agrees):
+        if int(v) not in rejected:
+            rejected[int(v)] = (
+                f"views {names[v][0]} and {names[v][1]}: the two cameras disagree with the other views about where "
+                "they stand: the board moved between the exposures, or the images are not a pair"
+            )
+    observations = observations[~np.isin(observations.view, list(rejected))]
+
+    def report(text: str) -> None:
+        if progress:
+            progress(text, 0, 0)
+
+    report("refining")
+    choice = (
+        None if settings.distortion == "auto" else (settings.distortion,),
+        BOARD_MODELS if settings.board == "auto" else (settings.board,),
+    )
+    refinement, candidates = choose_terms(observations, start, board.points, *choice, settings.equal_aspect, report)
+    bad = _misfitting_views(refinement, names)
+    if bad:
+        rejected |= bad
+        observations = observations[~np.isin(observations.view, list(bad))]
+        refinement, candidates = choose_terms(observations, start, board.points, *choice, settings.equal_aspect, report)
+    if table_view in rejected:
+        raise CalibrationError(f"the table view {table_view} cannot be used: {rejected[table_view]}")
+    n_used = len(np.unique(refinement.observations.view[refinement.kept]))
+    if n_used < MIN_VIEWS:
+        raise CalibrationError(f"only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}")
+    report("judging")
+    inflation = max(consistency_factor(refinement), 1.0)
+    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation)
+    halves = half_set_differences(refinement, inflation)
+    assessment = assess(refinement, candidates, rig, table_view, inflation, halves)
+    return StereoCalibration(
+        rig=rig,
+        refinement=refinement,
+        board=board,
+        board_points=refinement.model.points,
+        settings=settings,
+        table_view=table_view,
+        board_thickness=board_thickness,
+        view_names=names,
+        corner_views=(tuple(views[0]), tuple(views[1])),
+        rejected_views=dict(sorted(rejected.items())),
+        candidates=candidates,
+        assessment=assessment,
+        warnings=(*warnings, *assessment.warnings),
+    )
+
+
+def _views_not_found(
+    views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]], names: Sequence[tuple[str, str]]
+) -> tuple[dict[int, str], list[str]]:
+    """Views that neither camera can use, and warnings about those that only one can."""
+    rejected, warnings = {}, []
+    for v, pair in enumerate(zip(*views, strict=True)):
+        missing = [(c, view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
+        text = "; ".join(f"{names[v][c]}: {reason}" for c, reason in missing)
+        if len(missing) == 2:
+            rejected[v] = text
+        elif missing:
+            warnings.append(f"view {v} is used in one camera only: {text}")
+    notes = sorted({note for side in views for view in side if isinstance(view, CornerView) for note in view.notes})
+    return rejected, warnings + notes
+
+
+def _require_views(
+    views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]],
+    names: Sequence[tuple[str, str]],
+    rejected: dict[int, str],
+    table_view: int | None,
+) -> None:
+    if not views[0]:
+        raise CalibrationError("no calibration views were given")
+    for camera, side in enumerate(views):
+        found = sum(isinstance(view, CornerView) for view in side)
+        if found < MIN_VIEWS:
+            reasons = {v: view.reason for v, view in enumerate(side) if isinstance(view, BoardNotFound)}
+            raise CalibrationError(
+                f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
+                f"are needed (10 to 20 are good). {_listed(reasons)}"
+            )
+    if table_view is not None and table_view in rejected:
+        raise CalibrationError(
+            f"the board was not found in the table view {table_view} ({rejected[table_view]}): without it there is no "
+            "lab frame. Name another view whose board lies flat on the table, or take it again."
+        )
+
+
+def _listed(reasons: dict[int, str]) -> str:
+    shown = [f"view {v}: {reason}" for v, reason in list(reasons.items())[:3]]
+    return "; ".join(shown) + (f"; and {len(reasons) - 3} more" if len(reasons) > 3 else "")
+
+
+def _observations(views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]) -> Observations:
+    parts: list[tuple[NDArray, ...]] = []
+    for camera, side in enumerate(views):
+        for v, view in enumerate(side):
+            if isinstance(view, CornerView):
+                index = np.flatnonzero(view.accepted)
+                parts.append(
+                    (
+                        np.full(len(index), v),
+                        np.full(len(index), camera),
+                        index,
+                        view.points[index],
+                        view.covariance[index],
+                    )
+                )
+    return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _agree_on_order(
+    views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]],
+    board: Board,
+    names: Sequence[tuple[str, str]],
+) -> tuple[tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]], str]:
+    """Turn the right views so that all pairs tell of one stereo pose: for boards whose colouring is symmetric."""
+    observations = _observations(views)
+    orders = board_orders(board.inner_corners)
+    if board.symmetry == 2 and len(orders) == 4:
+        orders = orders[::2]
+    sizes = [next(v.image_size for v in side if isinstance(v, CornerView)) for side in views]
+    poses = [start_camera(observations, c, board.points, sizes[c])[1] for c in (0, 1)]
+    both = sorted(poses[0].keys() & poses[1].keys())
+    centre = board.points.mean(0)
+    rotations, translations = [], []
+    for v in both:
+        R, t = poses[1][v]
+        for k in range(len(orders)):
+            # corner orders[k][i] takes place i: the board turns by k steps about its own centre
+            turn = _turn_of_order(orders[k], board)
+            R_turned = R @ turn
+            t_turned = t + R @ centre - R_turned @ centre
+            R_pair = R_turned @ poses[0][v][0].T
+            rotations.append(R_pair)
+            translations.append(t_turned - R_pair @ poses[0][v][1])
+    _, agree = common_pair(np.array(rotations), np.array(translations))
+    agree_per_view = agree.reshape(len(both), len(orders))
+    right = list(views[1])
+    for v, agreeing in zip(both, agree_per_view, strict=True):
+        view = right[v]
+        if agreeing.any() and isinstance(view, CornerView):
+            right[v] = view.reordered(orders[int(np.argmax(agreeing))])
+    note = (
+        f"a board of {board.inner_corners[0]} x {board.inner_corners[1]} inner corners looks the same after a turn: "
+        "the two cameras were made to agree, but which corner is the origin of the lab frame is a choice (i points to the "
+        "right in the left image). An odd by an even count leaves no choice."
+    )
+    return (views[0], right), note
+
+
+def _turn_of_order(order: NDArray[np.intp], board: Board) -> Array:
+    """Rotation (3, 3) with points[order] - centre = (points - centre) @ R.T."""
+    d = board.points - board.points.mean(0)
+    U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])
+    R = np.eye(3)
+    R[:2, :2] = U @ Vt
+    return R
+
+
+def _misfitting_views(refinement: Refinement, names: Sequence[tuple[str, str]]) -> dict[int, str]:
+    """Views whose corners fit far worse than those of the others, or lost most of their corners."""
+    o = refinement.observations
+    views = np.unique(o.view)
+    rms = np.array([refinement.rms(o.view == v) for v in views])
+    lost = np.array([1 - refinement.kept[o.view == v].mean() for v in views])
+    typical = float(np.nanmedian(rms))
+    bad = {}
+    for v, value, share in zip(views, rms, lost, strict=True):
+        if share > 0.5:
+            bad[int(v)] = f"{names[v][0]}, {names[v][1]}: {100 * share:.0f} % of the corners do not fit the other views"
+        elif value > MAX_VIEW_RATIO * typical:
+            bad[int(v)] = (
+                f"{names[v][0]}, {names[v][1]}: RMS {value:.3f} px, the median view has {typical:.3f} px: "
+                "blurred, or the board moved between the exposures"
+            )
+    return bad
+
+
+__all__ = [
+    "Board",
+    "CalibrationSettings",
+    "StereoCalibration",
+    "calibrate_from_corners",
+    "calibrate_stereo",
+]
