@@ -158,6 +158,8 @@ class RollingMotion:
     nutation_deg: float = 0.05  # amplitude of the oscillation on top of regular precession
     nutation_phase_deg: float = 0.0
     state: dict[str, float] = field(default_factory=dict)  # components of rolling.State [SI] that replace the above
+    struck: dict[str, float] = field(default_factory=dict)  # in place of all that: upright and at rest, hit by a ball;
+    # lateral_mm, vertical_mm from the middle of the upper face, impulse_N_s, friction of the table during the impact
     effects: dict[str, dict[str, float]] = field(default_factory=lambda: {"km": {}, "kn": {}, "kz": {}})
     # by their names in rolling.CATALOGUE; parameters not given take their nominal value, for these three the paper's
 

@@ -99,10 +99,15 @@ def rolling_model(scene: Scene) -> Model:
 
 
 def rolling_start(scene: Scene) -> State:
-    """State at the beginning: regular precession with a nutation oscillation, changed by the scene's `state`."""
+    """State at the beginning: regular precession with a nutation oscillation, changed by the scene's `state`.
+
+    Or, with `struck`, the upright disc just after a ball has hit it.
+    """
     from disctrack.rolling import State, steady_precession
 
     start = scene.motion.rolling
+    if start.struck:
+        return _struck(scene)
     unknown = set(start.state) - set(State.__dataclass_fields__)
     if unknown:
         known = ", ".join(State.__dataclass_fields__)
@@ -120,6 +125,30 @@ def rolling_start(scene: Scene) -> State:
         y=start.centre_mm[1] * 1e-3,
     )
     return regular.moved(**start.state)
+
+
+def _struck(scene: Scene) -> State:
+    from disctrack.rolling import struck_disc
+
+    start = scene.motion.rolling
+    wanted = {"lateral_mm", "vertical_mm", "impulse_N_s"}
+    given = set(start.struck)
+    if not wanted <= given <= wanted | {"friction"}:
+        raise SceneError(
+            f"motion.rolling.struck has {', '.join(sorted(given))}; expected {', '.join(sorted(wanted))} and, "
+            "if wanted, friction"
+        )
+    return struck_disc(
+        scene.declared_disc,
+        start.struck["lateral_mm"] * 1e-3,
+        start.struck["vertical_mm"] * 1e-3,
+        start.struck["impulse_N_s"],
+        friction=start.struck.get("friction", 0.0),
+        psi=np.radians(start.psi_deg),
+        phi=np.radians(start.phi_deg),
+        x=start.centre_mm[0] * 1e-3,
+        y=start.centre_mm[1] * 1e-3,
+    )
 
 
 def simulate_scene(scene: Scene) -> Motion:

@@ -1,12 +1,14 @@
 """The rolling disc forwards: equations of motion, effects that are added to them, simulation, derivatives.
 
-Public verbs in the order of use: `Model`, `State` (or `steady_precession`), `simulate`, `simulate_batch`,
-`sensitivities`. Effects are in `effects.CATALOGUE`.
+Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `struck_disc`), `simulate`,
+`simulate_batch`, `sensitivities`. Effects are in `effects.CATALOGUE`; `evaluate` applies their laws to motions from
+elsewhere, `run` writes a scene's motion to a file.
 """
 
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, ModelError, Parameter
-from disctrack.rolling.model import DEFAULT_THETA_END, Model
+from disctrack.rolling.impact import struck_disc
+from disctrack.rolling.model import DEFAULT_THETA_END, Model, effects_from_tables, effects_toml
 from disctrack.rolling.motion import EndReason, Motion, Regime, Switch
 from disctrack.rolling.sensitivities import Sensitivities, sensitivities
 from disctrack.rolling.simulate import simulate, simulate_batch, time_grid
@@ -27,11 +29,14 @@ __all__ = [
     "State",
     "Switch",
     "effects",
+    "effects_from_tables",
+    "effects_toml",
     "nutation_frequency",
     "precession_rate",
     "sensitivities",
     "simulate",
     "simulate_batch",
     "steady_precession",
+    "struck_disc",
     "time_grid",
 ]

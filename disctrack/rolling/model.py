@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -95,3 +95,20 @@ def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str,
     for name in own:
         own[name] = (values or {}).get(f"{effect.name}.{name}", own[name])
     return own
+
+
+def effects_from_tables(tables: Mapping[str, Mapping[str, float]]) -> tuple[Effect, ...]:
+    """Effects of nested tables {effect: {parameter: value}}, as a scene or a saved model has them."""
+    return tuple(effect_class(name)(**values) for name, values in tables.items())
+
+
+def effects_toml(effects: Sequence[Effect], section: str = "motion.rolling.effects") -> str:
+    """TOML text of the effects, ready to stand in a scene; units and meaning as comments."""
+    lines = []
+    for effect in effects:
+        lines += [f"[{section}.{effect.name}]  # {effect.title}"]
+        for p in effect.parameters:
+            value = effect.values[p.name]
+            number = repr(value) if np.isfinite(value) else ("inf" if value > 0 else "-inf")
+            lines += [f"{p.name} = {number}  # {p.unit}; {p.meaning}"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,98 @@
+"""disctrack simulate: from a scene to a file that explains itself, and messages where it cannot be."""
+
+import tomllib
+
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.errors import OutputError, SceneError
+from disctrack.rolling import CATALOGUE, effects_from_tables, effects_toml
+from disctrack.rolling.run import run_simulate
+
+SCENE = """
+name = "roll"
+[cameras]
+n_frames = 51
+frame_rate_hz = 500.0
+[motion]
+kind = "rolling"
+[motion.rolling]
+theta_deg = 8
+[motion.rolling.effects.km]
+[motion.rolling.effects.kz]
+k_z = 6e-5
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def test_motion_file_holds_the_motion_with_units(scene, tmp_path):
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert "kz.k_z = 6e-05 m" in run.summary
+    with h5py.File(run.path) as file:
+        assert file.attrs["complete"] == 1
+        assert file.attrs["end_reason"] == "the requested time was reached"
+        assert_allclose(file["time"][()], np.arange(51) / 500)
+        for i, name in enumerate(("x", "y", "z", "psi", "theta", "phi")):
+            assert_allclose(file[name][()], run.motion.q[:, i])
+        assert_allclose(file["energy/total"][()], run.motion.energy)
+        assert_allclose(file["contact/F_z"][()], run.motion.contact_force[:, 2])
+        assert file["model/kz"].attrs["k_z"] == 6e-5
+
+        def has_units(name, item):
+            if isinstance(item, h5py.Dataset):
+                assert item.attrs["units"], name
+                assert item.attrs["long_name"], name
+
+        file.visititems(has_units)
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_motion_file_opens_in_xarray(scene, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    run = run_simulate(scene, tmp_path / "motion.h5", duration=0.02, rate=2000)
+    with xarray.open_dataset(run.path, engine="h5netcdf") as data:
+        assert dict(data.sizes)["time"] == 41
+        assert data.theta.attrs["units"] == "rad"
+
+
+def test_a_motion_that_ends_gives_a_shorter_file_with_the_reason(scene, tmp_path):
+    scene.write_text(SCENE.replace("theta_deg = 8", "theta_deg = 0.8"))
+    run = run_simulate(scene, tmp_path / "motion.h5", duration=1.0)
+    with h5py.File(run.path) as file:
+        assert len(file["time"]) < 501
+        assert file.attrs["end"] == "NUTATION"
+
+
+def test_a_struck_disc_is_a_scene_too(scene, tmp_path):
+    struck = "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05, friction = 0.1 }"
+    text = SCENE.replace("theta_deg = 8", struck) + "[motion.rolling.effects.slip]\nmu = 0.1\n"
+    scene.write_text(text)
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert run.motion.q[0, 4] == np.pi / 2
+    scene.write_text(text.replace("impulse_N_s", "impulse"))
+    with pytest.raises(SceneError, match="expected impulse_N_s, lateral_mm, vertical_mm"):
+        run_simulate(scene, tmp_path / "other.h5")
+
+
+def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
+    (tmp_path / "there.h5").write_text("")
+    with pytest.raises(OutputError, match="exists"):
+        run_simulate(scene, tmp_path / "there.h5")
+    scene.write_text('[motion]\nkind = "static"\n')
+    with pytest.raises(SceneError, match='needs kind = "rolling"'):
+        run_simulate(scene, tmp_path / "motion.h5")
+
+
+def test_effects_survive_their_toml():
+    effects = tuple(effect() for effect in CATALOGUE.values())
+    tables = tomllib.loads(effects_toml(effects))["motion"]["rolling"]["effects"]
+    assert effects_from_tables(tables) == effects
