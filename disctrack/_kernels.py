@@ -36,6 +36,9 @@ _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
 _CLIP_SIGMA = 5.0
+# Semi-minor axis in blurs: below, the two long edges melt into one another and the centre errs by more than its sigma.
+_MIN_SEMI_MINOR = 3.7
+_ATTITUDE_TOLERANCE = 1.5e-3  # [rad] farther from the expected attitude a pair is looked at once more
 
 
 @_compiled
@@ -172,12 +175,12 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, de
             X, Y = _plane_point(P, map_x[y, x], map_y[y, x])
             dx, dy = X - start[0] - p[A], Y - start[1] - p[B]
             rho2 = dx * dx + dy * dy
-            if not inner * inner < rho2 < outer * outer or rim * rim < X * X + Y * Y:  # NaN: a pixel without a ray
+            if not inner * inner < rho2 < outer * outer:  # also NaN: a pixel without a ray
                 continue
             d, slope, nx, ny, g, curvature = _edge_distance(dx, dy, p[RADIUS], G, det)
             if not -band - 1.0 < d < band or n >= scratch.shape[1]:
                 continue
-            near = False
+            near = math.hypot(X, Y) > rim - 2.5 * p[SIGMA] * g
             for k in range(neighbours.shape[0]):
                 if math.hypot(X - neighbours[k, 0], Y - neighbours[k, 1]) - start[2] < 3.0 * p[SIGMA] * g:
                     near = True
@@ -339,8 +342,8 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
-    noise (2,): variance = noise[0] + noise[1] grey; rim: pixels farther than this from the plane's origin are not
-    used, nor are the surroundings of `neighbours` (k, 2), the other dots' centres; scratch (SCRATCH_ROWS, N).
+    noise (2,): variance = noise[0] + noise[1] grey; rim: radius of an edge about the plane's origin whose
+    blur must not reach the pixels used, as that of `neighbours` (k, 2), the other dots' centres; scratch (SCRATCH_ROWS, N).
     p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (12,) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -358,7 +361,7 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
-        if radius / largest < max(1.5 * p[SIGMA], 1.2):  # semi-minor axis: the two edges melt into one another
+        if radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], 2.0):
             return BLURRED
         band = 3.0 * p[SIGMA] + 1.0
         extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
@@ -584,30 +587,67 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
 
 
 @_compiled
-def track_frames(
-    images,
-    readable,
-    map_x,
-    map_y,
-    cameras,
-    R_cw,
-    t_cw,
-    centres,
-    radius,
-    rim,
-    sigma,
-    noise,
-    limits,
-    R_last,
-    t_last,
-    R_before,
-    t_before,
-    results,
-    status,
-    R_out,
-    t_out,
-    max_rms,
-):
+def _predict(R_last, t_last, R_before, t_before, R, t):
+    """The next pose if the last turn and the last shift are made once more: R = (R_last R_before^T) R_last."""
+    for i in range(3):
+        t[i] = 2.0 * t_last[i] - t_before[i]
+        for j in range(3):
+            R[i, j] = 0.0
+            for k in range(3):
+                turn = 0.0
+                for q in range(3):
+                    turn += R_last[i, q] * R_before[k, q]
+                R[i, j] += turn * R_last[k, j]
+
+
+@_compiled
+def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits, R, t,
+          scratch, results, status):  # fmt: skip
+    """Locate and judge the dots of one pair (2, H, W), the disc being near the pose R, t."""
+    R_cb, t_cb = np.empty((3, 3)), np.empty(3)
+    for c in range(2):
+        if not readable[c]:
+            results[c, :, :] = np.nan
+            status[c, :] = NOT_LOOKED_FOR
+            continue
+        for i in range(3):
+            t_cb[i] = t_cw[c, i]
+            for j in range(3):
+                t_cb[i] += R_cw[c, i, j] * t[j]
+                R_cb[i, j] = 0.0
+                for k in range(3):
+                    R_cb[i, j] += R_cw[c, i, k] * R[k, j]
+        locate_dots(images[c], map_x[c], map_y[c], cameras[c], R_cb, t_cb, centres, radius, rim, sigma[c], noise[c],
+                    scratch, results[c], status[c])  # fmt: skip
+        for i in range(centres.shape[0]):
+            if status[c, i] == MEASURED:
+                status[c, i] = judge_dot(results[c, i], radius, sigma[c], limits)
+
+
+@_compiled
+def _settle(results, status, cameras, R_cw, t_cw, centres, R, t):
+    """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer."""
+    step, R_new = np.empty(6), np.empty((3, 3))
+    rms = -1.0
+    for _ in range(5):
+        rms = _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step)
+        if rms < 0.0:
+            return rms
+        for i in range(3):
+            t[i] += step[i]
+        _rotate_from_left(step[3:], R, R_new)
+        R[:] = R_new
+        if (
+            math.fabs(step[0]) + math.fabs(step[1]) + math.fabs(step[2]) < 1e-6
+        ):  # a micrometre: a prediction needs no more
+            break
+    _orthonormalise(R)
+    return rms
+
+
+@_compiled
+def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
+                 R_last, t_last, R_before, t_before, results, status, R_out, t_out, max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the two before by constant velocity and turn.
 
     images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 2), limits (4,)
@@ -615,67 +655,22 @@ def track_frames(
     (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was
     lost at that frame.
     """
-    n, m = images.shape[0], centres.shape[0]
     scratch = np.empty((SCRATCH_ROWS, 40000))
-    R, t, R_new = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    R_cb, t_cb, step = np.empty((3, 3)), np.empty(3), np.empty(6)
-    for f in range(n):
-        for i in range(3):
-            t[i] = 2.0 * t_last[i] - t_before[i]
-            for j in range(3):
-                # the last turn once more: R = (R_last R_before^T) R_last
-                R[i, j] = 0.0
-                for k in range(3):
-                    turn = 0.0
-                    for q in range(3):
-                        turn += R_last[i, q] * R_before[k, q]
-                    R[i, j] += turn * R_last[k, j]
-        for c in range(2):
-            if not readable[f, c]:
-                results[f, c, :, :] = np.nan
-                status[f, c, :] = NOT_LOOKED_FOR
-                continue
-            for i in range(3):
-                t_cb[i] = t_cw[c, i]
-                for j in range(3):
-                    t_cb[i] += R_cw[c, i, j] * t[j]
-                    R_cb[i, j] = 0.0
-                    for k in range(3):
-                        R_cb[i, j] += R_cw[c, i, k] * R[k, j]
-            locate_dots(
-                images[f, c],
-                map_x[c],
-                map_y[c],
-                cameras[c],
-                R_cb,
-                t_cb,
-                centres,
-                radius,
-                rim,
-                sigma[c],
-                noise[c],
-                scratch,
-                results[f, c],
-                status[f, c],
-            )
-            for i in range(m):
-                if status[f, c, i] == MEASURED:
-                    status[f, c, i] = judge_dot(results[f, c, i], radius, sigma[c], limits)
+    R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for f in range(images.shape[0]):
+        _predict(R_last, t_last, R_before, t_before, R, t)
         rms = -1.0
-        for _ in range(4):
-            rms = _pose_step(results[f], status[f], cameras, R_cw, t_cw, centres, R, t, step)
-            if rms < 0.0:
-                break
-            for i in range(3):
-                t[i] += step[i]
-            _rotate_from_left(step[3:], R, R_new)
-            R[:] = R_new
-            if math.fabs(step[0]) + math.fabs(step[1]) + math.fabs(step[2]) < 1e-6:
+        for _ in range(3):
+            R_expected[:] = R
+            _look(images[f], readable[f], map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
+                  R, t, scratch, results[f], status[f])  # fmt: skip
+            rms = _settle(results[f], status[f], cameras, R_cw, t_cw, centres, R, t)
+            # the template's shape follows the expected attitude: an error of 3 mrad moves centres by 1e-3 px
+            if rms < 0.0 or np.sum((R - R_expected) ** 2) < 2.0 * _ATTITUDE_TOLERANCE**2:
                 break
         if not 0.0 <= rms < max_rms:
             return f
-        _orthonormalise(R)
         R_out[f], t_out[f] = R, t
         R_before[:], t_before[:] = R_last, t_last
         R_last[:], t_last[:] = R, t
-    return n
+    return images.shape[0]

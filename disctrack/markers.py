@@ -85,6 +85,16 @@ def normalised_maps(camera: Camera) -> tuple[Array, Array]:
     return np.ascontiguousarray(ab[..., 0]), np.ascontiguousarray(ab[..., 1])
 
 
+def face_edge(disc: Disc) -> float:
+    """Radius [m] within which the face is taken to be one even background for its dots.
+
+    Paper ends, and edges are bevelled, a few per cent inside the disc's radius; a dot printed farther out than that
+    moves the limit with it.
+    """
+    outermost = float(np.hypot(*disc.marker_centres_body[:, :2].T).max()) + 0.5 * disc.marker_diameter
+    return max(0.95 * disc.radius, min(outermost + 0.15 * disc.marker_diameter, disc.radius))
+
+
 def locate_on_disc(
     image: Image,
     camera: Camera,
@@ -114,7 +124,7 @@ def locate_on_disc(
         np.ascontiguousarray(t_camera_body),
         np.ascontiguousarray(disc.marker_centres_body),
         0.5 * disc.marker_diameter,
-        disc.radius,
+        face_edge(disc),
         blur_px,
         noise.parameters,
         np.empty((kernels.SCRATCH_ROWS, 40000)),

@@ -29,6 +29,7 @@ from disctrack.markers import (
     NoiseModel,
     TemplateLimits,
     dot_centres,
+    face_edge,
     measure_noise,
     normalised_maps,
 )
@@ -130,7 +131,7 @@ class _Follower:
                 np.stack([t for _, t in poses]),
                 np.ascontiguousarray(self.disc.marker_centres_body),
                 0.5 * self.disc.marker_diameter,
-                self.disc.radius,
+                face_edge(self.disc),
                 np.array(self.blur),
                 np.stack([noise.parameters for noise in self.noise]),
                 self.limits.array(),
