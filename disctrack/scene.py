@@ -162,6 +162,7 @@ class RollingMotion:
     # lateral_mm, vertical_mm from the middle of the upper face, impulse_N_s, friction of the table during the impact
     effects: dict[str, dict[str, float]] = field(default_factory=lambda: {"km": {}, "kn": {}, "kz": {}})
     # by their names in rolling.CATALOGUE; parameters not given take their nominal value, for these three the paper's
+    formulas: dict[str, dict[str, str]] = field(default_factory=dict)  # laws of further effects: component -> formula
 
 
 @dataclass(frozen=True)

@@ -91,11 +91,10 @@ def _frames_within(scene: Scene, start: float, end: float, source: str) -> int:
 
 def rolling_model(scene: Scene) -> Model:
     """Declared disc and gravity with the scene's effects; raises ModelError for an effect that does not exist."""
-    from disctrack.rolling import Model
-    from disctrack.rolling.effects import effect_class
+    from disctrack.rolling import Model, effects_from_tables
 
-    effects = tuple(effect_class(name)(**values) for name, values in scene.motion.rolling.effects.items())
-    return Model(scene.declared_disc, scene.gravity_m_s2, effects)
+    settings = scene.motion.rolling
+    return Model(scene.declared_disc, scene.gravity_m_s2, effects_from_tables(settings.effects, settings.formulas))
 
 
 def rolling_start(scene: Scene) -> State:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from disctrack.disc import Disc
-from disctrack.rolling.effects import Effect, ModelError, Parameter, effect_class
+from disctrack.rolling.effects import Effect, ModelError, Parameter, effect_class, effect_from_formulas
 from disctrack.rolling.records import BODY
 
 DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper
@@ -97,8 +97,15 @@ def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str,
     return own
 
 
-def effects_from_tables(tables: Mapping[str, Mapping[str, float]]) -> tuple[Effect, ...]:
-    """Effects of nested tables {effect: {parameter: value}}, as a scene or a saved model has them."""
+def effects_from_tables(
+    tables: Mapping[str, Mapping[str, float]], formulas: Mapping[str, Mapping[str, str]] | None = None
+) -> tuple[Effect, ...]:
+    """Effects of nested tables {effect: {parameter: value}}, as a scene or a saved model has them.
+
+    formulas : {effect: {component: formula}} of effects that are not in the catalogue (effects.learned)
+    """
+    for name, law in (formulas or {}).items():
+        effect_from_formulas(name, law)
     return tuple(effect_class(name)(**values) for name, values in tables.items())
 
 
@@ -106,6 +113,10 @@ def effects_toml(effects: Sequence[Effect], section: str = "motion.rolling.effec
     """TOML text of the effects, ready to stand in a scene; units and meaning as comments."""
     lines = []
     for effect in effects:
+        formulas = getattr(effect, "formulas", None)
+        if formulas:
+            lines += [f"[{section.rpartition('.')[0]}.formulas.{effect.name}]"]
+            lines += [f"{component} = {formula!r}" for component, formula in formulas.items()]
         lines += [f"[{section}.{effect.name}]  # {effect.title}"]
         for p in effect.parameters:
             value = effect.values[p.name]

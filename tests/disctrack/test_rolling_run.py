@@ -92,6 +92,21 @@ def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
         run_simulate(scene, tmp_path / "motion.h5")
 
 
+def test_an_effect_by_formula_is_simulated_and_saved(scene, tmp_path):
+    law = '[motion.rolling.formulas.brake]\nload_z = "-c * omega_z"\n[motion.rolling.effects.brake]\nc = 1e-4\n'
+    scene.write_text(SCENE + law)
+    try:
+        run = run_simulate(scene, tmp_path / "motion.h5")
+        plain = scene.with_name("plain.toml")
+        plain.write_text(SCENE)
+        without = run_simulate(plain, tmp_path / "plain.h5")
+        assert np.abs(run.motion.q - without.motion.q).max() > 1e-6
+        saved = tomllib.loads(effects_toml(run.motion.model.effects))["motion"]["rolling"]
+        assert effects_from_tables(saved["effects"], saved["formulas"]) == run.motion.model.effects
+    finally:
+        CATALOGUE.pop("brake", None)
+
+
 def test_effects_survive_their_toml():
     effects = tuple(effect() for effect in CATALOGUE.values())
     tables = tomllib.loads(effects_toml(effects))["motion"]["rolling"]["effects"]

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Effect, Model, ModelError, Parameter, State, steady_precession
+from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None]
@@ -180,3 +181,60 @@ def test_load_dependent_moments_are_solved_with_the_acceleration_not_lagged():
     second = np.gradient(np.gradient(height, motion.time, edge_order=2), motion.time, edge_order=2)
     # F_z is read from the equations, the height from their solution: 1 ms differences of a 30 rad/s motion
     assert_allclose(F_z[3:-3], MA_2014.mass * (9.81 + second[3:-3]), rtol=0.02)
+
+
+@pytest.fixture
+def formula_effects():
+    before = set(CATALOGUE)
+    yield
+    for name in set(CATALOGUE) - before:
+        del CATALOGUE[name]
+
+
+@pytest.mark.usefixtures("formula_effects")
+def test_an_effect_written_as_a_formula_is_the_effect_written_as_a_class():
+    written = effect_from_formulas("formula_km", {"load_m": "-k * psidot * magnitude(psidot)"})
+    state = steady_precession(np.radians(9), MA_2014)
+    times = np.linspace(0, 0.3, 31)
+    a = rolling.simulate(Model(MA_2014, effects=(written(k=5e-8),)), state, times=times)
+    b = rolling.simulate(Model(MA_2014, effects=(CATALOGUE["km"](k_m=5e-8),)), state, times=times)
+    assert_allclose(a.q, b.q, rtol=1e-13)
+    two = effect_from_formulas("formula_two", {"M_z": "-c*omega_z", "X_n": "-(c + d)*v_n*exp(-theta**2)"})
+    assert [p.name for p in two.parameters] == ["c", "d"]
+    assert effect_from_formulas("formula_two", two.formulas) is two
+
+
+@pytest.mark.usefixtures("formula_effects")
+@pytest.mark.parametrize(
+    ("formulas", "message"),
+    [
+        ({"M_z": "__import__('os')"}, "no function __import__"),
+        ({"M_z": "c.real"}, "not allowed"),
+        ({"M_z": "c *"}, "is no formula"),
+        ({"M_z": "c if theta else 1"}, "not allowed"),
+        ({"M_q": "c"}, "no component"),
+        ({}, "no formula"),
+    ],
+)
+def test_a_formula_that_cannot_be_a_law_is_refused(formulas, message):
+    with pytest.raises(ModelError, match=message):
+        effect_from_formulas("formula_bad", formulas)
+
+
+def test_a_formula_does_not_replace_an_effect_of_the_catalogue():
+    with pytest.raises(ModelError, match="already"):
+        effect_from_formulas("km", {"M_z": "-c*omega_z"})
+
+
+def test_spin_drifts_whichever_direction_the_dissipative_moment_has():
+    """The falling nutation drives omega3 through the contact force, m r psidot thetadot L2; the moment modifies it.
+
+    Along m0 its component along the axis, k_m F_z psidot^2 sin(theta), works against the drift; along e2 there is none.
+    """
+    state = steady_precession(np.radians(8), MA_2014)
+    along_m0, along_e2 = (
+        rolling.simulate(Model(MA_2014, effects=(CATALOGUE[n](),)), state, 1.2) for n in ("km", "km_e2")
+    )
+    assert_allclose(along_m0.energy[-1], along_e2.energy[-1], rtol=0.05)
+    assert along_m0.state[-1, 7] < 0.05 < state.omega3
+    assert along_e2.state[-1, 7] < along_m0.state[-1, 7] - 0.1

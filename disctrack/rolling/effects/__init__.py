@@ -8,4 +8,6 @@ from disctrack.rolling.effects.base import CATALOGUE, Effect, ModelError, Parame
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 
-__all__ = ["CATALOGUE", "Effect", "ModelError", "Parameter", "catalogue", "effect_class"]
+from disctrack.rolling.effects.learned import effect_from_formulas  # noqa: E402 (after its package is read)
+
+__all__ = ["CATALOGUE", "Effect", "ModelError", "Parameter", "catalogue", "effect_class", "effect_from_formulas"]

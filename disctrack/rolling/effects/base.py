@@ -7,7 +7,8 @@ To add one, write a class in a module of this package: a name, its parameters, w
                          and complex numbers alike: no `if`, no `abs`; use `magnitude`, `sign`, `np.sqrt`, `np.exp`.
     adjust(body, p)      changes the body's constants (records.BODY) before the motion starts
 
-or both. Defining the class registers it: simulation, fitting and diagnosis take it from CATALOGUE.
+or both. Defining the class registers it: simulation, fitting and diagnosis take it from CATALOGUE. A compiled law is
+kept as long as its own file does not change; who changes `magnitude` or `sign` touches the laws' files too.
 
 Signs: M is the moment of the table on the disc at the contact, in (n0, m0, k). Its power is
 M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O, and for a passive effect it is never positive.

@@ -23,6 +23,21 @@ class PrecessionFriction(Effect):
         w.load_m -= p.k_m * s.psidot * magnitude(s.psidot)
 
 
+class AxisFriction(Effect):
+    """The paper's moment turned into the direction of e2, perpendicular to the axis."""
+
+    name = "km_e2"
+    title = "rolling friction along e2, M = -k F_z psidot |psidot| e2"
+    source = "variant of Ma et al. 2014, (5.4): direction of the dissipative moment"
+    parameters = (Parameter("k", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),)
+
+    @staticmethod
+    def law(p: Any, s: Any, w: Any) -> None:
+        moment = p.k * s.psidot * magnitude(s.psidot)
+        w.load_m -= moment * s.cos_theta  # e2 = cos(theta) m0 + sin(theta) k
+        w.load_z -= moment * s.sin_theta
+
+
 class NutationFriction(Effect):
     """M_n = -k_n F_z thetadot |thetadot|."""
 

@@ -1,0 +1,102 @@
+"""Effects written as formulas: laws that a residual suggested, or that one wants to try without programming.
+
+    effect_from_formulas("braking", {"load_z": "-c * sign(omega_z, 0.01) * sin_theta**2"})
+
+makes and registers an effect "braking" with the parameter c. A formula uses the names of records.KINEMATICS, numbers of
+the effect (every other name) and sqrt, exp, log, sin, cos, magnitude(x) = |x|, sign(x, width). It gives one of the
+components that a law may set (records.WRENCH): M_n, M_m, M_z [N m]; load_n, load_m, load_z, moments per normal force
+[m]; X_n, X_m, X_z [N].
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from disctrack.rolling.effects.base import CATALOGUE, Effect, ModelError, Parameter, magnitude, sign
+from disctrack.rolling.records import KINEMATICS, WRENCH
+
+_COMPONENTS = WRENCH[:9]
+_NUMPY_FUNCTIONS = ("sqrt", "exp", "log", "sin", "cos")
+_FUNCTIONS = {"magnitude": "magnitude", "sign": "sign"} | {name: f"np.{name}" for name in _NUMPY_FUNCTIONS}
+_ALLOWED = (
+    ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant,
+    ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub, ast.UAdd,
+)  # fmt: skip
+
+
+def effect_from_formulas(
+    name: str,
+    formulas: Mapping[str, str],
+    parameters: tuple[Parameter, ...] = (),
+    *,
+    title: str = "",
+    source: str = "learned from a residual",
+    passive: bool = False,
+) -> type[Effect]:
+    """Effect class whose law adds these formulas to the wrench; registered under `name`.
+
+    formulas : component of the wrench -> formula.   parameters : those not given have unit "SI", nominal 1, no bounds.
+    Asking again for the same formulas returns the same class. Raises ModelError for a formula that cannot be read and
+    for a name that is taken.
+    """
+    formulas = dict(formulas)
+    if name in CATALOGUE:
+        if getattr(CATALOGUE[name], "formulas", None) == formulas:
+            return CATALOGUE[name]
+        raise ModelError(f"there is an effect '{name}' already, with another law: choose another name")
+    lines, free = [], []
+    for component, formula in formulas.items():
+        if component not in _COMPONENTS:
+            raise ModelError(f"{name}: '{component}' is no component; a law sets {', '.join(_COMPONENTS)}")
+        text, names = _translate(name, formula)
+        lines.append(f"    w.{component} += {text}")
+        free += [n for n in names if n not in free]
+    given = {p.name: p for p in parameters}
+    unused = set(given) - set(free)
+    if unused or not lines:
+        raise ModelError(f"{name}: no formula uses {', '.join(sorted(unused)) or 'anything: there is none'}")
+    namespace: dict[str, Any] = {"np": np, "magnitude": magnitude, "sign": sign}
+    exec("def law(p, s, w):\n" + "\n".join(lines), namespace)  # checked node by node in _translate
+    members = {
+        "__doc__": title or f"Law by formula: {formulas}",
+        "__module__": __name__,
+        "name": name,
+        "title": title or "; ".join(f"{k} = {v}" for k, v in formulas.items()),
+        "source": source,
+        "parameters": tuple(given.get(n, Parameter(n, "SI", 1.0, "number of the formula")) for n in free),
+        "passive": passive,
+        "formulas": formulas,
+        "law": staticmethod(namespace["law"]),
+    }
+    return type(f"Formula_{name}", (Effect,), members)
+
+
+def _translate(name: str, formula: str) -> tuple[str, list[str]]:
+    """Formula with s. and p. before its names, and the names that are parameters."""
+    try:
+        tree = ast.parse(formula, mode="eval")
+    except SyntaxError as error:
+        raise ModelError(f"{name}: '{formula}' is no formula: {error.msg}") from error
+    functions = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    parameters: list[str] = []
+    for node in ast.walk(tree):
+        if not isinstance(node, _ALLOWED) or (
+            isinstance(node, ast.Constant) and not isinstance(node.value, int | float)
+        ):
+            raise ModelError(f"{name}: '{formula}': {ast.unparse(node)} is not allowed in a formula")
+        if isinstance(node, ast.Call) and not (isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS):
+            known = ", ".join(_FUNCTIONS)
+            raise ModelError(f"{name}: '{formula}': no function {ast.unparse(node.func)}; there are {known}")
+        if isinstance(node, ast.Name) and node not in functions and node.id not in KINEMATICS:
+            parameters.append(node.id)
+    names = [n for n in ast.walk(tree) if isinstance(n, ast.Name)]
+    for node in names:
+        if node in functions:
+            node.id = _FUNCTIONS[node.id]
+        else:
+            node.id = ("s." if node.id in KINEMATICS else "p.") + node.id
+    return ast.unparse(tree), parameters
