@@ -327,7 +327,7 @@ def _agree_on_order(
             right[v] = view.reordered(orders[int(np.argmax(agreeing))])
     note = (
         f"a board of {board.inner_corners[0]} x {board.inner_corners[1]} inner corners looks the same after a turn: "
-        "the two cameras were made to agree, but which corner is the origin of the lab frame is a choice (i points to the "
+        "the two cameras were made to agree, but which corner is the lab frame's origin is a choice (i points to the "
         "right in the left image). An odd by an even count leaves no choice."
     )
     return (views[0], right), note

@@ -1,0 +1,189 @@
+"""Rig files: nothing is lost on the way, and nothing that is not a rig gets in."""
+
+import contextlib
+from dataclasses import fields, is_dataclass, replace
+
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration import Board, Camera, Observations, RigFileError, StereoRig
+from calibration.camera import N_RIG, rotation_from_vector
+from calibration.opencv_yaml import export_opencv, import_opencv
+from calibration.rig_file import CalibrationRecord, RigFile, read_rig, read_rig_file, write_rig
+
+
+@pytest.fixture
+def rig(rng):
+    A = rng.normal(size=(N_RIG, N_RIG)) * 10.0 ** rng.uniform(-6, 0, N_RIG)[:, None]
+    return StereoRig(
+        left=Camera(2015.3, 2040.6, 255.2, 258.3, (-0.12, 0.38, 6e-4, -4e-4, 0.01), (512, 480)),
+        right=Camera(2053.4, 2051.8, 258.4, 251.8, (-0.10, 0.2, -5e-4, 3e-4, 0.0), (512, 480)),
+        R_right_left=rotation_from_vector(np.array([0.1, -0.9, 0.3])),
+        t_right_left=np.array([-0.37, -0.18, 0.2]),
+        R_left_world=rotation_from_vector(np.array([2.0, 0.5, -0.3])),
+        t_left_world=np.array([-0.02, 0.03, 0.49]),
+        covariance=A @ A.T,
+        world_is_table=True,
+    )
+
+
+@pytest.fixture
+def content(rig, rng):
+    m = 40
+    A = rng.normal(size=(m, 2, 2)) * 0.01
+    observations = Observations(
+        np.sort(rng.integers(0, 3, m)),
+        rng.integers(0, 2, m),
+        rng.integers(0, 20, m),
+        rng.uniform(0, 500, (m, 2)),
+        A @ np.swapaxes(A, 1, 2) + 1e-5 * np.eye(2),
+    )
+    record = CalibrationRecord(
+        board=Board((5, 4), 7.5e-3),
+        board_points=Board((5, 4), 7.5e-3).points + rng.normal(scale=1e-5, size=(20, 3)),
+        table_view=1,
+        board_thickness=3e-3,
+        view_names=(("l0.png", "r0.png"), ("l1.png", "r1.png"), ("links ü.png", "r2.png")),
+        observations=observations,
+        kept=rng.random(m) > 0.1,
+        residuals=rng.normal(size=(m, 2)),
+        unexplained_sigma=0.01,
+        R_left_board=np.stack([rotation_from_vector(v) for v in rng.normal(size=(3, 3))]),
+        t_left_board=rng.normal(size=(3, 3)),
+        settings={"distortion": "auto", "threads": 2},
+        figures={"rms_px": 0.012, "cross_validation": [{"distortion": "k1", "rms_px": 0.1}]},
+        rejected_views={2: "the board moved"},
+        rejected_corners=((0, 1, 7, "contrast"),),
+        warnings=("few views",),
+        versions={"numpy": "2"},
+    )
+    return RigFile(rig, record)
+
+
+def assert_equal(a, b):
+    """Field by field, bit by bit."""
+    assert type(a) is type(b)
+    if is_dataclass(a):
+        for f in fields(a):
+            assert_equal(getattr(a, f.name), getattr(b, f.name))
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        assert np.array_equal(a, b)
+    else:
+        assert a == b
+
+
+def test_reading_back_gives_equal_dataclasses(content, tmp_path):
+    write_rig(tmp_path / "rig.h5", content)
+    assert_equal(read_rig_file(tmp_path / "rig.h5"), content)
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.h5"]  # no temporary file stays
+
+
+def test_a_changed_covariance_is_not_equal(content, tmp_path):
+    write_rig(tmp_path / "rig.h5", content)
+    changed = replace(content, rig=replace(content.rig, covariance=content.rig.covariance * (1 + 1e-15)))
+    with pytest.raises(AssertionError):
+        assert_equal(read_rig_file(tmp_path / "rig.h5"), changed)
+
+
+def test_every_dataset_says_what_it_is(content, tmp_path):
+    write_rig(tmp_path / "rig.h5", content)
+    found = []
+    with h5py.File(tmp_path / "rig.h5") as file:
+        file.visititems(lambda name, item: found.append((name, item)) if isinstance(item, h5py.Dataset) else None)
+        assert len(found) > 20
+        for name, item in found:
+            assert item.attrs["description"], name
+
+
+def test_a_rig_in_a_folder_that_does_not_exist_is_an_error_that_names_it(rig, tmp_path):
+    with pytest.raises(RigFileError, match="nowhere"):
+        write_rig(tmp_path / "nowhere" / "rig.h5", rig)
+
+
+def test_missing_foreign_and_unfinished_files_are_told_apart(rig, tmp_path):
+    with pytest.raises(RigFileError, match="no such rig file"):
+        read_rig(tmp_path / "rig.h5")
+    (tmp_path / "text.h5").write_text("left camera: fine")
+    with pytest.raises(RigFileError, match="cannot be read as a rig file"):
+        read_rig(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1.0
+    with pytest.raises(RigFileError, match="not a rig"):
+        read_rig(tmp_path / "other.h5")
+    write_rig(tmp_path / "rig.h5", rig)
+    with h5py.File(tmp_path / "rig.h5", "a") as file:
+        del file.attrs["complete"]
+    with pytest.raises(RigFileError, match="not written to its end"):
+        read_rig(tmp_path / "rig.h5")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("R_right_left", np.ones((3, 3))),
+        ("R_left_world", np.eye(4)),
+        ("t_right_left", np.array([0, np.nan, 0])),
+        ("covariance", -np.eye(N_RIG)),
+        ("left_intrinsics", np.array([-1.0, 1, 1, 1, 0, 0, 0, 0, 0])),
+        ("left_image_size", np.array([0, 0])),
+        ("t_left_world", np.array([b"a", b"b", b"c"])),
+    ],
+)
+def test_impossible_values_are_refused(rig, tmp_path, name, value):
+    path = tmp_path / "rig.h5"
+    write_rig(path, rig)
+    with h5py.File(path, "a") as file:
+        del file["rig"][name]
+        file["rig"][name] = value
+    with pytest.raises(RigFileError, match=r"rig\.h5"):
+        read_rig(path)
+
+
+def test_damaged_files_give_an_error_or_a_rig_but_never_a_crash(content, tmp_path, rng):
+    write_rig(tmp_path / "rig.h5", content)
+    whole = np.fromfile(tmp_path / "rig.h5", dtype=np.uint8)
+    path = tmp_path / "bad.h5"
+    refused = 0
+    for trial in range(200):
+        data = whole.copy()
+        if trial % 2:
+            data = data[: rng.integers(0, len(data))]
+        else:
+            where = rng.integers(0, len(data), rng.integers(1, 40))
+            data[where] = rng.integers(0, 256, len(where))
+        data.tofile(path)
+        with contextlib.suppress(RigFileError):
+            read_rig_file(path)
+            continue
+        refused += 1
+    assert refused >= 100  # every cut file; a changed byte may hit a description only
+
+
+def test_opencv_yaml_keeps_all_but_the_covariance(rig, tmp_path):
+    export_opencv(tmp_path / "rig.yml", rig)
+    back = import_opencv(tmp_path / "rig.yml")
+    for a, b in zip(rig.cameras, back.cameras, strict=True):
+        assert_allclose(b.parameters, a.parameters, rtol=1e-15)
+        assert b.image_size == a.image_size
+    for name in ("R_right_left", "t_right_left", "R_left_world", "t_left_world"):
+        assert_allclose(getattr(back, name), getattr(rig, name), rtol=1e-14, atol=1e-16)
+    assert back.world_is_table
+    assert not back.covariance.any()
+
+
+def test_opencv_yaml_without_unit_or_with_rational_distortion_is_refused(rig, tmp_path):
+    export_opencv(tmp_path / "rig.yml", rig)
+    text = (tmp_path / "rig.yml").read_text()
+    (tmp_path / "no_unit.yml").write_text(text.replace("unit: m", "unit: foot").replace('unit: "m"', 'unit: "foot"'))
+    with pytest.raises(RigFileError, match="unit"):
+        import_opencv(tmp_path / "no_unit.yml")
+    assert_allclose(import_opencv(tmp_path / "no_unit.yml", unit=0.5).baseline, 0.5 * rig.baseline)
+    (tmp_path / "no_R.yml").write_text(text.replace("\nR:", "\nQ:"))
+    with pytest.raises(RigFileError, match="R missing"):
+        import_opencv(tmp_path / "no_R.yml")
+    (tmp_path / "junk.yml").write_text("%YAML:1.0\n---\nM1: [1, 2")
+    with pytest.raises(RigFileError, match=r"junk\.yml"):
+        import_opencv(tmp_path / "junk.yml")
