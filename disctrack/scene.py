@@ -8,6 +8,7 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 import types
@@ -282,6 +283,34 @@ def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = P
     scene = _build(Scene, {**tree, "folder": folder}, where, "")
     _check(scene, where)
     return typing.cast(Scene, scene)
+
+
+def scene_toml(scene: Scene) -> str:
+    """All of `scene` as a TOML file that `load_scene` reads back to the same scene (but for its folder)."""
+    return "\n".join(_toml_section(scene, "")).lstrip() + "\n"
+
+
+def _toml_section(settings: Any, name: str) -> list[str]:
+    own, below = ([f"\n[{name}]"] if name else []), []
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        if isinstance(value, Path):
+            continue
+        if is_dataclass(value):
+            below += _toml_section(value, f"{name}.{f.name}" if name else f.name)
+        else:
+            own.append(f"{f.name} = {_toml_value(value)}")
+    return own + below
+
+
+def _toml_value(value: Any) -> str:
+    if is_dataclass(value):
+        value = {f.name: getattr(value, f.name) for f in fields(value)}
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {_toml_value(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 def _build(kind: Any, tree: dict[str, Any], where: str, section: str) -> Any:

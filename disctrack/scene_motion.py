@@ -25,6 +25,7 @@ class SceneMotion:
     """Pose of the disc over time, and for which frames it is known."""
 
     pose: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) q, SI and radians, angles not wrapped
+    rates: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) dq/dt
     n_frames: int
     simulated: Motion | None = None  # the rolling model's own result, where the motion is one
 
@@ -46,7 +47,7 @@ def _static(scene: Scene) -> SceneMotion:
     def pose(time: Array) -> Array:
         return q[np.clip(np.rint(np.asarray(time) * rate).astype(int), 0, len(q) - 1)]
 
-    return SceneMotion(pose, len(q))
+    return SceneMotion(pose, lambda time: np.zeros_like(pose(time)), len(q))
 
 
 def _table(scene: Scene) -> SceneMotion:
@@ -60,7 +61,8 @@ def _table(scene: Scene) -> SceneMotion:
     if rows.ndim != 2 or rows.shape[1] != 7 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0).all():
         raise SceneError(f"{path}: shape {rows.shape}; expected 2 or more rows of 7 with increasing t [s]")
     spline = CubicSpline(rows[:, 0], rows[:, 1:])
-    return SceneMotion(lambda time: spline(np.asarray(time)), _frames_within(scene, rows[0, 0], rows[-1, 0], str(path)))
+    n = _frames_within(scene, rows[0, 0], rows[-1, 0], str(path))
+    return SceneMotion(spline, spline.derivative(), n)
 
 
 def _rolling(scene: Scene) -> SceneMotion:
@@ -68,9 +70,8 @@ def _rolling(scene: Scene) -> SceneMotion:
 
     motion = simulate_scene(scene)
     spline = CubicHermiteSpline(motion.time, motion.q, motion.qdot)
-    last = motion.time[-1]
-    n = _frames_within(scene, motion.time[0], last, "the rolling model")
-    return SceneMotion(lambda time: spline(np.asarray(time)), n, motion)
+    n = _frames_within(scene, motion.time[0], motion.time[-1], "the rolling model")
+    return SceneMotion(spline, spline.derivative(), n, motion)
 
 
 def _margin(scene: Scene) -> tuple[float, float]:

@@ -7,7 +7,6 @@ from functools import lru_cache
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
 from disctrack.render.rays import View, table_points
@@ -82,12 +81,29 @@ def table_cells(view: View, pad: int, s: int, scene: Scene) -> Array32:
     if look.table_streaks == 0 and look.table_blotches == 0:
         return np.full((s * (points.shape[0] - 1), s * (points.shape[1] - 1)), look.table, np.float32)
     texture = _texture(scene.seed, look.table_streaks, look.table_blotches, look.streak_direction_deg)
-    rows = (np.arange(s * (points.shape[0] - 1)) + 0.5) / s
-    columns = (np.arange(s * (points.shape[1] - 1)) + 0.5) / s
-    index = np.meshgrid(rows, columns, indexing="ij")
-    texels = [map_coordinates(points[..., k], index, order=1, mode="nearest") / _TEXEL for k in (1, 0)]
-    values = look.table + map_coordinates(texture, texels, order=1, mode="grid-wrap")
-    return np.maximum(values, 0.0).astype(np.float32)
+    return _textured_cells(points, s, look.table, texture)
+
+
+@numba.njit(cache=True, nogil=True)
+def _textured_cells(points: Array, s: int, grey: float, texture: Array) -> Array32:
+    """Texture at the cells' centres, bilinear between the pixels' corners on the table and between texels; 0.1 s."""
+    n = texture.shape[0]
+    cells = np.empty((s * (points.shape[0] - 1), s * (points.shape[1] - 1)), dtype=np.float32)
+    for row in range(cells.shape[0]):
+        i, p = row // s, (row % s + 0.5) / s
+        for column in range(cells.shape[1]):
+            j, q = column // s, (column % s + 0.5) / s
+            a, b, c, d = (1 - p) * (1 - q), (1 - p) * q, p * (1 - q), p * q
+            x = a * points[i, j, 0] + b * points[i, j + 1, 0] + c * points[i + 1, j, 0] + d * points[i + 1, j + 1, 0]
+            y = a * points[i, j, 1] + b * points[i, j + 1, 1] + c * points[i + 1, j, 1] + d * points[i + 1, j + 1, 1]
+            x, y = x / _TEXEL, y / _TEXEL
+            k, m = int(np.floor(x)), int(np.floor(y))
+            u, v = x - k, y - m
+            k0, k1, m0, m1 = k % n, (k + 1) % n, m % n, (m + 1) % n
+            value = (1 - v) * ((1 - u) * texture[m0, k0] + u * texture[m0, k1])
+            value += v * ((1 - u) * texture[m1, k0] + u * texture[m1, k1])
+            cells[row, column] = max(grey + value, 0.0)
+    return cells
 
 
 def illumination(view: View, camera: str, scene: Scene) -> tuple[Array32, Array32]:

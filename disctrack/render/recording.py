@@ -114,6 +114,7 @@ def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
     return Truth(
         time=time,
         q=motion.pose(time),
+        qdot=motion.rates(time),
         q_right=motion.pose(time + delay) if scene.motion.kind != "static" else motion.pose(time),
         frame_rate=rate,
         rig=rig,

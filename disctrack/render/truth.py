@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_vector, vector_from_rotation
 from disctrack.render.rays import View, image_of
-from disctrack.scene import Scene
+from disctrack.scene import Scene, scene_toml
 
 Array = NDArray[np.float64]
 
@@ -29,6 +28,7 @@ class Truth:
 
     time: Array  # (n,) mid exposure of the left camera's frames [s]
     q: Array  # (n, 6) at `time`, angles not wrapped
+    qdot: Array  # (n, 6) rates at `time`
     q_right: Array  # (n, 6) at the right camera's mid exposure; equals q unless that camera is delayed
     frame_rate: float  # true one [Hz]
     rig: StereoRig  # while the chessboard was shown
@@ -72,11 +72,12 @@ def write_truth(path: Path, truth: Truth, scene: Scene) -> None:
 
     with h5py.File(path, "w") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
-        file.attrs["scene"] = json.dumps(asdict(scene), default=str)
+        file.attrs["scene"] = scene_toml(scene)  # renders the same recording again
         file.attrs["frame_rate_hz"] = truth.frame_rate
         _put(file, "time", truth.time, "s", "mid exposure of the left camera")
         units = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES)
         _put(file, "q", truth.q, units, "pose at time, world frame = table")
+        _put(file, "qdot", truth.qdot, "m/s, rad/s", "rates of q at time")
         _put(file, "q_right", truth.q_right, units, "pose at the right camera's mid exposure")
         _put(file, "markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)")
         disc = file.create_group("disc")
@@ -126,6 +127,7 @@ def read_truth(path: str | Path) -> Truth:
             return Truth(
                 time=file["time"][:],
                 q=file["q"][:],
+                qdot=file["qdot"][:],
                 q_right=file["q_right"][:],
                 frame_rate=float(file.attrs["frame_rate_hz"]),
                 rig=_get_rig(file["rig"]),

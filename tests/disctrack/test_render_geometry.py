@@ -157,3 +157,24 @@ def test_chessboard_has_converged(rig):
         for s in (6, 12)
     )
     assert np.abs(coarse.astype(int) - fine).max() / 257 < 0.1  # grey levels of 180
+
+
+def test_an_error_of_the_lens_model_would_be_noticed(rig):
+    q = POSES[1]
+    R = rotation_from_euler(*q[3:])
+    outline = circle(MA_2014.marker_centres_body[3], MA_2014.marker_diameter / 2) @ R.T + q[:3]
+    k1, k2, p1, p2, k3 = rig.left.distortion
+    wrong = replace(rig, left=replace(rig.left, distortion=(k1, k2, -p1, p2, k3)))
+    shift = polygon_moments(cv2_pixels(outline, wrong, 0))[1] - polygon_moments(cv2_pixels(outline, rig, 0))[1]
+    assert np.abs(shift).max() > 10e-3  # ten times the tolerance above
+
+
+def test_area_of_a_half_plane_in_a_cell(rng):
+    from disctrack.render.areas import half_plane_area
+
+    grid = (np.arange(500) + 0.5) / 500 - 0.5
+    for f0, a, b in rng.normal(size=(40, 3)) * [0.5, 1.0, 1.0]:
+        sampled = np.mean(f0 + a * grid + b * grid[:, None] > 0)
+        assert half_plane_area(f0, a, b) == pytest.approx(sampled, abs=2e-3)  # one line of 500 samples
+        assert half_plane_area(f0, a, b) + half_plane_area(-f0, a, b) == pytest.approx(1.0, abs=1e-12)
+    assert half_plane_area(0.1, 1.0, 0.0) == pytest.approx(0.6, abs=1e-12)

@@ -1,5 +1,6 @@
 """A rendered recording is a recording like any other; what was planted in it shows in its images and nowhere else."""
 
+import tomllib
 from dataclasses import replace
 
 import cv2
@@ -16,6 +17,7 @@ from disctrack.scene import (
     CameraFault,
     CameraSettings,
     Faults,
+    GlareSettings,
     LightSettings,
     MotionSettings,
     Occluder,
@@ -23,6 +25,8 @@ from disctrack.scene import (
     Scene,
     SensorSettings,
     load_scene,
+    scene_from_tree,
+    scene_toml,
 )
 from disctrack.scene_motion import motion_of
 
@@ -283,6 +287,29 @@ def test_mistakes_in_a_scene_are_named(text, message, tmp_path):
     (tmp_path / "scene.toml").write_text(text)
     with pytest.raises(SceneError, match=message):
         load_scene(tmp_path / "scene.toml")
+
+
+def test_scene_survives_being_written_as_toml():
+    scene = replace(
+        SMALL,
+        name='a "quoted" name',
+        light=LightSettings(glare=(GlareSettings("right", (1.0, 2.0), 3.0, 4.0),)),
+        faults=Faults(occluders=(Occluder(), Occluder(camera="right")), misprint_mm=((0.1, 0.2),) * 6),
+    )
+    again = scene_from_tree(tomllib.loads(scene_toml(scene)))
+    # nan (a spin that is not given) differs from itself: compare what is written
+    assert scene_toml(again) == scene_toml(scene)
+    assert again.light == scene.light
+    assert again.faults == scene.faults
+
+
+def test_truth_holds_the_scene_and_the_rates(scene, tmp_path):
+    import h5py
+
+    render.write_recording(tmp_path / "r", scene)
+    with h5py.File(tmp_path / "r/truth.h5") as file:
+        assert scene_from_tree(tomllib.loads(file.attrs["scene"])).board == scene.board
+        assert_allclose(file["qdot"][:], np.tile(VELOCITY, (4, 1)), atol=1e-9)
 
 
 def test_missing_table_of_motion_is_named(tmp_path):
