@@ -58,10 +58,11 @@ def _record(names: tuple[str, ...], scalar: type) -> types.Type:
 
 
 def _compile(function: Callable[..., None], signature: Any) -> Any:
+    # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
     try:
-        return cfunc(signature, cache=True)(function)
+        return cfunc(signature, cache=True, error_model="numpy")(function)
     except RuntimeError:  # numba: "no locator available": typed at a prompt, there is no file to put a cache beside
-        return cfunc(signature)(function)
+        return cfunc(signature, error_model="numpy")(function)
 
 
 @cache

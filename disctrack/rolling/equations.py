@@ -41,33 +41,33 @@ LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start o
 HEADER = 4
 
 
-@njit
+@njit(error_model="numpy")
 def _cross(a: Any, b: Any) -> Any:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@njit
+@njit(error_model="numpy")
 def _dot(a: Any, b: Any) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit
+@njit(error_model="numpy")
 def _add(a: Any, b: Any) -> Any:
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@njit
+@njit(error_model="numpy")
 def _scale(f: Any, a: Any) -> Any:
     return (f * a[0], f * a[1], f * a[2])
 
 
-@njit
+@njit(error_model="numpy")
 def _nodal(n: Any, m: Any, z: Any, s: Any, c: Any) -> Any:
     """(n0, m0, k) -> (e1, e2, e3): n0 = e1, m0 = c e2 - s e3, k = s e2 + c e3."""
     return (n, m * c + z * s, z * c - m * s)
 
 
-@njit
+@njit(error_model="numpy")
 def _solve(rows: Any, b: Any) -> Any:
     """3 x 3 system by Cramer's rule."""
     r0, r1, r2 = rows
@@ -76,7 +76,7 @@ def _solve(rows: Any, b: Any) -> Any:
     return _scale(1.0 / _dot(r0, c0), x)
 
 
-@njit
+@njit(error_model="numpy")
 def _contact_arm(body: Any, s: Any, c: Any) -> Any:
     """r_OA and its part a that turns with the nodal frame, nodal components."""
     rho = body.edge_radius
@@ -85,7 +85,7 @@ def _contact_arm(body: Any, s: Any, c: Any) -> Any:
     return (zero, a2 - rho * s, a3 - rho * c), (zero, a2, a3)
 
 
-@njit
+@njit(error_model="numpy")
 def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
     """Fills the record of kinematic quantities from the state."""
     psi, theta = y[2], y[3]
@@ -109,7 +109,7 @@ def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
     k.gravity = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
 
 
-@njit
+@njit(error_model="numpy")
 def _apply_laws(table: Any, w: Any) -> None:
     w.M_n = w.M_m = w.M_z = 0.0
     w.load_n = w.load_m = w.load_z = 0.0
@@ -118,7 +118,7 @@ def _apply_laws(table: Any, w: Any) -> None:
         call_law(table[HEADER + 2 * i], table[HEADER + 1 + 2 * i], table[2], table[3])
 
 
-@njit
+@njit(error_model="numpy")
 def _inertia_rows(body: Any, phi: Any) -> Any:
     """Inertia about G in nodal axes, from body axes turned by the spin angle."""
     c, s = np.cos(phi), np.sin(phi)
@@ -129,7 +129,7 @@ def _inertia_rows(body: Any, phi: Any) -> Any:
     return (J11, J12, J13), (J12, J22, J23), (J13, J23, body.J_33)
 
 
-@njit
+@njit(error_model="numpy")
 def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     """Omegadot and acceleration of O (vectors, nodal components); writes the contact force into the record."""
     s, c, m = kin.sin_theta, kin.cos_theta, body.mass
@@ -182,7 +182,7 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     return omegadot, frame, a_O
 
 
-@njit
+@njit(error_model="numpy")
 def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
     _kinematics(table[0], t, y, body, kin)
     _apply_laws(table, wrench)

@@ -85,13 +85,13 @@ def integrate(
     return Stretch(status, n_filled, solution, t_last[0], y_last, event, n_steps)
 
 
-@njit
+@njit(error_model="numpy")
 def _call(function: int, t: Any, y: Any, out: Any, t_box: Any, args: Any) -> None:
     t_box[0] = t
     call_system(function, t_box.ctypes.data, y.ctypes.data, out.ctypes.data, args[0], args[1], args[2], args[3])
 
 
-@njit
+@njit(error_model="numpy")
 def _stages(
     rates: int, args: Any, t: Any, y: Any, h: Any, first: int, last: int, A: Any, C: Any, K: Any, box: Any
 ) -> None:
@@ -106,7 +106,7 @@ def _stages(
         _call(rates, t + C[i] * h, y_stage, K[i], t_box, args)
 
 
-@njit
+@njit(error_model="numpy")
 def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, box: Any, y_new: Any) -> None:
     """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
     A, B, C, _, _, _ = tableau
@@ -118,7 +118,7 @@ def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, b
         y_new[k] = y[k] + h * total
 
 
-@njit
+@njit(error_model="numpy")
 def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float, atol: Any) -> float:
     """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance."""
     _, _, _, E3, E5, _ = tableau
@@ -136,7 +136,7 @@ def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float,
     return abs(h) * sum5 / np.sqrt((sum5 + 0.01 * sum3) * y.size)
 
 
-@njit
+@njit(error_model="numpy")
 def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
     """Coefficients F (7, n) of the polynomial of degree 7 through the step."""
     for k in range(y.size):
@@ -151,7 +151,7 @@ def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
             F[3 + row, k] = h * total
 
 
-@njit
+@njit(error_model="numpy")
 def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
     """Value at the fraction x of the step, by nested factors x, 1 - x, x, ..."""
     for k in range(y.size):
@@ -161,7 +161,7 @@ def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
         out[k] = y[k] + total
 
 
-@njit
+@njit(error_model="numpy")
 def _locate(
     system: Any,
     args: Any,
@@ -194,7 +194,7 @@ def _locate(
     return high
 
 
-@njit
+@njit(error_model="numpy")
 def _first_event(
     system: Any,
     args: Any,
@@ -220,7 +220,7 @@ def _first_event(
     return event, h
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _dop853(
     rates: int,
     margins: int,
@@ -289,7 +289,7 @@ def _dop853(
     return 2, i_grid, -1, max_steps
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _evaluate(
     function: int, args: Any, t: Any, Y: Any, out: Any, first: Any, second: Any, firsts: Any, seconds: Any
 ) -> None:

@@ -161,6 +161,8 @@ def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float) -> Pat
                 regime = new
                 if len(switches) > _MAX_SWITCHES:
                     end = EndReason.CHATTER
+    if not pieces:  # over at its start
+        pieces.append(_sample(assembly, regime, grid[:1], y[None]))
     return Path(_join(pieces), switches, end, t, y)
 
 
@@ -194,6 +196,8 @@ def _margins(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> NDArra
 def _event_at_start(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> int | None:
     """An event that holds already where a stretch starts: the regime asked for is not the one that physics allows."""
     margins = _margins(assembly, regime, t, y).real
+    if regime == SLIPPING and not margins[EVENTS.index("grip")] > 0:  # without slip the direction of friction is open,
+        return EVENTS.index("grip")  # and the load with it
     margins[EVENTS.index("upright")] += -1e-12 * np.sign(y[5].real)  # at exactly 90 deg the direction decides
     failed = np.flatnonzero(~(margins > 0))
     return int(failed[0]) if failed.size else None

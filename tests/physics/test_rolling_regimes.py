@@ -130,3 +130,50 @@ def test_end_time_does_not_depend_on_the_output_rate():
     state = steady_precession(np.radians(4), MA_2014)
     ends = [rolling.simulate(model, state, 2.0, rate=rate).end_time for rate in (10.0, 333.0, 5000.0)]
     assert_allclose(ends, ends[0], atol=1e-10)
+
+
+def random_model(rng):
+    names = [str(n) for n in rng.choice([n for n in CATALOGUE if n != "slip"], size=rng.integers(0, 4), replace=False)]
+    effects = []
+    for name in names:
+        scale = 10 ** rng.uniform(-1, 1.5)
+        values = {p.name: float(np.clip(p.nominal * scale, p.lower, p.upper)) for p in CATALOGUE[name].parameters}
+        effects.append(CATALOGUE[name](**values))
+    return slippery(rng.uniform(0.05, 0.5), *effects)
+
+
+def test_any_model_from_any_state_ends_with_a_reason_and_finite_numbers(rng):
+    for _ in range(60):
+        theta = np.radians(10 ** rng.uniform(0, 1.9))
+        psidot = rng.uniform(-1.5, 1.5) * np.sqrt(4 * 9.81 / 0.0375 / np.sin(theta))
+        state = State(theta=theta, thetadot=rng.normal(), omega2=psidot * np.sin(theta), omega3=3 * rng.normal())
+        if rng.random() < 0.5:
+            state = state.moved(v_x=0.3 * rng.normal(), v_y=0.0)
+        motion = rolling.simulate(random_model(rng), state, 0.3)
+        assert motion.end not in (EndReason.FAILED, EndReason.CHATTER)
+        assert len(motion) > 0
+        for values in (motion.q, motion.qdot, motion.energy, motion.contact_force, motion.acceleration_world):
+            assert np.isfinite(values).all()
+
+
+def test_velocity_that_happens_to_be_that_of_rolling_starts_rolling():
+    state = steady_precession(np.radians(20), MA_2014)
+    v = rolling.simulate(Model(MA_2014), state, times=[0.0]).qdot[0]
+    motion = rolling.simulate(slippery(0.3), state.moved(v_x=v[0], v_y=v[1]), 0.1)
+    assert motion.switches[0].time == 0.0
+    assert (motion.regime == Regime.ROLLING).all()
+
+
+def test_a_motion_over_at_its_start_has_its_first_instant():
+    motion = rolling.simulate(Model(MA_2014), State(theta=np.pi / 2, thetadot=1.0), 0.1)
+    assert motion.end is EndReason.UPRIGHT
+    assert len(motion) == 1
+    assert motion.q[0, 4] == np.pi / 2
+
+
+def test_motion_does_not_depend_on_the_tolerance():
+    """A hundred times finer tolerance moves slip, its end and the rolling after it by 1e-9 m and 1e-7 rad at most."""
+    model = slippery(0.25, CATALOGUE["km"](), CATALOGUE["kz"](k_z=6e-5))
+    coarse, fine = (rolling.simulate(model, sliding_start(), 0.4, rtol=rtol) for rtol in (1e-10, 1e-12))
+    assert_allclose(coarse.q[:, :3], fine.q[:, :3], atol=1e-9)
+    assert_allclose(coarse.q[:, 3:], fine.q[:, 3:], atol=1e-7)

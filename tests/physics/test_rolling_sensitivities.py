@@ -129,3 +129,8 @@ def test_a_parameter_that_is_not_there_is_named():
         rolling.sensitivities(MODEL, STATE, TIMES, ["nothing.x"])
     with pytest.raises(ModelError, match="increasing"):
         rolling.simulate(MODEL, State(theta=0.3), times=[0.0, 0.0])
+
+
+def test_a_friction_that_is_never_reached_has_no_influence():
+    found = rolling.sensitivities(Model(MA_2014), STATE, TIMES, ["slip.mu"], components=[])
+    assert (found.dq == 0).all()

@@ -87,7 +87,7 @@ class Effect:
         self._values = {p.name: float(values.get(p.name, p.nominal)) for p in self.parameters}
         for p in self.parameters:
             value = self._values[p.name]
-            if not p.lower <= value <= p.upper:
+            if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
                 raise ModelError(
                     f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
                     + (
