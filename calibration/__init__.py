@@ -4,12 +4,32 @@ found = calibrate_stereo(left_images, right_images, Board((9, 6), 8e-3), table_v
 found.rig, found.rms_px, found.assessment.verdict
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from calibration.board import Board
 from calibration.camera import Camera, StereoRig, triangulate
-from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError, DiscTrackError, RigFileError
-from calibration.refinement import Observations, StereoModel, Terms, refine_stereo
-from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners, calibrate_stereo
+
+if TYPE_CHECKING:
+    from calibration.chessboard import BoardNotFound, CornerView, find_corners
+    from calibration.refinement import Observations, StereoModel, Terms, refine_stereo
+    from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners, calibrate_stereo
+
+# Imported when asked for: the physics needs the camera model and the errors, not the image library behind these.
+_ON_DEMAND = {
+    "chessboard": ("BoardNotFound", "CornerView", "find_corners"),
+    "refinement": ("Observations", "StereoModel", "Terms", "refine_stereo"),
+    "stereo": ("CalibrationSettings", "StereoCalibration", "calibrate_from_corners", "calibrate_stereo"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _ON_DEMAND.items():
+        if name in names:
+            return getattr(import_module(f"calibration.{module}"), name)
+    raise AttributeError(f"module 'calibration' has no attribute '{name}'")
+
 
 __all__ = [
     "Board",
