@@ -135,7 +135,8 @@ def power_law_end(time: Array, psi: Array, psidot: Array) -> float:
     is psidot averaged over a turn, so that the nutation does not look like a brake.
     """
     known = np.flatnonzero(np.isfinite(psidot) & np.isfinite(psi))
-    before = np.interp(psi[known] - 2 * np.pi, psi[known], time[known], left=np.nan)
+    turned = np.maximum.accumulate(psi[known])  # a disc that has stopped jitters
+    before = np.interp(turned - 2 * np.pi, turned, time[known], left=np.nan)
     mean = 2 * np.pi / (time[known] - before)  # over the turn that ends here
     if not np.isfinite(mean).any():
         return float(time[known[-1]])
@@ -215,7 +216,7 @@ class _Fit:
 
     def coefficients(self, data: Array) -> Array:
         """Linear parameters (p, k) for data (k, n)."""
-        return np.linalg.lstsq(self.design(), data.T, rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(self.design(), data.T, rcond=None)[0], float)
 
     def residuals(self) -> Array:
         """Weighted misfit (2 n,)."""

@@ -1,0 +1,305 @@
+"""From a trajectory file to the physics: motion, contact, energy and scaling laws, into the file and into a report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.contact import Contact, analyse_contact
+from disctrack.derivatives import GROUP_NAMES, STATE, Motion, differentiate
+from disctrack.energy import Energy, analyse_energy
+from disctrack.errors import AnalysisError, OutputError
+from disctrack.labelled import Variable
+from disctrack.propagation import RATES, Series, propagate, rates
+from disctrack.scaling import WINDOW, NutationCount, PowerLaws, count_nutation, exponents_by_window, fit_power_laws
+from disctrack.storage import read_provenance, read_trajectory, write_group
+from disctrack.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, for the exponents' dependence
+CIRCLE_DURATION = 0.6  # [s], as for the paper's figure 9
+HEIGHT_TOLERANCE = 2e-6  # [m] by which a table may depart from the board's plane without a remark
+EXPECTED_NOISE_SCALE = (0.7, 1.5)  # found over stated variance of the poses: outside, the report says so
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Scaling laws of the last stage."""
+
+    laws: PowerLaws
+    by_window: tuple[PowerLaws, ...]  # one per entry of WINDOWS
+    count: NutationCount
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Everything that the analysis of one trajectory gives."""
+
+    trajectory: Trajectory
+    motion: Motion
+    rates: tuple[Series, ...]
+    contact: Contact
+    energy: Energy
+    scaling: Scaling
+    warnings: tuple[str, ...]
+
+    def series(self, name: str) -> Series:
+        """The derived quantity of this name."""
+        for item in (*self.rates, *self.contact.series, *self.energy.series):
+            if item.name == name:
+                return item
+        raise KeyError(name)
+
+
+@dataclass(frozen=True)
+class AnalyseOutcome:
+    """What `run_analyse` did."""
+
+    analysis: Analysis
+    report: Path  # report.html
+    figures: tuple[Path, ...]
+
+
+def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: float = CIRCLE_DURATION) -> Analysis:
+    """Motion, contact, energy and scaling laws of a trajectory.
+
+    window, circle_duration : [s] before t_f for the exponents, before the end for the circle
+    Raises AnalysisError when the trajectory has no table frame, or too few poses.
+    """
+    if not trajectory.rig.world_is_table:
+        raise AnalysisError(
+            "the trajectory is in the axes of the left camera, not of the table, so that neither heights nor the "
+            "vertical are known. Name the view whose board lies on the table ([table] in recording.toml), calibrate "
+            "and track again."
+        )
+    motion = differentiate(trajectory)
+    found = propagate(motion, rates)
+    contact = analyse_contact(motion, circle_duration)
+    energy = analyse_energy(motion)
+    theta_sigma = np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
+    sense = np.sign(np.nanmedian(found.value[:, 0])) if np.isfinite(found.value[:, 0]).any() else 1.0
+    psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]  # precession in either sense
+    data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, 5])
+    scaling = Scaling(
+        laws=fit_power_laws(*data, window=window),
+        by_window=exponents_by_window(*data, WINDOWS),
+        count=count_nutation(psi, motion.euler[:, 1], theta_sigma, motion.disc, motion.gravity),
+    )
+    return Analysis(
+        trajectory=trajectory,
+        motion=motion,
+        rates=found.series(RATES),
+        contact=contact,
+        energy=energy,
+        scaling=scaling,
+        warnings=_warnings(trajectory, motion, contact, scaling),
+    )
+
+
+def run_analyse(
+    path: Path,
+    output: Path | None = None,
+    window: float = WINDOW,
+    circle_duration: float = CIRCLE_DURATION,
+    overwrite: bool = False,
+) -> AnalyseOutcome:
+    """Analyse the trajectory file, add the groups to it, write report.html and the figures.
+
+    output : folder for the report; without it, `<name>_analysis` beside the file
+    Raises TrajectoryFileError, AnalysisError, OutputError (also when there is a report and not `overwrite`).
+    """
+    from disctrack.report import write_report  # matplotlib is wanted here only
+
+    path = Path(path)
+    folder = Path(output) if output is not None else path.with_name(f"{path.stem}_analysis")
+    if (folder / "report.html").exists() and not overwrite:
+        raise OutputError(
+            f"{folder / 'report.html'}: exists. Choose another folder with -o, or replace with --overwrite."
+        )
+    trajectory, provenance = read_trajectory(path), read_provenance(path)
+    try:
+        analysis = analyse(trajectory, window, circle_duration)
+    except AnalysisError as error:
+        raise AnalysisError(f"{path}: {error}") from error
+    write_analysis(path, analysis)
+    report, figures = write_report(folder, analysis, provenance)
+    return AnalyseOutcome(analysis, report, figures)
+
+
+def write_analysis(path: Path, analysis: Analysis) -> None:
+    """Add the groups motion, contact, energy and scaling to the trajectory file, replacing older ones."""
+    write_group(
+        path, "motion", _motion_variables(analysis), axes=_state_axes(), attributes=_motion_attributes(analysis)
+    )
+    onset, circle = analysis.contact.onset, analysis.contact.circle
+    write_group(
+        path,
+        "contact",
+        _series_variables(analysis.contact.series),
+        attributes={
+            "rolling_onset_s": onset.time,
+            "rolling_onset_low_s": onset.low,
+            "rolling_onset_high_s": onset.high,
+            "rolling_probability": onset.probability,
+            "rolling_verdict": onset.verdict,
+            "slip_distance_m": onset.slip_distance,
+            "slip_distance_sigma_m": onset.slip_distance_sigma,
+            "locus_circle_radius_m": circle.radius,
+            "locus_circle_radius_sigma_m": circle.sigma,
+            "locus_circle_radius_sigma_calibration_m": circle.sigma_calibration,
+            "locus_circle_expected_radius_m": circle.expected,
+            "locus_circle_centre_m": circle.centre,
+            "locus_circle_interval_s": np.array([circle.start, circle.end]),
+        },
+    )
+    energy = analysis.energy
+    write_group(
+        path,
+        "energy",
+        _series_variables(energy.series),
+        attributes={
+            "loss_J": energy.loss,
+            "loss_sigma_J": energy.loss_sigma,
+            "loss_sigma_calibration_J": energy.loss_sigma_calibration,
+            "precession_level_over_4g_r": energy.level_ratio,
+            "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
+        },
+    )
+    _write_scaling(path, analysis.scaling)
+
+
+def _series_variables(series: tuple[Series, ...]) -> dict[str, Variable]:
+    variables = {}
+    for s in series:
+        variables[s.name] = Variable(s.value, ("time",), s.unit, s.long_name)
+        variables[f"{s.name}_sigma"] = Variable(
+            s.sigma, ("time",), s.unit, f"standard deviation, noise of the poses: {s.long_name}"
+        )
+        variables[f"{s.name}_sigma_calibration"] = Variable(
+            s.sigma_calibration, ("time",), s.unit, f"standard deviation, calibration: {s.long_name}"
+        )
+    return variables
+
+
+def _state_axes() -> dict[str, Variable]:
+    what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
+    return {name: Variable(np.array(STATE), (name,), "1", what) for name in ("state", "state_2")}
+
+
+def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
+    motion = analysis.motion
+    variables = _series_variables(analysis.rates)
+    vectors = (
+        ("position", motion.position, "m", "smoothed position of the centre", 0),
+        ("velocity", motion.velocity, "m s-1", "velocity of the centre", 6),
+        ("omega", motion.omega_world, "rad s-1", "angular velocity, world axes", 9),
+        ("acceleration", motion.acceleration, "m s-2", "acceleration of the centre", 12),
+        ("alpha", motion.alpha_world, "rad s-2", "angular acceleration, world axes", 15),
+    )
+    sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
+    S = motion.calibration_sensitivity
+    common = np.sqrt(np.maximum(np.einsum("nsa,ab,nsb->ns", S, motion.rig_covariance, S, optimize=True), 0.0))
+    for name, values, unit, text, first in vectors:
+        for i, axis in enumerate("xyz"):
+            item = Series(
+                f"{name}_{axis}", unit, f"{text}, {axis}", values[:, i], sigma[:, first + i], common[:, first + i]
+            )
+            variables |= _series_variables((item,))
+    for i, name in enumerate(("psi", "theta", "phi")):
+        variables[name] = Variable(motion.euler[:, i], ("time",), "rad", f"smoothed {name}, unwrapped")
+    return variables | {
+        "covariance": Variable(
+            motion.covariance, ("time", "state", "state_2"), "products of m, rad, s", "covariance, noise of the poses"
+        ),
+        "bridged": Variable(
+            (~motion.measured & motion.known).astype(np.uint8),
+            ("time",),
+            "1",
+            "1 where the frame has no pose of its own",
+        ),
+    }
+
+
+def _motion_attributes(analysis: Analysis) -> dict[str, object]:
+    motion = analysis.motion
+    return {
+        "method": "Gaussian-process regression in moving windows, squared-exponential covariance on a straight line; "
+        "length and amplitude by restricted maximum likelihood",
+        "groups": ", ".join(GROUP_NAMES),
+        "median_length_s": np.median(motion.length, axis=0),
+        "noise_scale": motion.noise_scale,
+        "warnings": "\n".join(analysis.warnings),
+    }
+
+
+def _write_scaling(path: Path, scaling: Scaling) -> None:
+    fits = scaling.by_window
+    dims = ("scaling_window",)
+    variables = {}
+    for name, text in (("n_theta", "nutation"), ("n_psidot", "precession rate"), ("n_energy", "energy")):
+        exponents = [getattr(fit, name) for fit in fits]
+        for ending, what in (("value", ""), ("sigma", "_sigma"), ("low", "_low"), ("high", "_high")):
+            values = np.array([getattr(e, ending) for e in exponents])
+            variables[name + what] = Variable(values, dims, "1", f"exponent of the {text} in t_f - t, {ending}")
+    variables["t_f"] = Variable(
+        np.array([fit.t_f for fit in fits]), dims, "s", "instant of collapse fitted in the window"
+    )
+    variables["t_f_sigma"] = Variable(np.array([fit.t_f_sigma for fit in fits]), dims, "s", "standard deviation of t_f")
+    laws, count = scaling.laws, scaling.count
+    attributes: dict[str, object] = {
+        "window_s": np.array(laws.window),
+        "t_f_s": laws.t_f,
+        "t_f_sigma_s": laws.t_f_sigma,
+        "reason_undetermined": laws.reason,
+        "nutation_over_precession_counted": count.slope,
+        "nutation_over_precession_counted_sigma": count.sigma,
+        "nutation_over_precession_expected": np.array(count.expected),
+    }
+    for name in ("n_theta", "n_psidot", "n_energy"):
+        exponent = getattr(laws, name)
+        attributes[name] = exponent.value
+        attributes[f"{name}_sigma"] = exponent.sigma
+        attributes[f"{name}_confidence_95"] = np.array([exponent.low, exponent.high])
+    axis = Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")
+    write_group(path, "scaling", variables, axes={"scaling_window": axis}, attributes=attributes)
+
+
+def _warnings(trajectory: Trajectory, motion: Motion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
+    """What an experimenter should know before using the numbers, in plain words."""
+    found = []
+    n, missing, unknown = len(motion), int((~motion.measured).sum()), int((~motion.known).sum())
+    if missing:
+        found.append(
+            f"{missing} of {n} frames have no pose of their own; {missing - unknown} were bridged from their "
+            f"neighbours (their sigmas are larger), {unknown} stay unknown."
+        )
+    for name, scale in zip(GROUP_NAMES, motion.noise_scale, strict=True):
+        if not EXPECTED_NOISE_SCALE[0] <= scale <= EXPECTED_NOISE_SCALE[1]:
+            found.append(
+                f"The scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
+                "follow the scatter."
+            )
+    height, common = contact.series[2].value, contact.series[2].sigma_calibration
+    offset = float(np.mean(height[np.isfinite(height)])) if np.isfinite(height).any() else 0.0
+    allowed = 3 * float(np.nanmax(np.append(common, 0.0))) + HEIGHT_TOLERANCE
+    if abs(offset) > allowed:
+        found.append(
+            f"The lowest point of the edge lies {1e6 * offset:+.1f} um from the table on average, more than the "
+            f"calibration explains ({1e6 * allowed:.1f} um): the thickness, the table view or the board's thickness is "
+            "off."
+        )
+    onset = contact.onset
+    if not onset.probability >= 0.5:
+        found.append(f"The disc {onset.verdict}." if np.isfinite(onset.probability) else f"Rolling: {onset.verdict}.")
+    elif onset.n_late_slips:
+        found.append(
+            f"After the onset of rolling, {onset.n_late_slips} frames still show slip beyond five sigmas: stick and "
+            "slip, or impacts."
+        )
+    if scaling.laws.reason:
+        found.append(f"No exponents are given: {scaling.laws.reason}.")
+    return tuple(found)

@@ -1,0 +1,199 @@
+"""The stage that ties the analysis together: groups in the file, verdicts in words, and what bad input does."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.analyse import analyse, run_analyse, write_analysis
+from disctrack.disc import MA_2014
+from disctrack.errors import AnalysisError, OutputError, TrajectoryFileError
+from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
+from disctrack.storage import Provenance, read_group, read_trajectory, write_trajectory
+
+
+@pytest.fixture(scope="module")
+def late(true_motion, as_tracked):
+    rng = np.random.default_rng(20140703)
+    return as_tracked(true_motion(theta_deg=9, duration=3.0)[-450:], rng, missing=range(100, 106))
+
+
+@pytest.fixture(scope="module")
+def analysed(late):
+    return analyse(late)
+
+
+def stored(folder: Path, trajectory) -> Path:
+    path = folder / "trajectory.h5"
+    write_trajectory(path, trajectory, Provenance("simulated", {"left": "0" * 64}, {"case": "test"}))
+    return path
+
+
+def test_file_gets_the_groups_and_keeps_what_it_had(tmp_path, late, analysed, true_motion):
+    path = stored(tmp_path, late)
+    write_analysis(path, analysed)
+    again = read_trajectory(path)
+    assert_allclose(again.q, late.q, atol=0)
+    for name, quantities in {
+        "motion": ("psidot", "omega_3", "velocity_x", "alpha_z", "covariance", "bridged"),
+        "contact": ("slip_n", "slip_m", "locus_m", "force_z", "friction_needed"),
+        "energy": ("total", "potential", "power", "precession_level"),
+        "scaling": ("n_theta", "n_psidot", "n_energy", "t_f"),
+    }.items():
+        arrays, _ = read_group(path, name)
+        assert set(quantities) <= set(arrays), name
+    motion, attributes = read_group(path, "motion")
+    truth = true_motion(theta_deg=9, duration=3.0)[-450:]
+    for name, true in (("psidot", truth.rates[:, 0]), ("omega_3", truth.rates[:, 5])):
+        assert np.all(np.abs(motion[name] - true) < 6 * motion[f"{name}_sigma"]), name
+    assert motion["bridged"].sum() == 6
+    assert "bridged" in attributes["warnings"]
+    with h5py.File(path) as file:
+        for group in ("motion", "contact", "energy", "scaling"):
+            for name, dataset in file[group].items():
+                assert dataset.attrs["units"], f"{group}/{name}"
+                assert dataset.attrs["long_name"], f"{group}/{name}"
+
+
+def test_analysing_again_replaces_the_groups(tmp_path, late, analysed):
+    path = stored(tmp_path, late)
+    write_analysis(path, replace(analysed, warnings=("first",)))
+    write_analysis(path, analysed)
+    arrays, attributes = read_group(path, "motion")
+    assert attributes["warnings"] == "\n".join(analysed.warnings)
+    assert_allclose(arrays["velocity_x"], analysed.motion.velocity[:, 0], atol=0)
+
+
+def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analysed):
+    """Seen in a mirror (y -> -y) psi runs backwards, and nothing else changes."""
+    q = late.q * np.array([1, -1, 1, -1, 1, -1])
+    q[:, 3] += np.pi  # the mirrored e1 points the other way
+    q[:, 5] += np.pi
+    R = rotation_from_euler(*q[:, 3:].T)
+    flip = np.diag([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    mirrored = replace(
+        late,
+        q=q,
+        quaternion=continuous_quaternions(quaternion_from_rotation(R)),
+        pose_covariance=flip @ late.pose_covariance @ flip,
+    )
+    here, there = analysed.scaling.laws, analyse(mirrored).scaling.laws
+    assert here.determined
+    assert_allclose(there.n_theta.value, here.n_theta.value, atol=1e-6)
+    assert_allclose(there.n_psidot.value, here.n_psidot.value, atol=1e-6)
+    assert_allclose(there.t_f, here.t_f, atol=1e-7)
+
+
+def test_disc_at_rest_gives_no_rates_and_no_exponents(true_motion, as_tracked, rng):
+    base = true_motion(theta_deg=9, duration=3.0)[:300]
+    zero = np.zeros((300, 3))
+    tilt = np.radians(0.5)
+    z = 0.0375 * np.sin(tilt) + 0.003 * np.cos(tilt)
+    still = replace(
+        base,
+        position=np.tile([0.05, 0.04, z], (300, 1)),
+        R=np.tile(rotation_from_euler(0.3, tilt, 0.1), (300, 1, 1)),
+        velocity=zero,
+        omega=zero,
+        acceleration=zero,
+        alpha=zero,
+    )
+    analysis = analyse(as_tracked(still, rng))
+    assert not analysis.scaling.laws.determined
+    assert np.isnan(analysis.scaling.laws.n_theta.value)
+    assert np.isnan(analysis.contact.circle.radius)
+    psidot = analysis.series("psidot")
+    assert np.all(np.abs(psidot.value) < 6 * psidot.sigma)
+    assert_allclose(np.nanmean(analysis.series("force_z").value), MA_2014.mass * 9.81, rtol=1e-3)
+    assert any("No exponents" in text for text in analysis.warnings)
+
+
+def test_lying_flat_everything_about_precession_is_unknown_not_wrong(true_motion, as_tracked, rng):
+    base = true_motion(theta_deg=9, duration=3.0)[:100]
+    zero = np.zeros((100, 3))
+    flat = replace(
+        base,
+        position=np.tile([0.05, 0.04, 0.003], (100, 1)),
+        R=np.tile(np.eye(3), (100, 1, 1)),
+        velocity=zero,
+        omega=zero,
+        acceleration=zero,
+        alpha=zero,
+    )
+    analysis = analyse(as_tracked(flat, rng))
+    assert np.isnan(analysis.series("psidot").value).all()
+    assert not analysis.scaling.laws.determined
+    assert not np.isfinite(analysis.contact.onset.time)
+
+
+def test_disc_that_floats_is_noticed(late, analysed):
+    """A table frame 50 um too low: the lowest point of the edge does not lie on the table."""
+    q = late.q.copy()
+    q[:, 2] += 50e-6
+    assert not any("lowest point" in text for text in analysed.warnings)
+    (said,) = (text for text in analyse(replace(late, q=q)).warnings if "lowest point" in text)
+    assert re.search(r"\+(49\.9|50\.[01]) um", said), said
+
+
+def test_understated_noise_is_said(late):
+    shy = replace(late, pose_covariance=late.pose_covariance / 9)
+    texts = analyse(shy).warnings
+    assert sum("times what the tracker states" in text for text in texts) == 4
+
+
+def test_most_frames_lost_is_an_error_or_an_honest_answer(late):
+    q, quaternion = late.q.copy(), late.quaternion.copy()
+    lost = np.ones(len(q), bool)
+    lost[::60] = False  # ten poses, far apart
+    q[lost], quaternion[lost] = np.nan, np.nan
+    with pytest.raises(AnalysisError, match="frames have a pose"):
+        analyse(replace(late, q=q, quaternion=quaternion))
+    lost[::20] = False  # thirty poses 20 ms apart: each oscillation is seen twice or thrice
+    q, quaternion = late.q.copy(), late.quaternion.copy()
+    q[lost], quaternion[lost] = np.nan, np.nan
+    with pytest.raises(AnalysisError, match="neighbouring frames"):
+        analyse(replace(late, q=q, quaternion=quaternion))
+
+
+def test_trajectory_without_table_frame_is_refused(late):
+    with pytest.raises(AnalysisError, match="table"):
+        analyse(replace(late, rig=replace(late.rig, world_is_table=False)))
+
+
+def test_error_names_the_file(tmp_path, late):
+    path = stored(tmp_path, replace(late, rig=replace(late.rig, world_is_table=False)))
+    with pytest.raises(AnalysisError, match=r"trajectory\.h5"):
+        run_analyse(path)
+
+
+def test_file_of_another_program_is_refused_and_left_alone(tmp_path):
+    path = tmp_path / "foreign.h5"
+    with h5py.File(path, "w") as file:
+        file["time"] = np.arange(5.0)
+    before = path.read_bytes()
+    with pytest.raises(TrajectoryFileError, match="not a trajectory"):
+        run_analyse(path)
+    assert path.read_bytes() == before
+    assert not (tmp_path / "foreign_analysis").exists()
+
+
+def test_missing_and_broken_files_are_named(tmp_path):
+    with pytest.raises(TrajectoryFileError, match="no such file"):
+        run_analyse(tmp_path / "nothing.h5")
+    broken = tmp_path / "broken.h5"
+    broken.write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 100)
+    with pytest.raises(TrajectoryFileError, match=r"broken\.h5"):
+        run_analyse(broken)
+
+
+def test_report_is_not_overwritten_unasked(tmp_path, late):
+    path = stored(tmp_path, late)
+    (tmp_path / "trajectory_analysis").mkdir()
+    (tmp_path / "trajectory_analysis" / "report.html").write_text("mine")
+    with pytest.raises(OutputError, match="exists"):
+        run_analyse(path)
+    assert (tmp_path / "trajectory_analysis" / "report.html").read_text() == "mine"

@@ -1,0 +1,96 @@
+"""The report: one file, complete, and readable in a real browser."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from disctrack.analyse import run_analyse
+from disctrack.storage import Provenance, write_trajectory
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+BLUE_BGR = np.array([0x8B, 0x6F, 0x1F])  # of the curves
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory, true_motion, as_tracked):
+    """Report of a disc that rolls down to 0.5 degrees, with a gap."""
+    folder = tmp_path_factory.mktemp("report")
+    trajectory = as_tracked(
+        true_motion(theta_deg=9, duration=3.0)[-1200:], np.random.default_rng(3), missing=range(100, 106)
+    )
+    path = folder / "rolling down.h5"
+    write_trajectory(path, trajectory, Provenance("rolling <down>", {"left": "0" * 64}, {}))
+    return run_analyse(path, folder / "out")
+
+
+def test_report_needs_nothing_else(reported):
+    page = reported.report.read_text()
+    references = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+    assert references
+    assert all(text.startswith("data:image/") for text in references)
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "<script" not in page
+
+
+def test_report_says_what_was_found(reported):
+    page = reported.report.read_text()
+    laws = reported.analysis.scaling.laws
+    assert f"{laws.n_theta.value:.4f} ± {laws.n_theta.sigma:.4f}" in page
+    assert "rolls without slip from the first frame" in page
+    assert "6 of 1200 frames have no pose" in page
+    assert "rolling &lt;down&gt;" in page  # names are not taken for markup
+    assert "0.6680" in page  # the recomputed average of the published table
+    assert "0.6872" in page  # and the printed one
+    assert not re.search(r"\bnan\b", re.sub(r"base64,[^\"]*", "", page))
+
+
+def test_every_figure_is_there_as_png_and_pdf(reported):
+    names = {path.stem for path in reported.figures}
+    for number in ("04", "05", "06", "07", "08", "09", "10", "11", "12", "13", "14", "15", "16"):
+        assert any(name.startswith(number) for name in names), number
+    for path in reported.figures:
+        content = path.read_bytes()
+        assert content.startswith(b"\x89PNG" if path.suffix == ".png" else b"%PDF"), path
+        if path.suffix == ".png":
+            picture = cv2.imread(str(path))
+            assert picture.std() > 5, path  # not blank
+
+
+def screenshot(page: Path, folder: Path, browser: str) -> np.ndarray:
+    picture = folder / f"{page.stem}.png"
+    flags = (
+        "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync --hide-scrollbars --window-size=1280,6000"
+    )
+    command = [
+        browser,
+        *flags.split(),
+        f"--user-data-dir={folder / 'profile'}",
+        f"--screenshot={picture}",
+        page.as_uri(),
+    ]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    return cv2.imread(str(picture))
+
+
+def share_of_blue(picture: np.ndarray) -> float:
+    return float(np.mean(np.abs(picture.astype(int) - BLUE_BGR).max(axis=2) < 12))
+
+
+def test_report_shows_its_figures_in_a_browser(reported, tmp_path):
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip(f"no browser found under the names {', '.join(BROWSERS)}")
+    picture = screenshot(reported.report, tmp_path, browser)
+    assert picture.shape == (6000, 1280, 3)
+    assert share_of_blue(picture) > 5e-4  # curves of 1 px, 500 px long, in some 15 figures
+    # negative control: the same page with its pictures damaged has no curves
+    damaged = tmp_path / "damaged.html"
+    damaged.write_text(reported.report.read_text().replace(";base64,", ";base64,AAAA"))
+    assert share_of_blue(screenshot(damaged, tmp_path, browser)) < 0.2 * share_of_blue(picture)
