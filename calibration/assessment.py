@@ -101,7 +101,7 @@ def half_set_differences(refinement: Refinement, inflation: float) -> HalfSets |
 
 def _half(problem: Problem, refinement: Refinement) -> tuple[Array, Array]:
     """Parameters (s,) relative to the full refinement, along its basis, and their covariance."""
-    minimum = minimise(problem, refinement.model, iterations=40, tolerance=1e-8)
+    minimum = minimise(problem, refinement.model, iterations=40, tolerance=1e-8, damping=1e-6)
     covariance, _, _ = minimum.normal.covariances()
     a, b = refinement.model, minimum.model
     change = np.concatenate([b.cameras[i].parameters - a.cameras[i].parameters for i in (0, 1)])

@@ -17,6 +17,7 @@ from calibration.refinement import (
     Refinement,
     StereoModel,
     Terms,
+    inverse_covariance,
     minimise,
     predict,
     refine_stereo,
@@ -52,12 +53,14 @@ def held_out(refinement: Refinement, sigma: float) -> tuple[Array, Array, Array]
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
         train = used[~np.isin(used.view, left_out)]
-        problem = replace(refinement.problem, observations=train, weights=_weights(train, sigma))
-        model = minimise(problem, refinement.model, iterations=12, tolerance=1e-6).model
+        problem = replace(
+            refinement.problem, observations=train, weights=inverse_covariance(train.covariance, sigma**2)
+        )
+        model = minimise(problem, refinement.model, iterations=12, tolerance=1e-6, damping=1e-7).model
         test = everything[np.isin(everything.view, left_out)]
         model = fit_poses(test, model, sigma)
         residuals = test.pixels - predict(model, test)[0]
-        distance = np.einsum("mi,mij,mj->m", residuals, _weights(test, sigma), residuals)
+        distance = np.einsum("mi,mij,mj->m", residuals, inverse_covariance(test.covariance, sigma**2), residuals)
         good = distance < TRUNCATE
         for v in left_out:
             of_view = test.view == v
@@ -71,17 +74,13 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
     """Poses of the target in the views of the observations, everything else held."""
     problem = Problem(
         observations,
-        _weights(observations, sigma),
+        inverse_covariance(observations.covariance, sigma**2),
         np.zeros((N_STEREO, 0)),
         np.zeros((*model.points.shape, 0)),
         len(model.R_left_board),
         huber=3.0,
     )
-    return minimise(problem, model, iterations=12, tolerance=1e-6).model
-
-
-def _weights(observations: Observations, sigma: float) -> Array:
-    return np.asarray(np.linalg.inv(observations.covariance + sigma**2 * np.eye(2)), np.float64)
+    return minimise(problem, model, iterations=12, tolerance=1e-6, damping=1e-7).model
 
 
 def candidate(refinement: Refinement, sigma: float) -> Candidate:
@@ -150,7 +149,9 @@ def choose_terms(
     if len(boards) > 1:
         chosen = compare([(chosen[0], b) for b in boards], fits[chosen])
         if chosen[1] != board and len(distortions) > 1:
-            chosen = compare([(d, chosen[1]) for d in distortions], fits[chosen])
+            least = len(DISTORTION_MODELS[chosen[0]]) - 1  # far fewer terms were seen to fail with the flat board
+            again = [(d, chosen[1]) for d in distortions if len(DISTORTION_MODELS[d]) >= least]
+            chosen = compare(again, fits[chosen])
     if chosen not in table:
         table[chosen] = candidate(fits[chosen], fits[chosen].unexplained_sigma)
     return fits[chosen], tuple(table.values())

@@ -233,40 +233,62 @@ class Problem:
         o = self.observations
         pixels, d_stereo, d_pose, d_point = predict(model, o)
         residuals = o.pixels - pixels
-        J = d_stereo @ self.stereo_basis
-        if self.shape_basis.shape[-1]:
-            J = np.concatenate([J, d_point @ self.shape_basis[o.point]], axis=-1)
-        mahalanobis = np.sqrt(np.einsum("mi,mij,mj->m", residuals, self.weights, residuals))
+        m, s1, s2 = len(o), self.stereo_basis.shape[1], self.shape_basis.shape[-1]
+        s = s1 + s2
+        block = np.empty((m, 2, s + 7))  # derivatives by shared parameters and pose, then the residual
+        block[..., :s1] = (d_stereo.reshape(2 * m, N_STEREO) @ self.stereo_basis).reshape(m, 2, s1)
+        if s2:
+            block[..., s1:s] = d_point @ self.shape_basis[o.point]
+        block[..., s : s + 6] = d_pose
+        block[..., s + 6] = residuals
+        mahalanobis = np.sqrt(_quadratic(self.weights, residuals))
         cost, factor = _huber(mahalanobis, self.huber)
-        weights = self.weights * factor[:, None, None]
-        weighted = (weights @ residuals[..., None])[..., 0]
-        weighted_J, weighted_pose = weights @ J, weights @ d_pose
-        s, V = J.shape[-1], self.n_views
-        parts = Normal(
-            np.zeros((V, s, s)),
-            np.zeros((V, s)),
-            np.zeros((V, s, 6)),
-            np.tile(np.eye(6), (V, 1, 1)),
-            np.zeros((V, 6)),
-            cost,
-            residuals,
+        block = _whitened(block, self.weights * factor[:, None, None]).reshape(2 * m, s + 7)
+        V = self.n_views
+        squares = np.zeros((V, s + 7, s + 7))
+        bounds = 2 * np.searchsorted(o.view, np.arange(V + 1))
+        for v in range(V):
+            rows = block[bounds[v] : bounds[v + 1]]
+            squares[v] = rows.T @ rows
+        pose = squares[:, s : s + 6, s : s + 6]
+        pose[bounds[1:] == bounds[:-1]] = np.eye(6)
+        return Normal(
+            shared=squares[:, :s, :s],
+            gradient=squares[:, :s, s + 6],
+            cross=squares[:, :s, s : s + 6],
+            pose=pose,
+            pose_gradient=squares[:, s : s + 6, s + 6],
+            cost=cost,
+            residuals=residuals,
         )
-        bounds = np.searchsorted(o.view, np.arange(V + 1))
-        for v, rows in enumerate(map(slice, bounds[:-1], bounds[1:])):
-            if rows.start == rows.stop:
-                continue
-            n = 2 * (rows.stop - rows.start)
-            own, shared, rest = d_pose[rows].reshape(n, 6), J[rows].reshape(n, s), weighted[rows].reshape(n)
-            parts.shared[v] = shared.T @ weighted_J[rows].reshape(n, s)
-            parts.cross[v] = shared.T @ weighted_pose[rows].reshape(n, 6)
-            parts.pose[v] = own.T @ weighted_pose[rows].reshape(n, 6)
-            parts.gradient[v], parts.pose_gradient[v] = shared.T @ rest, own.T @ rest
-        return parts
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""
         s1 = self.stereo_basis.shape[1]
         return moved(model, self.stereo_basis @ shared[:s1], poses, self.shape_basis @ shared[s1:])
+
+
+def _whitened(block: Array, weights: Array) -> Array:
+    """L^T block for weights = L L^T; block (m, 2, k), weights (m, 2, 2)."""
+    a = np.sqrt(weights[:, 0, 0])
+    b = weights[:, 0, 1] / np.where(a > 0, a, 1.0)
+    c = np.sqrt(np.maximum(weights[:, 1, 1] - b * b, 0.0))
+    return np.stack([a[:, None] * block[:, 0] + b[:, None] * block[:, 1], c[:, None] * block[:, 1]], axis=1)
+
+
+def _quadratic(matrix: Array, vector: Array) -> Array:
+    """v^T M v of (m, 2, 2) and (m, 2)."""
+    x, y = vector[:, 0], vector[:, 1]
+    value: Array = matrix[:, 0, 0] * x * x + 2 * matrix[:, 0, 1] * x * y + matrix[:, 1, 1] * y * y
+    return value
+
+
+def inverse_covariance(covariance: Array, extra: float) -> Array:
+    """Inverse of covariance (m, 2, 2) + extra [px^2] in both axes."""
+    a, b, c = covariance[:, 0, 0] + extra, covariance[:, 0, 1], covariance[:, 1, 1] + extra
+    inverse = np.stack([np.stack([c, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)
+    result: Array = inverse / (a * c - b * b)[:, None, None]
+    return result
 
 
 def _huber(mahalanobis: Array, limit: float) -> tuple[float, Array]:
@@ -292,12 +314,14 @@ class Minimum:
     converged: bool
 
 
-def minimise(problem: Problem, start: StereoModel, iterations: int = 60, tolerance: float = 1e-10) -> Minimum:
+def minimise(
+    problem: Problem, start: StereoModel, iterations: int = 60, tolerance: float = 1e-10, damping: float = 1e-3
+) -> Minimum:
     """Levenberg-Marquardt; converged when the cost to be gained by a full step is below tolerance x cost.
 
     The predicted gain g^T H^-1 g is free of the parameters' units, and a vanishing gradient is what it says.
     """
-    model, normal, damping = start, problem.linearise(start), 1e-3
+    model, normal = start, problem.linearise(start)
     if not np.isfinite(normal.cost):
         raise CalibrationError(
             "the start of the refinement puts the board behind a camera: check the order of the views"
@@ -309,10 +333,10 @@ def minimise(problem: Problem, start: StereoModel, iterations: int = 60, toleran
         trial_normal = problem.linearise(trial)
         if trial_normal.cost <= normal.cost * (1 + 1e-14):
             model, normal, damping = trial, trial_normal, max(damping * 0.1, 1e-12)
-            if damping < 1e-4 and gain <= tolerance * max(normal.cost, 1e-30):
+            if damping < 1e-4 and gain <= tolerance * max(normal.cost, 1.0):
                 return Minimum(model, normal, iteration, True)
         else:
-            if gain <= tolerance * max(normal.cost, 1e-30):
+            if gain <= tolerance * max(normal.cost, 1.0):
                 return Minimum(model, normal, iteration, damping < 1e-2)
             damping *= 10.0
             if damping > 1e10:
@@ -385,13 +409,13 @@ def refine_stereo(
         kept, extra = begin.kept, begin.unexplained_sigma**2
     for _ in range(8):
         used = observations[kept]
-        problem = Problem(used, _weights(used.covariance, extra), stereo_basis, shape_basis, n_views)
+        problem = Problem(used, inverse_covariance(used.covariance, extra), stereo_basis, shape_basis, n_views)
         if _degrees_of_freedom(problem, len(used)) <= 0:
             raise CalibrationError(
                 f"{len(used)} points in {len(np.unique(used.view))} views are fewer than the parameters to be found: "
                 "take more views, or fewer free terms"
             )
-        minimum = minimise(problem, model)
+        minimum = minimise(problem, model, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict(model, observations)[0]
         dof = _degrees_of_freedom(problem, len(used))
@@ -450,7 +474,7 @@ def _robust_start(
         for _ in range(2):
             residuals = observations.pixels - predict(model, observations)[0]
             extra = _median_variance(residuals)
-            weights = _weights(observations.covariance, extra)
+            weights = inverse_covariance(observations.covariance, extra)
             problem = Problem(observations, weights, stereo_basis, basis, n_views, huber=2.0)
             model = minimise(problem, model, iterations=30, tolerance=1e-5).model
     residuals = observations.pixels - predict(model, observations)[0]
@@ -462,12 +486,8 @@ def _median_variance(residuals: Array) -> float:
     return float(np.median(np.sum(residuals**2, axis=-1)) / (2 * np.log(2))) + 1e-12
 
 
-def _weights(covariance: Array, extra: float) -> Array:
-    return np.asarray(np.linalg.inv(covariance + extra * np.eye(2)), np.float64)
-
-
 def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
-    return np.einsum("mi,mij,mj->m", residuals, _weights(covariance, extra), residuals)
+    return _quadratic(inverse_covariance(covariance, extra), residuals)
 
 
 def _extra_variance(residuals: Array, covariance: Array, dof: int) -> float:
@@ -479,7 +499,7 @@ def _extra_variance(residuals: Array, covariance: Array, dof: int) -> float:
     if excess(0.0) <= 0:
         return 0.0
     low, high = 0.0, float(np.sum(residuals**2)) / dof + 1e-12
-    for _ in range(60):
+    for _ in range(40):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return 0.5 * (low + high)

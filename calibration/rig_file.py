@@ -134,7 +134,7 @@ def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibrati
             file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION)
             file.attrs["description"] = (
                 "Two calibrated cameras. points_left = R_left_world @ points_world + t_left_world; "
-                "points_right = R_right_left @ points_left + t_right_left; Brown distortion with OpenCV's coefficients; "
+                "points_right = R_right_left @ points_left + t_right_left; Brown distortion, OpenCV's coefficients; "
                 "pixel (0, 0) is the centre of the top-left pixel; camera axes: x right, y down, z along the view."
             )
             write_rig_group(file.create_group("rig"), content.rig)

@@ -1,0 +1,264 @@
+"""The joint refinement finds the minimum, the truth, and how far it may be from it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
+
+from calibration import CalibrationError, Terms, refine_stereo
+from calibration.assessment import consistency_factor
+from calibration.camera import N_RIG
+from calibration.model_choice import choose_terms
+from calibration.refinement import board_basis, moved, predict
+from calibration.start import start_stereo
+from calibration.table_frame import rig_with_covariance, table_pose
+
+FULL = Terms("k1 k2 p1 p2")
+
+
+def disturbed(scene, rng, size=1.0):
+    """A start a few px and degrees off."""
+    n = len(scene.model.R_left_board)
+    stereo = np.zeros(24)
+    stereo[[0, 1, 9, 10]] = rng.normal(size=4) * 20 * size
+    stereo[[2, 3, 11, 12]] = rng.normal(size=4) * 5 * size
+    stereo[18:21], stereo[21:24] = rng.normal(size=3) * 0.01 * size, rng.normal(size=3) * 2e-3 * size
+    poses = rng.normal(size=(n, 6)) * np.array([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3]) * size
+    return replace(moved(scene.model, stereo, poses, np.zeros_like(scene.model.points)), points=scene.board.points)
+
+
+def parameters(model):
+    return np.concatenate([model.cameras[0].parameters, model.cameras[1].parameters, model.t_right_left])
+
+
+def rig_error(found, truth):
+    """(30,) difference of two rigs in RIG_PARAMETERS, rotation vectors from the left."""
+
+    def turn(A, B):
+        D = A @ B.T
+        return 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
+
+    return np.concatenate(
+        [
+            found.left.parameters - truth.left.parameters,
+            found.right.parameters - truth.right.parameters,
+            turn(found.R_right_left, truth.R_right_left),
+            found.t_right_left - truth.t_right_left,
+            turn(found.R_left_world, truth.R_left_world),
+            found.t_left_world - truth.t_left_world,
+        ]
+    )
+
+
+def true_rig(scene, view, thickness):
+    m = scene.model
+    R, t = table_pose(m.R_left_board[view], m.t_left_board[view], thickness)
+    found = refine_stereo(scene.observations(1e-3), m, scene.board.points, FULL)
+    rig = rig_with_covariance(found, view, thickness, 1.0)
+    return replace(
+        rig,
+        left=m.cameras[0],
+        right=m.cameras[1],
+        R_right_left=m.R_right_left,
+        t_right_left=m.t_right_left,
+        R_left_world=R,
+        t_left_world=t,
+    )
+
+
+def test_derivatives_agree_with_central_differences(scene_maker, rng):
+    scene = scene_maker(n_views=3)
+    o = scene.observations(0.01)
+    m, n = scene.model, len(scene.model.points)
+    _, d_stereo, d_pose, d_point = predict(m, o)
+    zero = (np.zeros(24), np.zeros((3, 6)), np.zeros((n, 3)))
+
+    def shifted(which, index, h):
+        step = [z.copy() for z in zero]
+        step[which][index] = h
+        return predict(moved(m, *step), o)[0]
+
+    for i in range(24):
+        h = 1e-5
+        numeric = (shifted(0, i, h) - shifted(0, i, -h)) / (2 * h)
+        # round-off 1e-13 / 1e-5 of pixels of size 500
+        assert_allclose(d_stereo[:, :, i], numeric, atol=1e-6 * max(1, np.abs(numeric).max()))
+    for i in range(6):
+        h = 1e-6
+        numeric = (shifted(1, (1, i), h) - shifted(1, (1, i), -h)) / (2 * h)
+        of_view = (o.view == 1)[:, None]
+        assert_allclose(np.where(of_view, d_pose[:, :, i], 0), numeric, atol=1e-6 * np.abs(numeric).max())
+    for i in range(3):
+        numeric = (shifted(2, (5, i), 1e-6) - shifted(2, (5, i), -1e-6)) / 2e-6
+        of_point = (o.point == 5)[:, None]
+        assert_allclose(np.where(of_point, d_point[:, :, i], 0), numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_exact_corners_give_back_the_exact_rig(scene_maker, rng):
+    scene = scene_maker()
+    o = scene.observations(0.01)
+    found = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL)
+    assert found.converged
+    assert found.rms() < 1e-7  # round-off: pixels of size 500 in double precision, some 1e-13 each, ill-conditioned
+    assert_allclose(parameters(found.model)[:4], parameters(scene.model)[:4], rtol=1e-7)
+    assert_allclose(found.model.t_right_left, scene.model.t_right_left, atol=1e-9)
+
+
+def test_the_minimum_is_the_one_that_scipy_finds(scene_maker, rng):
+    scene = scene_maker(n_views=4, inner_corners=(5, 4))
+    o = scene.observations(0.05, rng)
+    found = refine_stereo(o, disturbed(scene, rng), scene.board.points, Terms("k1"), reject_beyond=np.inf)
+    problem = found.problem
+    L = np.linalg.cholesky(problem.weights)
+    s = problem.stereo_basis.shape[1]
+
+    def residuals(x):
+        model = problem.stepped(start, x[:s] * scale, x[s:].reshape(-1, 6))
+        r = problem.observations.pixels - predict(model, problem.observations)[0]
+        return np.einsum("mji,mj->mi", L, r).ravel()
+
+    start = disturbed(scene, np.random.default_rng(5), 0.02)
+    start = replace(start, cameras=tuple(replace(c, distortion=(-0.1, 0, 0, 0, 0)) for c in start.cameras))
+    scale = np.abs(problem.stereo_basis).T @ np.array(([100, 100, 100, 100] + [1] * 5) * 2 + [1] * 6)
+    other = least_squares(residuals, np.zeros(s + 24), method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=20000)
+    ours = found.normal.cost
+    # both at the bottom of one parabola: what is left is scipy's numeric derivative
+    assert_allclose(ours, 2 * other.cost, rtol=1e-6)
+    assert ours <= 2 * other.cost * (1 + 1e-9)
+
+
+def test_the_gradient_vanishes_at_the_minimum(scene_maker, rng):
+    scene = scene_maker()
+    found = refine_stereo(scene.observations(0.02, rng), disturbed(scene, rng), scene.board.points, FULL)
+    normal = found.normal
+    shared, poses = normal.solve(0.0)
+    gain = shared @ normal.gradient.sum(0) + np.sum(poses * normal.pose_gradient)
+    assert 0 <= gain < 1e-8 * normal.cost  # what another Newton step could still gain
+    sigma = np.sqrt(np.diag(normal.covariances()[0]))
+    assert np.abs(shared / sigma).max() < 1e-3  # in standard deviations of the parameters
+
+
+@pytest.mark.parametrize(("n_seeds", "tolerance"), [(20, 4.0), pytest.param(200, 4.0, marks=pytest.mark.slow)])
+def test_squared_error_of_the_rig_equals_its_covariance(scene_maker, n_seeds, tolerance):
+    scene = scene_maker(n_views=10)
+    view, thickness = 2, 3e-3
+    truth = true_rig(scene, view, thickness)
+    ratios, errors, covariance = [], [], None
+    for seed in range(n_seeds):
+        o = scene.observations(0.02, np.random.default_rng(seed))
+        found = refine_stereo(o, scene.model, scene.board.points, FULL)
+        rig = rig_with_covariance(found, view, thickness, 1.0)
+        error = rig_error(rig, truth)
+        free = np.diag(rig.covariance) > 0
+        scale = np.sqrt(np.diag(rig.covariance)[free])
+        correlation = rig.covariance[np.ix_(free, free)] / scale / scale[:, None]
+        ratios.append(float((error[free] / scale) @ np.linalg.solve(correlation, error[free] / scale)) / free.sum())
+        errors.append(error[free] / scale)
+        covariance = correlation
+    p = len(covariance)
+    # mean of n chi-squares of p degrees of freedom over p: scatter sqrt(2 / (n p))
+    assert abs(np.mean(ratios) - 1) < tolerance * np.sqrt(2 / (n_seeds * p))
+    each = np.mean(np.square(errors), axis=0)
+    assert np.abs(each - 1).max() < 1.2 * tolerance * np.sqrt(2 / n_seeds)  # every parameter by itself, 28 at once
+
+
+def test_a_covariance_of_half_the_size_would_be_noticed(scene_maker):
+    scene = scene_maker(n_views=10)
+    truth = true_rig(scene, 2, 3e-3)
+    ratios = []
+    for seed in range(10):
+        found = refine_stereo(
+            scene.observations(0.02, np.random.default_rng(seed)), scene.model, scene.board.points, FULL
+        )
+        rig = rig_with_covariance(found, 2, 3e-3, 0.5)
+        error, free = rig_error(rig, truth), np.diag(rig.covariance) > 0
+        ratios.append(
+            error[free] @ np.linalg.pinv(rig.covariance[np.ix_(free, free)], rcond=1e-25) @ error[free] / free.sum()
+        )
+    assert np.mean(ratios) > 1.5
+
+
+def test_thickness_of_the_board_moves_the_origin_down_and_couples_it_to_the_tilt(scene_maker):
+    scene = scene_maker(n_views=8)
+    found = refine_stereo(scene.observations(0.02), scene.model, scene.board.points, FULL)
+    thin, thick = (rig_with_covariance(found, 0, h, 1.0) for h in (0.0, 20e-3))
+    corner = scene.board.points[:1]
+    on_print = thick.R_left_world @ (corner[0] + [0, 0, 20e-3]) + thick.t_left_world
+    assert_allclose(on_print, thin.R_left_world @ corner[0] + thin.t_left_world, atol=1e-12)
+    # by central differences: the same step of the pose, seen through either thickness
+    for axis in range(3):
+        v = np.zeros(N_RIG)
+        v[24 + axis] = 1e-6
+        moved_thin = thin.perturbed(v)
+        R, t = moved_thin.R_left_world, moved_thin.t_left_world
+        shift = (table_pose(R, t, 20e-3)[1] - thick.t_left_world) / 1e-6
+        arm = 20e-3 * thin.R_left_world[:, 2]
+        assert_allclose(shift, np.cross(arm, np.eye(3)[axis]), atol=1e-6)
+
+
+def test_gross_outliers_are_rejected_and_do_no_harm(scene_maker, rng):
+    scene = scene_maker()
+    o = scene.observations(0.02, rng)
+    clean = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL)
+    bad = rng.choice(len(o), 25, replace=False)
+    pixels = o.pixels.copy()
+    pixels[bad] += rng.choice([-1, 1], (25, 2)) * rng.uniform(0.5, 5.0, (25, 2))
+    dirty = refine_stereo(replace(o, pixels=pixels), disturbed(scene, rng), scene.board.points, FULL)
+    assert not dirty.kept[np.isin(np.arange(len(o)), bad)].any()
+    assert (~dirty.kept).sum() <= 27
+    # 25 of 1296 points fewer: far less than a standard deviation of change
+    sigma = np.sqrt(np.diag(rig_with_covariance(clean, None, 0, 1.0).covariance))[:9]
+    change = dirty.model.cameras[0].parameters - clean.model.cameras[0].parameters
+    assert np.abs(change[sigma > 0] / sigma[sigma > 0]).max() < 1.0
+
+
+def test_a_bent_board_is_chosen_and_recovered_by_held_out_error(scene_maker, rng):
+    flat = scene_maker(n_views=12)
+    basis = board_basis(flat.board.points, "warped")
+    deviation = basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3])
+    scene = scene_maker(n_views=12, deviation=deviation)
+    o = scene.observations(0.02, rng)
+    start, usable = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), 12)
+    assert usable.all()
+    distortions = ("k1 k2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3")
+    found, table = choose_terms(o, start, scene.board.points, distortions, ("flat", "warped"))
+    assert found.terms.board == "warped"
+    assert found.terms.distortion in ("k1 k2 p1 p2", "k1 k2 p1 p2 k3")
+    assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
+    by_terms = {(c.terms.distortion, c.terms.board): c for c in table}
+    chosen = by_terms[found.terms.distortion, "warped"]
+    assert chosen.held_out_chi_square < by_terms[found.terms.distortion, "flat"].held_out_chi_square
+
+
+def test_a_flat_board_without_distortion_needs_no_more_terms(scene_maker, rng):
+    scene = scene_maker(distortion=False)
+    o = scene.observations(0.02, rng)
+    found, _ = choose_terms(o, scene.model, scene.board.points, boards=("flat", "warped"))
+    assert found.terms.board == "flat"
+    assert found.problem.stereo_basis.shape[1] <= 20  # "none" to "k1 k2": the rest cannot be told from noise
+
+
+def test_errors_common_to_a_view_inflate_the_covariance(scene_maker, rng):
+    scene = scene_maker(n_views=16)
+    o = scene.observations(0.02, rng)
+    quiet = consistency_factor(refine_stereo(o, scene.model, scene.board.points, FULL))
+    shear = rng.normal(size=(16, 2, 2)) * 3e-4  # a bend of the images that changes from view to view
+    centred = o.pixels - 256.0
+    pixels = o.pixels + shear[o.view, o.camera] * centred[:, :1] * centred[:, 1:] / 256
+    noisy = consistency_factor(refine_stereo(replace(o, pixels=pixels), scene.model, scene.board.points, FULL))
+    assert 0.4 < quiet < 1.8  # 16 views: scatter of about 0.25
+    assert noisy > 1.5 * quiet
+
+
+def test_equal_aspect_ties_the_focal_lengths(scene_maker, rng):
+    scene = scene_maker()
+    found = refine_stereo(scene.observations(0.02), scene.model, scene.board.points, Terms("k1", equal_aspect=True))
+    assert found.model.cameras[0].fx == pytest.approx(found.model.cameras[0].fy, abs=1e-9)
+
+
+def test_too_few_views_are_an_error_that_says_so(scene_maker):
+    scene = scene_maker(n_views=2)
+    with pytest.raises(CalibrationError, match="at least 3"):
+        start_stereo(scene.observations(0.02), scene.board.points, ((512, 512), (512, 512)), 2)
