@@ -8,18 +8,15 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
-import types
-import typing
-from dataclasses import dataclass, field, fields, is_dataclass
-from difflib import get_close_matches
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from disctrack.disc import MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
+from disctrack.toml_tree import build, toml_lines
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -280,79 +277,44 @@ def load_scene(path: str | Path) -> Scene:
 
 def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = Path()) -> Scene:
     """Scene of nested dictionaries as tomllib returns them; errors as in `load_scene`."""
-    scene = _build(Scene, {**tree, "folder": folder}, where, "")
+    scene = replace(build(Scene, tree, where), folder=folder)
     _check(scene, where)
-    return typing.cast(Scene, scene)
+    return scene
 
 
 def scene_toml(scene: Scene) -> str:
     """All of `scene` as a TOML file that `load_scene` reads back to the same scene (but for its folder)."""
-    return "\n".join(_toml_section(scene, "")).lstrip() + "\n"
-
-
-def _toml_section(settings: Any, name: str) -> list[str]:
-    own, below = ([f"\n[{name}]"] if name else []), []
-    for f in fields(settings):
-        value = getattr(settings, f.name)
-        if isinstance(value, Path):
-            continue
-        if is_dataclass(value):
-            below += _toml_section(value, f"{name}.{f.name}" if name else f.name)
-        else:
-            own.append(f"{f.name} = {_toml_value(value)}")
-    return own + below
-
-
-def _toml_value(value: Any) -> str:
-    if is_dataclass(value):
-        value = {f.name: getattr(value, f.name) for f in fields(value)}
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {_toml_value(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    return json.dumps(value) if isinstance(value, str) else repr(value)
-
-
-def _build(kind: Any, tree: dict[str, Any], where: str, section: str) -> Any:
-    known = {f.name for f in fields(kind)} - ({"folder"} if section else set())
-    hints = typing.get_type_hints(kind)
-    values = {}
-    for key, value in tree.items():
-        if key not in known:
-            near = get_close_matches(key, sorted(known - {"folder"}), n=1, cutoff=0.0)
-            place = f"[{section}]" if section else "the top level"
-            raise SceneError(f"{where}: unknown key '{key}' in {place}; the nearest known key is '{near[0]}'")
-        values[key] = _convert(hints[key], value, where, f"{section}.{key}" if section else key)
-    return kind(**values)
-
-
-def _convert(hint: Any, value: Any, where: str, key: str) -> Any:
-    """`value` as the annotation `hint` wants it: number, string, tuple of them, dataclass, or mapping."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if is_dataclass(hint) and isinstance(value, dict):
-        return _build(hint, value, where, key)
-    if origin is tuple and isinstance(value, list):
-        kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
-        if len(kinds) == len(value):
-            return tuple(_convert(k, v, where, key) for k, v in zip(kinds, value, strict=True))
-        raise SceneError(f"{where}: {key} has {len(value)} values, {len(kinds)} are expected")
-    if origin is dict and isinstance(value, dict):
-        return {str(k): _convert(arguments[1], v, where, f"{key}.{k}") for k, v in value.items()}
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(hint, type) and not isinstance(hint, types.GenericAlias) and type(value) is hint:
-        return value
-    if hint is Path and isinstance(value, Path):
-        return value
-    wanted = getattr(hint, "__name__", str(hint)) if origin is None else f"a list ({hint})"
-    raise SceneError(f"{where}: {key} = {value!r} is of the wrong kind; expected {wanted}")
+    return "\n".join(toml_lines(scene)).lstrip() + "\n"
 
 
 def _check(scene: Scene, where: str) -> None:
     """Raise SceneError for values that no recording can have."""
+    cameras, disc, board = scene.cameras, scene.disc, scene.board
+    reach_mm = max((math.hypot(x, y) for x, y in scene.markers.centres_mm), default=0.0) + scene.markers.diameter_mm / 2
+    positive = {
+        "cameras.frame_rate_hz": cameras.frame_rate_hz,
+        "rig.mm_per_px": scene.rig.mm_per_px,
+        "rig.distance_mm": min(scene.rig.distance_mm),
+        "disc.radius_mm": disc.radius_mm,
+        "disc.thickness_mm": disc.thickness_mm,
+        "disc.mass_g": disc.mass_g,
+        "markers.diameter_mm": scene.markers.diameter_mm,
+        "board.square_mm": board.square_mm,
+        "gravity_m_s2": scene.gravity_m_s2,
+    }
+    for key, value in positive.items():
+        if not (math.isfinite(value) and value > 0):
+            raise SceneError(f"{where}: {key} = {value}; expected a positive number")
     complaints = [
+        (len(scene.markers.centres_mm) < 3, "markers.centres_mm", f"{len(scene.markers.centres_mm)} rows", "3 or more"),
+        (reach_mm > disc.radius_mm, "markers.centres_mm", "a dot over the disc's rim", "dots on the face"),
+        (
+            board.n_views < 1 or min(board.inner_corners) < 2,
+            "board",
+            "no view or no corner",
+            "n_views >= 1, corners >= 2",
+        ),
         (scene.cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", scene.cameras.bit_depth, "8, 10, 12, 16"),
-        (scene.cameras.frame_rate_hz <= 0, "cameras.frame_rate_hz", scene.cameras.frame_rate_hz, "a positive number"),
         (scene.cameras.n_frames < 1, "cameras.n_frames", scene.cameras.n_frames, "at least 1"),
         (scene.cameras.exposure_s < 0, "cameras.exposure_s", scene.cameras.exposure_s, "0 or more"),
         (min(scene.cameras.image_size) < 16, "cameras.image_size", scene.cameras.image_size, "at least 16 x 16"),

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import Camera
+from disctrack.errors import SceneError
 
 Array = NDArray[np.float64]
 
@@ -62,12 +63,12 @@ def corner_rays(camera: Camera, pad: int) -> Array:
     """Directions (x/z, y/z) through the pixels' corners: (height + 2 pad + 1, width + 2 pad + 1, 2), read-only.
 
     Corner [pad, pad] is the pixel position (-1/2, -1/2). Within a pixel directions are interpolated between its four
-    corners: for |k1| = 0.2 and f = 1700 px the error is below 1e-4 px. Raises ValueError where the distortion folds
+    corners: for |k1| = 0.2 and f = 1700 px the error is below 1e-4 px. Raises SceneError where the distortion folds
     inside the picture.
     """
     rays = _corner_rays(*camera.image_size, pad, camera.parameters)
     if not np.isfinite(rays).all():
-        raise ValueError(f"distortion {camera.distortion} folds inside the picture; choose smaller coefficients")
+        raise SceneError(f"lens distortion {camera.distortion} folds inside the picture; choose smaller coefficients")
     rays.flags.writeable = False
     return rays
 

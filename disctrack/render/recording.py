@@ -56,9 +56,11 @@ def write_recording(
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+    target = None if truth_path is None else Path(truth_path)
+    if target is not None and target.exists():
+        raise OutputError(f"{target}: exists; choose another name for the truth or remove it")
     motion = motion or motion_of(scene)
-    rig = rig_of(scene)
-    truth = _truth(scene, motion, rig)
+    truth = _truth(scene, motion, rig_of(scene))
     part = folder.with_name(folder.name + ".part")
     try:
         shutil.rmtree(part, ignore_errors=True)
@@ -67,9 +69,9 @@ def write_recording(
         (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
         images = [*_board_images(part, scene, truth), *_disc_images(part, scene, motion, truth)]
         _write_all(images, scene, progress)
-        target = part / TRUTH_NAME if truth_path is None else Path(truth_path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_truth(target, truth, scene)
+        if target is not None:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        write_truth(target or part / TRUTH_NAME, truth, scene)
         if folder.exists():
             folder.rmdir()
         part.rename(folder)
@@ -77,6 +79,8 @@ def write_recording(
         raise OutputError(
             f"{folder}: the recording cannot be written ({error}); check the disk and the rights"
         ) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     return truth
 
 

@@ -259,6 +259,24 @@ def test_existing_folder_is_left_alone(scene, tmp_path):
     with pytest.raises(OutputError, match="not an empty folder"):
         render.write_recording(tmp_path / "r", scene)
     assert (tmp_path / "r" / "precious").read_text() == "data"
+    with pytest.raises(OutputError, match="exists"):
+        render.write_recording(tmp_path / "new", scene, truth_path=tmp_path / "r" / "precious")
+
+
+def test_a_render_that_fails_leaves_nothing_behind(scene, tmp_path):
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render.write_recording(tmp_path / "r", scene, progress=stop)
+    assert not (tmp_path / "r").exists()
+    assert not (tmp_path / "r.part").exists()
+
+
+def test_truth_can_lie_apart(scene, tmp_path):
+    render.write_recording(tmp_path / "r", scene, truth_path=tmp_path / "truth" / "r.h5")
+    assert not (tmp_path / "r" / "truth.h5").exists()
+    assert len(render.read_truth(tmp_path / "truth" / "r.h5").time) == 4
 
 
 def test_truth_of_another_file_is_refused(tmp_path):
@@ -280,6 +298,9 @@ def test_truth_of_another_file_is_refused(tmp_path):
         ("[cameras]\nn_frames = 2.5", "cameras.n_frames = 2.5 is of the wrong kind; expected int"),
         ("[rig]\ndistance_mm = [400.0]", "rig.distance_mm has 1 values, 2 are expected"),
         ("seed = ", "not a TOML file"),
+        ('folder = "x"', "unknown key 'folder'"),
+        ("[rig]\nmm_per_px = 0.0", "rig.mm_per_px = 0.0; expected a positive number"),
+        ("[markers]\ncentres_mm = [[36, 0], [0, 9], [9, 0]]", "a dot over the disc's rim"),
         ("[motion]\nposes = [[1, 2, 3]]", "motion.poses"),
     ],
 )
@@ -310,6 +331,12 @@ def test_truth_holds_the_scene_and_the_rates(scene, tmp_path):
     with h5py.File(tmp_path / "r/truth.h5") as file:
         assert scene_from_tree(tomllib.loads(file.attrs["scene"])).board == scene.board
         assert_allclose(file["qdot"][:], np.tile(VELOCITY, (4, 1)), atol=1e-9)
+
+
+def test_a_lens_that_folds_is_refused():
+    lens = replace(SMALL, rig=replace(SMALL.rig, k1=(-30.0, -30.0), k2=(0.0, 0.0)))
+    with pytest.raises(SceneError, match="folds inside the picture"):
+        render.expected_disc(START, render.rig_of(lens), lens.declared_disc, lens)
 
 
 def test_missing_table_of_motion_is_named(tmp_path):
