@@ -115,7 +115,6 @@ def acquire(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRi
 
 def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquisition:
     """Find the disc from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
-    best: tuple[float, Array, Array, int] | None = None
     candidates = _candidates_from_stereo(blobs, rig, disc)
     best = _best_explanation(candidates, blobs, rig, disc)
     if best is None or best[3] < 2 * disc.n_markers - 3:
@@ -146,14 +145,11 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     keep = error < EPIPOLAR_PX
     if rig.world_is_table:  # a dot is neither below the table nor above a disc that stands on its edge
         keep &= (points[:, 2] > -3e-3) & (points[:, 2] < 2.1 * disc.radius + 2 * disc.half_thickness)
-    points = points[keep][np.argsort(error[keep])][: 2 * MAX_BLOBS]
+    points = points[keep][np.argsort(error[keep])][:MAX_BLOBS]
     if len(points) < 3:
         return []
     distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    order = np.array(list(permutations(range(len(points)), 3)) if len(points) <= 26 else [], int).reshape(-1, 3)
-    if not len(order):
-        points = points[:26]
-        order = np.array(list(permutations(range(len(points)), 3)), int)
+    order = np.array(list(permutations(range(len(points)), 3)))
     sides = np.stack([distance[order[:, a], order[:, b]] for a, b in ((0, 1), (1, 2), (2, 0))], axis=-1)
     found_points, found_dots = [], []
     centres = disc.marker_centres_body
@@ -199,7 +195,6 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         key=lambda k: -np.linalg.norm(np.cross(centres[k[1]] - centres[k[0]], centres[k[2]] - centres[k[0]])),
     )[:6]
     scored: list[tuple[float, Array, Array]] = []
-    pixels_per_m = rig.cameras[camera].fx
     for order in permutations(range(len(blobs)), 3):
         image = np.ascontiguousarray(rays[list(order)].reshape(3, 1, 2))
         for triple in triples:
@@ -216,7 +211,6 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
                 if score > MIN_EXPLAINED - 0.5:
                     scored.append((score, R_cw.T @ R, R_cw.T @ (t.ravel() - t_cw)))
     scored.sort(key=lambda item: -item[0])
-    del pixels_per_m
     return [(R, t) for _, R, t in scored[:40]]
 
 

@@ -29,6 +29,8 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
 # not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
 SYSTEMATIC_PX = 0.002
+# Dots that are found this near their declared places (rms) are left there: SYSTEMATIC_PX alone makes 0.5 um.
+MIN_MARKER_SHIFT = 2e-6  # [m]
 ITERATIONS = 4
 MIN_FRAMES = 10
 
@@ -56,12 +58,13 @@ def refine_as_built(
     t: Array,
     *,
     refine_markers: bool = True,
-    refine_rig: bool = True,
+    refine_rig: bool = False,
     max_frames: int = 2000,
 ) -> AsBuilt:
     """Refine dots and rig from the marker centres of n frames; shapes as in `pose.fit_poses`.
 
-    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared.
+    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared, and so do
+    dots that turn out to lie within MIN_MARKER_SHIFT (rms) of their declared places.
     """
     good = np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4))
     rows = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).astype(int))] if len(good) else good
@@ -107,6 +110,13 @@ def refine_as_built(
     remaining = np.zeros((len(shift), len(shift)))
     remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
     rig_covariance = remaining[:N_RIG, :N_RIG] if refine_rig else rig.covariance
+    if refine_markers and not refine_rig and np.sqrt(np.mean(shift[N_RIG:] ** 2)) < MIN_MARKER_SHIFT:
+        return replace(
+            unchanged,
+            marker_shift_sigma=np.sqrt(np.diag(remaining)[N_RIG:]).reshape(m, 2),
+            reduced_chi_square_before=before,
+            reduced_chi_square_after=before,
+        )
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
     return AsBuilt(

@@ -70,7 +70,9 @@ class TrackingSettings:
 
     limits: TemplateLimits = field(default_factory=TemplateLimits)
     refine_markers: bool = True  # the dots' places on the disc, over the whole sequence
-    refine_rig: bool = True  # the rig within its own calibration covariance
+    refine_rig: bool = (
+        False  # the rig within its own calibration covariance; hides a camera that moved, so not by default
+    )
     reject_outliers: bool = True
 
 
@@ -178,6 +180,13 @@ def track(
     """
     settings = settings or TrackingSettings()
     n = len(pairs)
+    spread = disc.marker_centres_body - disc.marker_centres_body.mean(axis=0)
+    if disc.n_markers < 3 or np.linalg.matrix_rank(spread, tol=0.1 * disc.marker_diameter) < 2:
+        raise TrackingError(
+            f"[markers] declares {disc.n_markers} dots"
+            + (" on one line" if disc.n_markers > 2 else "")
+            + ": a pose needs at least three dots that are not on one line"
+        )
     tables = _empty_tables(n, disc.n_markers)
     maps = [normalised_maps(camera) for camera in rig.cameras]
     follower = _Follower(

@@ -1,0 +1,169 @@
+"""From images to the trajectory: a rendered rolling disc, interruptions, faults."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from disctrack import frames
+from disctrack.errors import TrackingError
+from disctrack.render import render_disc
+from disctrack.tracking import TrackingSettings, track
+from disctrack.trajectory import FrameStatus, MarkerStatus
+
+N = 60
+
+
+@dataclass
+class Block:
+    frames: np.ndarray
+    images: np.ndarray
+    readable: np.ndarray
+
+
+def blocks_of(images, readable=None, size=16):
+    readable = np.ones(images.shape[:2], bool) if readable is None else readable
+
+    def read(start, stop):
+        for a in range(start, stop, size):
+            b = min(a + size, stop)
+            yield Block(np.arange(a, b), images[a:b], readable[a:b])
+
+    return read
+
+
+@pytest.fixture(scope="module")
+def rolling(rendered_pairs):
+    """Images of a disc that rolls with a moderate nutation, and its poses."""
+    from disctrack import rolling as model
+
+    disc, rig = rendered_pairs.disc, rendered_pairs.rig
+    start = model.steady_precession(np.radians(10), disc, 9.81)
+    motion = model.simulate(model.Model(disc, 9.81), start, duration=(N - 0.5) / 1000)
+    q = motion.q[:N].copy()
+    q[:, :2] += np.array([0.032, 0.02]) - q[:, :2].mean(axis=0)
+    images = render_disc(q, rig, disc, rendered_pairs.scene, np.random.default_rng(3), qdot=motion.qdot[:N])
+    return images, q
+
+
+def errors(trajectory, q):
+    R = frames.rotation_from_euler(*trajectory.q[:, 3:].T)
+    turn = frames.vector_from_rotation(R @ np.swapaxes(frames.rotation_from_euler(*q[:, 3:].T), 1, 2))
+    return np.concatenate([trajectory.q[:, :3] - q[:, :3], turn], axis=1)
+
+
+def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pairs):
+    images, q = rolling
+    result = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    trajectory = result.trajectory
+    assert (trajectory.frame_status == FrameStatus.MEASURED).all()
+    assert (trajectory.marker_status == MarkerStatus.MEASURED).all()
+    error = errors(trajectory, q)
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(trajectory.pose_covariance), error)
+    # 360 degrees of freedom scatter by 0.075; the templates' own error adds (0.3e-3 / 4e-3)^2
+    assert 0.75 < squared.mean() / 6 < 1.3
+    # mean over 60 frames: sigma / 8, plus the template's 3e-4 px or 0.03 um
+    assert np.abs(error[:, :3].mean(axis=0)).max() < 0.25e-6
+    assert np.abs(error[:, 3:].mean(axis=0)).max() < np.radians(0.5e-3)
+    assert result.variance_factor < 1.15
+    assert result.acquisitions == 1
+    # angles are continuous, and the quaternion tells the same rotation
+    assert np.abs(np.diff(trajectory.q[:, 3:], axis=0)).max() < 0.3
+    R = frames.rotation_from_quaternion(trajectory.quaternion)
+    assert np.allclose(R, frames.rotation_from_euler(*trajectory.q[:, 3:].T), atol=1e-9)
+
+
+def test_stretches_side_by_side_give_the_same_as_one(rolling, rendered_pairs, monkeypatch):
+    monkeypatch.setattr("disctrack.tracking.MIN_PAIRS_PER_WORKER", 20)
+    images, _ = rolling
+    one = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    two = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=2)
+    sigma = np.sqrt(np.diagonal(one.trajectory.pose_covariance, axis1=1, axis2=2))
+    change = np.abs(errors(two.trajectory, one.trajectory.q)) / sigma
+    assert change.max() < 0.5  # noise laws measured on different frames weigh pixels a little differently
+    assert two.acquisitions == 2
+
+
+def test_lost_and_unreadable_pairs_are_gaps_with_a_reason_and_the_rest_is_measured(rolling, rendered_pairs):
+    images, q = rolling
+    images = images.copy()
+    readable = np.ones((N, 2), bool)
+    images[10:13] = 85  # something hides the disc
+    readable[20] = False, False
+    readable[30] = True, False
+    result = track(blocks_of(images, readable), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    status = result.trajectory.frame_status
+    assert (status[10:13] == FrameStatus.MARKERS_NOT_FOUND).all()
+    assert status[20] == FrameStatus.UNREADABLE
+    assert status[30] == FrameStatus.ONE_CAMERA
+    rest = np.delete(np.arange(N), [10, 11, 12, 20, 30])
+    assert (status[rest] == FrameStatus.MEASURED).all()
+    assert np.isnan(result.trajectory.q[[10, 11, 12, 20]]).all()
+    sigma = np.sqrt(np.diagonal(result.trajectory.pose_covariance, axis1=1, axis2=2))
+    assert (sigma[30, :3] > 5 * sigma[29, :3]).all()  # depth rests on the pattern's size in one image
+    assert (np.abs(errors(result.trajectory, q)[rest]) < 6 * sigma[rest]).all()
+    assert np.isfinite(result.trajectory.time).all()
+
+
+def test_a_hidden_dot_costs_sigma_not_truth(rolling, rendered_pairs):
+    images, q = rolling
+    images = images[:30].copy()
+    truth = replace(rendered_pairs, q=q, R=frames.rotation_from_euler(*q[:, 3:].T)).true_pixels
+    for i in range(10, 20):
+        u, v = np.round(truth[i, 0, 1]).astype(int)
+        images[i, 0, v - 18 : v + 18, u - 6 : u + 25] = 120
+    result = track(blocks_of(images), range(30), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    assert np.isnan(result.trajectory.markers_px[10:20, 0, 1]).all()
+    sigma = np.sqrt(np.diagonal(result.trajectory.pose_covariance, axis1=1, axis2=2))
+    assert (np.abs(errors(result.trajectory, q[:30])) < 6 * sigma).all()
+
+
+def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
+    images, _ = rolling
+    declared = rendered_pairs.disc.marker_centres_body.copy()
+    declared[2, 0] += 60e-6  # the declaration is wrong by what a printer does
+    wrong = replace(rendered_pairs.disc, marker_centres_body=declared)
+    found = track(blocks_of(images), range(N), rendered_pairs.rig, wrong, 1000.0)
+    shift = found.as_built.marker_shift
+    relative = shift[2] - np.delete(shift, 2, axis=0).mean(axis=0)
+    # the mean displacement and turn of the pattern are gauge: the other five move to balance
+    assert -75e-6 < relative[0] < -45e-6
+    assert found.variance_factor < 1.2
+    kept = track(
+        blocks_of(images), range(N), rendered_pairs.rig, wrong, 1000.0, settings=TrackingSettings(refine_markers=False)
+    )
+    assert kept.variance_factor > 20  # the fault is loud when it is not refined
+
+
+def test_good_dots_are_left_where_they_are_declared(rolling, rendered_pairs):
+    images, _ = rolling
+    result = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    assert (result.as_built.marker_shift == 0).all()
+    assert result.trajectory.disc is rendered_pairs.disc
+
+
+def test_images_of_another_size_are_refused(rolling, rendered_pairs):
+    images, _ = rolling
+    with pytest.raises(TrackingError, match=r"480 x 512 px, but the rig's left camera was calibrated at 512 x 512"):
+        track(blocks_of(images[:3, :, :, :480]), range(3), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+
+
+def test_a_recording_without_the_disc_is_an_error_that_says_what_was_seen(rendered_pairs):
+    table = np.full((3, 2, 512, 512), 85, np.uint8)
+    with pytest.raises(TrackingError, match=r"none of the pairs 0-2.*0 in the left and 0 in the right"):
+        track(blocks_of(table), range(3), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+
+
+def test_a_symmetric_layout_is_announced(rolling, rendered_pairs):
+    images, _ = rolling
+    four = replace(rendered_pairs.disc, marker_centres_body=rendered_pairs.disc.marker_centres_body[[0, 1, 3, 4]])
+    result = track(blocks_of(images[:12]), range(12), rendered_pairs.rig, four, 1000.0)
+    assert any("repeats every 180 deg" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("keep", [[0, 3], [0, 3, 6]])
+def test_dots_that_carry_no_pose_are_refused(rendered_pairs, keep):
+    centres = np.concatenate([rendered_pairs.disc.marker_centres_body, [[0.0, 0.0, 0.003]]])
+    poor = replace(rendered_pairs.disc, marker_centres_body=centres[keep])
+    with pytest.raises(TrackingError, match="at least three dots that are not on one line"):
+        track(blocks_of(np.zeros((2, 2, 512, 512), np.uint8)), range(2), rendered_pairs.rig, poor, 1000.0)
