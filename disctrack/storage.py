@@ -60,8 +60,17 @@ class Provenance:
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def write_trajectory(path: Path, trajectory: Trajectory, provenance: Provenance, overwrite: bool = False) -> None:
-    """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be."""
+def write_trajectory(
+    path: Path,
+    trajectory: Trajectory,
+    provenance: Provenance,
+    overwrite: bool = False,
+    findings: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be.
+
+    findings : what the run found out on the way (blur, noise, warnings, ...), of JSON's types; see `read_findings`
+    """
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists. Choose another name with -o, or replace it with --overwrite.")
     buffer = io.BytesIO()  # a disk that fills up fails in one plain write, not inside the HDF5 library
@@ -72,6 +81,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, provenance: Provenance,
         file["disc"].attrs.update(_disc_attributes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
         file.attrs.update(_root_attributes(trajectory, provenance))
+        file.attrs["findings"] = json.dumps(dict(findings or {}))
         file.attrs["complete"] = 1
     write_whole(path, buffer.getbuffer())
 
@@ -91,6 +101,12 @@ def read_provenance(path: Path) -> Provenance:
             settings=json.loads(file.attrs["settings"]),
             version=str(file.attrs["software_version"]),
         )
+
+
+def read_findings(path: Path) -> dict[str, Any]:
+    """What the run that wrote the file found out on the way. Raises TrajectoryFileError."""
+    with _Reading(path) as file:
+        return dict(json.loads(file.attrs["findings"]))
 
 
 def is_result_of(path: Path, provenance: Provenance) -> bool:

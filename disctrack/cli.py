@@ -1,0 +1,93 @@
+"""The command line: a shell round the stages, and the one place where an error becomes a line and an exit code.
+
+A new subcommand is a line in COMMANDS and a module in `disctrack.commands`, which is imported only when it is called.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from disctrack import __version__
+
+# In the order of the measurement: name -> (module, what it does).
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("disctrack.commands.run", "calibrate and track a recording: folder in, trajectory and pictures out"),
+    "calibrate": ("disctrack.commands.calibrate", "views of a chessboard -> stereo rig with covariance"),
+    "track": ("disctrack.commands.track", "recording and rig -> trajectory with covariance"),
+}
+
+DONE = 0
+FAILED = 1  # nothing was written; the reason is on stderr
+USAGE = 2  # argparse's own
+INCOMPLETE = 3  # the result is written, but some of the input could not be read
+INTERNAL = 70
+INTERRUPTED = 130
+
+TRACEBACK_VARIABLE = "DISCTRACK_TRACEBACK"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand; returns its exit code. Errors are one line on stderr."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        arguments = _parser(words).parse_args(words)
+        if arguments.command is None:
+            _parser([]).print_help()
+            return USAGE
+        return int(arguments.run(arguments))
+    except KeyboardInterrupt:
+        return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)
+    except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except Exception as error:
+        if os.environ.get(TRACEBACK_VARIABLE):
+            raise
+        return _tell(error)
+
+
+def _tell(error: Exception) -> int:
+    from disctrack.errors import DiscTrackError  # here, so that --help does not wait for what it imports
+
+    if isinstance(error, DiscTrackError):
+        return _say(str(error), FAILED)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return _say(f"{where}{error.strerror or error}.", FAILED)
+    if isinstance(error, MemoryError):
+        return _say("out of memory. Close other programs, or measure fewer frames at once with --frames.", FAILED)
+    kind = type(error).__name__
+    return _say(f"internal error ({kind}: {error}). {TRACEBACK_VARIABLE}=1 shows where; please report it.", INTERNAL)
+
+
+def _say(message: str, code: int) -> int:
+    print(f"disctrack: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Parser of all subcommands; only the one that was named is imported and gets its arguments."""
+    parser = argparse.ArgumentParser(
+        prog="disctrack",
+        description="Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.",
+        epilog=f"Exit codes: {DONE} done, {FAILED} failed, {USAGE} wrong usage, {INCOMPLETE} done but some input could "
+        f"not be read, {INTERRUPTED} interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"disctrack {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND")
+    named = next((word for word in words if not word.startswith("-")), None)
+    for name, (module, summary) in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
+        if name == named:
+            command = importlib.import_module(module)
+            command.add_arguments(subparser)
+            subparser.set_defaults(run=command.run)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

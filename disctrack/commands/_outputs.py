@@ -1,0 +1,180 @@
+"""What the commands share: options, checks before the work, files after it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import StereoRig
+from disctrack import storage, summary
+from disctrack.errors import OutputError, RecordingError
+from disctrack.pipeline import ImagePairs, check_rig, measure, trajectory_provenance
+from disctrack.progress import progress_bar
+from disctrack.recording import Recording
+from disctrack.trajectory import Trajectory
+from disctrack.whole_files import make_folder, output_error
+
+RESULTS = "results"
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """What a user chose about tracking and its outputs."""
+
+    overwrite: bool
+    csv: bool
+    figures: bool
+    video: bool
+    threads: int | None
+
+
+def add_track_options(parser: argparse.ArgumentParser) -> None:
+    """Options that `run` and `track` have in common."""
+    parser.add_argument("--frames", type=_frame_range, default=(None, None), metavar="A:B",
+                        help="measure frames A to B-1 only; the file keeps the recording's length")  # fmt: skip
+    parser.add_argument("--overwrite", action="store_true", help="replace results of other inputs or settings")
+    parser.add_argument("--csv", action="store_true", help="also write the trajectory as a table (mm, deg)")
+    parser.add_argument("--no-figures", action="store_true", help="no pictures")
+    parser.add_argument("--no-video", action="store_true", help="no overlay video")
+    parser.add_argument("--threads", type=_positive, help="threads that read images (default: one per core)")
+
+
+def add_calibration_options(parser: argparse.ArgumentParser) -> None:
+    """Options that `run` and `calibrate` have in common."""
+    group = parser.add_argument_group("calibration", "what is not given is chosen by held-out error")
+    group.add_argument("--distortion", default="auto", metavar="TERMS", help="Brown's terms, e.g. 'k1 k2'")
+    group.add_argument("--board", default="auto", metavar="SHAPE", help="flat, warped or free")
+
+
+def track_options(arguments: argparse.Namespace) -> TrackOptions:
+    """The options of `add_track_options` as they were given."""
+    return TrackOptions(
+        arguments.overwrite,
+        arguments.csv,
+        not arguments.no_figures,
+        not arguments.no_video,
+        arguments.threads,
+    )
+
+
+def _frame_range(text: str) -> tuple[int | None, int | None]:
+    first, colon, last = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return (int(first) if first else None), (int(last) if last else None)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no range; give first:last, e.g. 100:200 or 100:") from None
+
+
+def _positive(text: str) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number above 0")
+    return number
+
+
+def check_writable(folder: Path) -> None:
+    """Create the folder and a file in it for a moment: a long run must not end at the door. Raises OutputError."""
+    make_folder(folder)
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise output_error(folder, error) from error
+
+
+def track_into(
+    path: Path, recording: Recording, rig: StereoRig, rig_name: str, pairs: ImagePairs, options: TrackOptions
+) -> tuple[list[str], list[Path], bool]:
+    """Track, or reuse what is there; write trajectory, table, pictures, video.
+
+    returns : lines of the summary, files, and whether every image could be read
+    Raises OutputError if `path` holds something else and may not be replaced.
+    """
+    check_rig(rig, pairs, rig_name)
+    lines = [f"{'recording':<13} {recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz"]
+    trajectory, findings = None, {}
+    if path.exists() and not options.overwrite:
+        if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, None)):
+            raise OutputError(
+                f"{path}: exists, and is not the complete result of these images, settings and version. Keep it and "
+                "choose another place with -o, or replace it with --overwrite."
+            )
+        trajectory, findings = storage.read_trajectory(path), storage.read_findings(path)
+        lines.append(f"{'reused':<13} {path}: complete result of the same images, settings and version")
+    if trajectory is None:
+        with progress_bar("track", len(pairs), "pair") as advance:
+            measurement = measure(recording, rig, pairs, threads=options.threads, progress=advance)
+        trajectory, findings = measurement.trajectory, measurement.findings
+        provenance = trajectory_provenance(recording, rig, pairs, None)
+        storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, findings=findings)
+        lines.append(summary.speed_line(len(pairs), measurement.seconds))
+        fresh = True
+    else:
+        fresh = False
+    lines += summary.trajectory_lines(trajectory, findings)
+    files = [path, *_companions(path, trajectory, pairs, options, fresh)]
+    return lines, files, not findings.get("unreadable")
+
+
+def _companions(
+    path: Path, trajectory: Trajectory, pairs: ImagePairs, options: TrackOptions, fresh: bool
+) -> Iterator[Path]:
+    """Table, pictures and video beside the trajectory; those that a reused result already has are kept."""
+    prefix = "" if path.stem == "trajectory" else f"{path.stem}_"
+    if options.csv:
+        storage.write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
+        yield path.with_suffix(".csv")
+    if options.figures:
+        from disctrack.plots import FIGURES, save_figure
+
+        for name, make in FIGURES.items():
+            picture = path.with_name(f"{prefix}{name}.png")
+            if fresh or not picture.exists():
+                save_figure(make(trajectory), picture)
+            yield picture
+    if options.video:
+        video = path.with_name(f"{prefix}overlay.mp4")
+        if fresh or not video.exists():
+            _write_video(video, trajectory, pairs)
+        yield video
+
+
+def _write_video(path: Path, trajectory: Trajectory, pairs: ImagePairs) -> None:
+    from disctrack.overlay import shown_rows, write_overlay
+
+    rows = shown_rows(pairs.start, pairs.stop)
+    with progress_bar("video", len(rows), "frame") as advance:
+        write_overlay(path, ((row, _pair(pairs, row)) for row in rows), trajectory, advance)
+
+
+def _pair(pairs: ImagePairs, row: int) -> NDArray:
+    """Both images of a frame; one that cannot be read is black."""
+    width, height = pairs.left.image_size
+    images = np.zeros((2, height, width), np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
+    for image, reader in zip(images, (pairs.left, pairs.right), strict=True):
+        try:
+            reader.read(row, image)
+        except RecordingError:
+            image[...] = 0
+    return images
+
+
+def relative(path: Path) -> Path:
+    """The shorter of the path and its form relative to the working folder."""
+    try:
+        short = Path(os.path.relpath(path))
+    except ValueError:  # another drive
+        return path
+    return min(short, path, key=lambda p: len(str(p)))

@@ -1,0 +1,50 @@
+"""`disctrack run`: the whole measurement of one recording."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack run`."""
+    from disctrack.commands._outputs import add_calibration_options, add_track_options
+
+    parser.add_argument("recording", type=Path, help="folder with a recording.toml")
+    parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: RECORDING/results)")
+    add_track_options(parser)
+    add_calibration_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate unless the recording names a rig, track, draw; returns the exit code."""
+    from disctrack import pipeline, summary
+    from disctrack.cli import DONE, INCOMPLETE
+    from disctrack.commands import _calibration as calibration
+    from disctrack.commands import _outputs as outputs
+    from disctrack.recording import read_recording
+    from disctrack.whole_files import write_whole
+
+    recording = read_recording(arguments.recording)
+    folder = arguments.output or recording.folder / outputs.RESULTS
+    pairs = pipeline.open_pairs(recording, arguments.frames)
+    options = outputs.track_options(arguments)
+    outputs.check_writable(folder)
+    if recording.rig_file is not None:
+        rig_name = str(recording.rig_file)
+        calibrated = calibration.given_rig(recording.rig_file)
+    else:
+        rig_name = "the rig from this recording's own calibration views"
+        source = calibration.source_of(recording, calibration.settings_of(arguments))
+        calibrated = calibration.calibrate_into(folder / "rig.h5", source, options.overwrite, options.figures)
+    lines, files, whole = outputs.track_into(
+        folder / "trajectory.h5", recording, calibrated.rig, rig_name, pairs, options
+    )
+    text = [*calibrated.lines, *lines]
+    write_whole(folder / "summary.txt", ("\n".join(text) + "\n").encode())
+    files = [*calibrated.files, *files, folder / "summary.txt"]
+    print("\n".join([*text, *summary.file_lines([outputs.relative(file) for file in files])]))
+    if not whole:
+        print("disctrack: some images could not be read; their frames have no answer (see above).", file=sys.stderr)
+    return DONE if whole else INCOMPLETE

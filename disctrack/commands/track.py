@@ -1,0 +1,45 @@
+"""`disctrack track`: a recording and a rig become a trajectory."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack track`."""
+    from disctrack.commands._outputs import add_track_options
+
+    parser.add_argument("recording", type=Path, help="folder with a recording.toml")
+    parser.add_argument("--rig", type=Path, help="rig file (default: the recording's own, or results/rig.h5)")
+    parser.add_argument("-o", "--output", type=Path, help="trajectory file (default: RECORDING/results/trajectory.h5)")
+    add_track_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Track; returns the exit code."""
+    from calibration.rig_file import read_rig
+    from disctrack import pipeline, summary
+    from disctrack.cli import DONE, INCOMPLETE
+    from disctrack.commands import _outputs as outputs
+    from disctrack.errors import RecordingError
+    from disctrack.recording import read_recording
+
+    recording = read_recording(arguments.recording)
+    path = arguments.output or recording.folder / outputs.RESULTS / "trajectory.h5"
+    rig_file = arguments.rig or recording.rig_file or recording.folder / outputs.RESULTS / "rig.h5"
+    if not rig_file.is_file():
+        raise RecordingError(
+            f"{rig_file}: no such rig file. Calibrate first (disctrack calibrate {arguments.recording} -o rig.h5), "
+            "or name the rig with --rig."
+        )
+    rig = read_rig(rig_file)
+    pairs = pipeline.open_pairs(recording, arguments.frames)
+    outputs.check_writable(path.parent)
+    options = outputs.track_options(arguments)
+    lines, files, whole = outputs.track_into(path, recording, rig, str(rig_file), pairs, options)
+    print("\n".join([*lines, *summary.file_lines([outputs.relative(file) for file in files])]))
+    if not whole:
+        print("disctrack: some images could not be read; their frames have no answer (see above).", file=sys.stderr)
+    return DONE if whole else INCOMPLETE

@@ -1,0 +1,188 @@
+"""The measurement from end to end: a recording's files -> rig -> trajectory, with what is needed to reuse results."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibration.camera import StereoRig
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.readers import FrameReader, open_frames
+from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, iter_pair_blocks
+from disctrack.recording import Recording
+from disctrack.storage import Provenance
+from disctrack.tracking import TrackingSettings, track
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class ImagePairs:
+    """The frames of a recording that are to be measured: both cameras, checked to belong together."""
+
+    left: FrameReader
+    right: FrameReader
+    start: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know about how the frames are read."""
+        return (*self.left.notes, *self.right.notes)
+
+    def inputs(self) -> dict[str, str]:
+        """SHA-256 of each camera's frames; what was read already is not read again."""
+        return {
+            f"{name} frames": reader.content_sha256(self.start, self.stop)
+            for name, reader in zip(CAMERAS, (self.left, self.right), strict=True)
+        }
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A tracked recording and what the run found out on the way."""
+
+    trajectory: Trajectory
+    unreadable: tuple[Unreadable, ...]
+    findings: dict[str, Any]  # blur, noise, warnings, ...: of JSON's types, stored with the result
+    seconds: float  # spent on reading and tracking
+
+
+def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:
+    """Open both cameras. frames: first and one past the last frame to measure, None for the recording's ends.
+
+    Raises RecordingError if images are missing, do not belong together, or the range holds no frame.
+    """
+    left, right = (
+        open_frames(pattern, recording.folder, camera)
+        for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
+    )
+    check_pair(left, right)
+    start, stop, _ = slice(*frames).indices(len(left))
+    if stop <= start:
+        raise RecordingError(
+            f"{recording.folder}: --frames {frames[0]}:{frames[1]} holds no frame; the recording has {len(left)}."
+        )
+    return ImagePairs(left, right, start, stop)
+
+
+def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
+    """Raise RecordingError unless the rig was calibrated at the recording's image size."""
+    for camera, reader, name in zip(rig.cameras, (pairs.left, pairs.right), CAMERAS, strict=True):
+        if camera.image_size != reader.image_size:
+            (w, h), (wr, hr) = reader.image_size, camera.image_size
+            raise RecordingError(
+                f"{reader.describe(pairs.start)}: {name} images are {w} x {h} px, but {rig_name} was calibrated with "
+                f"{wr} x {hr} px. Calibrate with views of the recording's own size, or name its own rig."
+            )
+
+
+def measure(
+    recording: Recording,
+    rig: StereoRig,
+    pairs: ImagePairs,
+    settings: TrackingSettings | None = None,
+    threads: int | None = None,
+    progress: Progress = lambda n: None,
+) -> Measurement:
+    """Track the disc through the pairs; the trajectory has the length of the recording.
+
+    Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
+    Raises TrackingError if the disc is found in no frame.
+    """
+    unreadable: list[Unreadable] = []
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=threads):
+            unreadable.extend(block.unreadable)
+            yield block
+
+    stamps = pairs.left.timestamps
+    began = time.perf_counter()
+    tracking = track(
+        read_blocks,
+        range(pairs.start, pairs.stop),
+        rig,
+        recording.disc,
+        recording.frame_rate,
+        gravity=recording.gravity,
+        settings=settings,
+        timestamps=None if stamps is None else stamps[pairs.start : pairs.stop],
+        progress=progress,
+    )
+    seconds = time.perf_counter() - began
+    findings = {
+        "notes": list(pairs.notes),
+        "warnings": list(tracking.warnings),
+        "unreadable": [image.reason for image in unreadable],
+        "blur_px": list(tracking.blur_px),
+        "noise": [_json_fields(noise) for noise in tracking.noise],
+        "variance_factor": tracking.variance_factor,
+        "acquisitions": tracking.acquisitions,
+    }
+    trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start)
+    return Measurement(trajectory, tuple(unreadable), findings, seconds)
+
+
+_FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}
+
+
+def at_full_length(part: Trajectory, n: int, start: int) -> Trajectory:
+    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED."""
+    length = len(part)
+    if length == n:
+        return part
+    whole: dict[str, Any] = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, np.ndarray):
+            fill = _FILL.get(field.name, np.nan if value.dtype.kind == "f" else 0)
+            whole[field.name] = np.full((n, *value.shape[1:]), fill, value.dtype)
+            whole[field.name][start : start + length] = value
+    whole["frame"] = np.arange(n)
+    whole["time"] = np.arange(n) / part.frame_rate
+    whole["time"][start : start + length] = part.time
+    return dataclasses.replace(part, **whole)
+
+
+def trajectory_provenance(
+    recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
+) -> Provenance:
+    """What the trajectory is made from; reads the images' content where it was not read yet."""
+    return Provenance(
+        recording=recording.name,
+        inputs={**pairs.inputs(), "rig": rig_sha256(rig)},
+        settings={
+            "recording": dict(recording.declared),
+            "frames": [pairs.start, pairs.stop],
+            "tracking": dataclasses.asdict(settings or TrackingSettings()),
+        },
+    )
+
+
+def rig_sha256(rig: StereoRig) -> str:
+    """SHA-256 (hex) of a rig's numbers, to the last bit."""
+    digest = hashlib.sha256()
+    for camera in rig.cameras:
+        digest.update(camera.parameters.tobytes() + np.array(camera.image_size, np.int64).tobytes())
+    for part in (rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance):
+        digest.update(np.ascontiguousarray(part, float).tobytes())
+    digest.update(bytes([rig.world_is_table]))
+    return digest.hexdigest()
+
+
+def _json_fields(item: Any) -> dict[str, Any]:
+    """A dataclass as JSON's types, arrays as lists."""
+    fields = dataclasses.asdict(item)
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}

@@ -1,0 +1,107 @@
+"""What a run tells its user at the end, in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration import StereoCalibration
+from disctrack.frames import CAMERAS
+from disctrack.trajectory import FrameStatus, Trajectory
+
+Array = NDArray[np.float64]
+_SHOWN_RANGES = 6
+
+
+def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) -> list[str]:
+    """Views used, RMS, baseline, what the uncertainty is, verdict, what was left out and why."""
+    n, assessment = len(found.view_names) + len(problems), found.assessment
+    left, right = found.rms_per_camera_px
+    used = n - len(problems) - len(found.rejected_views)
+    lines = [
+        _line(
+            "calibration",
+            f"{used} of {n} views, rms {found.rms_px:.4f} px (left {left:.4f}, right {right:.4f}), "
+            f"baseline {found.rig.baseline * 1e3:.3f} mm",
+        ),
+        _line("", assessment.verdict),
+    ]
+    corners = len(found.rejected_corners())
+    if corners:
+        lines.append(_line("", f"{corners} corners were found but not used"))
+    lines += [_line("", f"view {view} is not used: {why}") for view, why in found.rejected_views.items()]
+    lines += [_line("warning", text) for text in (*problems, *found.warnings)]
+    return lines
+
+
+def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> list[str]:
+    """Frames measured and lost with the reasons, sigmas, reprojection error, warnings."""
+    lines = [*_frame_lines(trajectory)]
+    if trajectory.measured.any():
+        lines += [
+            _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
+            _sigma_line("", trajectory.calibration_sigma, "from the calibration, common to all frames"),
+            _fit_line(trajectory),
+        ]
+    lines += [_line("image", reason) for reason in list(findings.get("unreadable", []))[:_SHOWN_RANGES]]
+    lines += [_line("note", note) for note in findings.get("notes", [])]
+    lines += [_line("warning", warning) for warning in findings.get("warnings", [])]
+    return lines
+
+
+def file_lines(files: Sequence[Path]) -> list[str]:
+    """Where the results are."""
+    return [_line("files" if i == 0 else "", str(file)) for i, file in enumerate(files)]
+
+
+def speed_line(pairs: int, seconds: float) -> str:
+    """Pairs per second, reading included."""
+    return _line("speed", f"{pairs / max(seconds, 1e-9):.0f} pairs/s ({seconds:.2f} s with reading the images)")
+
+
+def _line(head: str, text: str) -> str:
+    return f"{head:<13} {text}"
+
+
+def _frame_lines(trajectory: Trajectory) -> Iterable[str]:
+    processed = trajectory.frame_status != FrameStatus.NOT_PROCESSED
+    measured = int(np.sum(trajectory.measured))
+    of = f" of {len(trajectory)} frames" if not processed.all() else ""
+    yield _line("frames", f"{measured} measured, {int(processed.sum()) - measured} lost{of}")
+    for status in FrameStatus:
+        rows = np.flatnonzero(trajectory.frame_status == status)
+        if status != FrameStatus.MEASURED and rows.size:
+            yield _line("", f"{rows.size} {status.sentence} (frames {_ranges(trajectory.frame[rows])})")
+
+
+def _ranges(numbers: NDArray[np.int64]) -> str:
+    """Numbers as ranges: 3, 7-9, 12."""
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    shown = [f"{part[0]}" if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts[:_SHOWN_RANGES]]
+    return ", ".join(shown) + (f", ... {len(parts) - _SHOWN_RANGES} more" if len(parts) > _SHOWN_RANGES else "")
+
+
+def _sigma_line(head: str, sigma: Array, what: str) -> str:
+    known = sigma[np.isfinite(sigma).all(axis=1)]
+    if not len(known):
+        return _line(head, f"not known ({what})")
+    x, y, z = np.median(known[:, :3], axis=0) * 1e6
+    psi, theta, phi = np.degrees(np.median(known[:, 3:], axis=0)) * 1e3
+    return _line(
+        head, f"x {x:.2f}  y {y:.2f}  z {z:.2f} um   psi {psi:.1f}  theta {theta:.2f}  phi {phi:.1f} mdeg  ({what})"
+    )
+
+
+def _fit_line(trajectory: Trajectory) -> str:
+    rms = trajectory.reprojection_rms_px
+    cameras = [
+        f"{name} {np.sqrt(np.nanmean(rms[:, i] ** 2)):.4f} px" if np.isfinite(rms[:, i]).any() else f"{name} not used"
+        for i, name in enumerate(CAMERAS)
+    ]
+    chi = trajectory.reduced_chi_square
+    median = f"{np.nanmedian(chi):.2f}" if np.isfinite(chi).any() else "not known"
+    return _line("reprojection", f"{', '.join(cameras)}; reduced chi-square {median} (median; 1 is expected)")

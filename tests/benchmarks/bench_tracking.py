@@ -1,0 +1,147 @@
+"""Speed of reading and tracking beside decoding alone and beside a plain OpenCV + SciPy script.
+
+    python tests/benchmarks/bench_tracking.py RECORDING [--rig RIG] [--threads N] [--repeats N]
+
+Prints pairs per second and ratios. Every figure is the best of the repeats, so that other work on the machine counts
+for little; ratios are taken within one run. Not a test: nothing fails here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from calibration.camera import StereoRig
+from calibration.rig_file import read_rig
+from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
+from disctrack.pipeline import ImagePairs, open_pairs
+from disctrack.readers.blocks import PairBlock, default_threads, iter_pair_blocks
+from disctrack.recording import Recording, read_recording
+from disctrack.tracking import Tracking, track
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--rig", type=Path, help="default: RECORDING/results/rig.h5")
+    parser.add_argument("--threads", type=int, default=default_threads())
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    recording = read_recording(arguments.recording)
+    rig = read_rig(arguments.rig or recording.rig_file or recording.folder / "results" / "rig.h5")
+    pairs = open_pairs(recording)
+    cv2.setNumThreads(1)
+    report(recording, rig, pairs, arguments.threads, arguments.repeats)
+
+
+def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int, repeats: int) -> None:
+    n = len(pairs)
+    memory = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(n)])
+    from_memory: list[Tracking] = []
+
+    def track_memory(workers: int) -> None:
+        from_memory[:] = [run_track(recording, rig, n, lambda a, b: memory_blocks(memory, a, b), workers)]
+
+    def track_files() -> None:
+        run_track(recording, rig, n, lambda a, b: iter_pair_blocks(pairs.left, pairs.right, a, b, threads=threads), 1)
+
+    track_memory(1)  # compiles
+    seconds = {
+        f"decode alone: cv2.imread, {threads} threads": best(lambda: decode_alone(pairs, threads), repeats),
+        f"our reader alone, {threads} threads": best(lambda: read_alone(pairs, threads), repeats),
+        f"reading + tracking, {threads} reading threads": best(track_files, repeats),
+        "tracking, frames in memory, 1 worker": best(lambda: track_memory(1), repeats),
+        f"tracking, frames in memory, {threads} workers": best(lambda: track_memory(threads), repeats),
+        "plain OpenCV + SciPy, frames in memory": best(lambda: plain_script(recording, rig, memory, from_memory[0]), 1),
+    }
+    print(f"{recording.name}: {n} pairs of {memory.shape[3]} x {memory.shape[2]} px, {threads} threads")
+    for name, value in seconds.items():
+        print(f"  {name:<48} {n / value:8.0f} pairs/s")
+    decode, reader, files, one, many, plain = seconds.values()
+    print(f"  our reader / decode alone                        {reader / decode:8.2f}   (time)")
+    print(f"  reading + tracking / decode alone                {files / decode:8.2f}   (time; 1.25 is the aim)")
+    print(f"  plain script / ours, frames in memory, 1 worker  {plain / one:8.1f}   (time)")
+    print(f"  {threads} workers / 1 worker                            {one / many:8.2f}   (speed)")
+    print(f"  largest memory, {memory.nbytes >> 20} MB of frames held included  "
+          f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10:8d} MB")  # fmt: skip
+
+
+def best(action: Callable[[], object], repeats: int) -> float:
+    """Shortest time of `repeats` runs [s]."""
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def run_track(recording: Recording, rig: StereoRig, n: int, read_blocks: Callable, workers: int) -> Tracking:
+    return track(read_blocks, range(n), rig, recording.disc, recording.frame_rate, workers=workers)
+
+
+def memory_blocks(memory: np.ndarray, start: int, stop: int, block: int = 64):
+    for first in range(start, stop, block):
+        last = min(first + block, stop)
+        yield PairBlock(np.arange(first, last), memory[first:last], ())
+
+
+def decode_alone(pairs: ImagePairs, threads: int) -> None:
+    files = [str(file) for two in zip(pairs.left.files, pairs.right.files, strict=True) for file in two]
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(lambda file: cv2.imread(file, cv2.IMREAD_UNCHANGED), files):
+            pass
+
+
+def read_alone(pairs: ImagePairs, threads: int) -> None:
+    for _ in iter_pair_blocks(pairs.left, pairs.right, threads=threads):
+        pass
+
+
+def plain_script(recording: Recording, rig: StereoRig, memory: np.ndarray, start: Tracking) -> np.ndarray:
+    """What one writes in an afternoon: threshold, contours, moments, least squares per frame; start pose given."""
+    disc = recording.disc
+    trajectory = start.trajectory
+    R = rotation_from_quaternion(trajectory.quaternion[0])
+    p = np.concatenate([trajectory.q[0, :3], vector_from_rotation(R)])
+    poses = np.full((len(memory), 6), np.nan)
+
+    def projected(p: np.ndarray) -> np.ndarray:
+        return rig.project(disc.marker_centres_body @ rotation_from_vector(p[3:]).T + p[:3])
+
+    velocity = np.zeros(6)
+    for i, images in enumerate(memory):
+        expected = projected(p + velocity)
+        observed = np.full_like(expected, np.nan)
+        for camera in (0, 1):
+            _, dark = cv2.threshold(images[camera], 0, 255, cv2.THRESH_BINARY_INV | cv2.THRESH_OTSU)
+            contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+            blobs = []
+            for contour in contours:
+                moments = cv2.moments(contour)
+                if 50 < moments["m00"] < 5000:
+                    blobs.append((moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]))
+            if blobs:
+                distance = np.linalg.norm(expected[camera][:, None] - np.array(blobs), axis=-1)
+                nearest = distance.argmin(axis=1)
+                close = distance[np.arange(len(nearest)), nearest] < 8
+                observed[camera][close] = np.array(blobs)[nearest[close]]
+        seen = np.isfinite(observed)
+        if seen.sum() < 6:
+            continue
+        fit = least_squares(lambda p, o=observed, s=seen: (projected(p) - o)[s], p + velocity)
+        velocity = fit.x - p if i else velocity
+        p = poses[i] = fit.x
+    return poses
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""A short real recording and a rig that was calibrated once, for tests that go through the command line."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from disctrack.cli import main
+
+SHORT = 24  # frames: enough for the noise to be measured
+
+
+@pytest.fixture(scope="session")
+def source_recording(request) -> Path:
+    """The reference recording, or the clip that comes with the sources."""
+    for name in ("shared_data", "sample_clip"):
+        try:
+            folder = request.getfixturevalue(name)
+        except pytest.skip.Exception:
+            continue
+        return folder / "rec_a" if name == "shared_data" else folder
+    pytest.skip("neither ../shared/data nor sample_data/clip is there")
+
+
+@pytest.fixture(scope="session")
+def short_recording(source_recording, tmp_path_factory) -> Path:
+    """The first frames of it, with all calibration views; not to be changed by a test."""
+    folder = tmp_path_factory.mktemp("recordings") / "short"
+    shutil.copytree(source_recording / "calibration", folder / "calibration")
+    shutil.copy(source_recording / "recording.toml", folder)
+    for camera in ("left", "right"):
+        (folder / camera).mkdir()
+        for file in sorted((source_recording / camera).iterdir())[:SHORT]:
+            shutil.copy(file, folder / camera)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def rig_file(short_recording, tmp_path_factory) -> Path:
+    """Rig of the short recording."""
+    path = tmp_path_factory.mktemp("rig") / "rig.h5"
+    assert main(["calibrate", str(short_recording), "-o", str(path), "--no-figures"]) == 0
+    return path
+
+
+@pytest.fixture
+def recording(short_recording, rig_file, tmp_path) -> Path:
+    """A copy of the short recording that names the rig file; a test may damage it."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for camera in ("left", "right"):
+        (folder / camera).mkdir()
+        for file in (short_recording / camera).iterdir():
+            os.link(file, folder / camera / file.name)
+    text = (short_recording / "recording.toml").read_text()
+    start, end = text.index("[calibration]"), text.index("[gravity]")
+    rig = rig_file.as_posix()
+    (folder / "recording.toml").write_text(f'{text[:start]}[calibration]\nrig = "{rig}"\n\n{text[end:]}')
+    return folder

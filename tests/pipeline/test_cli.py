@@ -1,0 +1,136 @@
+"""The commands on a real recording: one line runs the measurement, a second run reuses it, and the summary tells."""
+
+import csv
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.cli import COMMANDS, main
+from disctrack.storage import read_findings, read_trajectory
+from disctrack.trajectory import FrameStatus
+
+QUICK = ["--no-figures", "--no-video"]
+
+
+def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys):
+    results = tmp_path / "results"
+    assert main(["run", str(short_recording), "-o", str(results), "--csv"]) == 0
+    output, errors = capsys.readouterr()
+    for word in ("views", "rms", "baseline", "measured", "sigma", "pairs/s", "trajectory.h5", "overlay.mp4"):
+        assert word in output
+    assert errors == ""  # no progress bar where stderr is no terminal
+    trajectory = read_trajectory(results / "trajectory.h5")
+    assert (trajectory.frame_status == FrameStatus.MEASURED).all()
+    # the height of the centre follows from the nutation in rolling contact (z = r sin theta + h cos theta)
+    theta, disc = trajectory.q[:, 4], trajectory.disc
+    height = disc.radius * np.sin(theta) + disc.half_thickness * np.cos(theta)
+    # lab frame within the paper's own claim of 5 um
+    assert_allclose(trajectory.q[:, 2], height, atol=5e-6)
+    with (results / "trajectory.csv").open() as stream:
+        assert len(list(csv.DictReader(stream))) == len(trajectory)
+    for picture in ("coordinates", "reprojection", "dots", "calibration_residuals", "calibration_coverage"):
+        image = cv2.imread(str(results / f"{picture}.png"))
+        assert image.std() > 5  # not blank
+    video = cv2.VideoCapture(str(results / "overlay.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == len(trajectory)
+    video.release()
+    assert (results / "summary.txt").read_text().splitlines()[0] in output
+
+    before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
+    (results / "dots.png").unlink()
+    assert main(["run", str(short_recording), "-o", str(results)]) == 0
+    output = capsys.readouterr().out
+    assert output.count("reused") == 2
+    assert (results / "dots.png").exists()
+    after = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
+    for name in ("rig.h5", "trajectory.h5", "overlay.mp4"):
+        assert after[name] == before[name]
+
+
+def test_results_go_into_the_recording_by_default(recording, capsys):
+    assert main(["run", str(recording), *QUICK]) == 0
+    assert (recording / "results" / "trajectory.h5").exists()
+    assert str(Path("results") / "trajectory.h5") in capsys.readouterr().out
+
+
+def test_track_takes_a_range_of_frames_and_keeps_the_length(recording, rig_file, tmp_path):
+    path = tmp_path / "part.h5"
+    assert main(["track", str(recording), "--rig", str(rig_file), "-o", str(path), "--frames", "5:19", *QUICK]) == 0
+    trajectory = read_trajectory(path)
+    assert len(trajectory) == 24
+    assert (trajectory.frame_status[5:19] == FrameStatus.MEASURED).all()
+    assert (np.delete(trajectory.frame_status, range(5, 19)) == FrameStatus.NOT_PROCESSED).all()
+    assert np.isnan(np.delete(trajectory.q, range(5, 19), axis=0)).all()
+    assert_allclose(trajectory.time, np.arange(24) / trajectory.frame_rate, rtol=1e-12)
+
+
+def test_the_result_does_not_depend_on_the_number_of_reading_threads(recording, tmp_path):
+    for threads in ("1", "3"):
+        path = tmp_path / f"{threads}.h5"
+        assert main(["track", str(recording), "-o", str(path), "--threads", threads, *QUICK]) == 0
+    one, three = (read_trajectory(tmp_path / f"{threads}.h5") for threads in "13")
+    np.testing.assert_array_equal(one.q, three.q)
+
+
+def test_calibrate_without_a_recording(shared_data, tmp_path, capsys):
+    folder = shared_data / "opencv_stereo_chessboard"
+    path = tmp_path / "rig.h5"
+    words = ["calibrate", "--left", str(folder / "left*.jpg"), "--right", str(folder / "right*.jpg")]
+    model = ["--distortion", "k1 k2", "--board", "flat", "--no-figures"]  # choosing by held-out error takes longer
+    assert main([*words, "--corners", "9x6", "--square-mm", "25", "-o", str(path), *model]) == 0
+    output = capsys.readouterr().out
+    baseline = float(output.split("baseline")[1].split("mm")[0])
+    assert 83.1 < baseline < 83.4  # reference.json beside the photographs: 83.2-83.3
+    assert path.exists()
+
+
+def test_a_changed_image_is_measured_anew_only_when_told(recording, capsys):
+    assert main(["run", str(recording), *QUICK]) == 0
+    file = recording / "left" / "000003.png"
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    file.unlink()  # it is linked to the original
+    cv2.imwrite(str(file), image ^ 1)
+    assert main(["run", str(recording), *QUICK]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["run", str(recording), "--overwrite", *QUICK]) == 0
+    assert "reused" not in capsys.readouterr().out
+
+
+def test_an_unreadable_image_is_one_lost_camera_and_the_exit_code_says_so(recording, capsys):
+    (recording / "right" / "000007.png").unlink()
+    (recording / "right" / "000007.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
+    for camera in ("left", "right"):
+        (recording / camera / "000011.png").unlink()
+        (recording / camera / "000011.png").write_bytes(b"")
+    assert main(["run", str(recording), *QUICK]) == 3
+    output, errors = capsys.readouterr()
+    assert "could not be read" in errors
+    assert "000007.png" in output
+    trajectory = read_trajectory(recording / "results" / "trajectory.h5")
+    assert trajectory.frame_status[11] == FrameStatus.UNREADABLE
+    assert trajectory.frame_status[7] == FrameStatus.ONE_CAMERA
+    others = np.delete(trajectory.frame_status, [7, 11])
+    assert (others == FrameStatus.MEASURED).all()
+    assert len(read_findings(recording / "results" / "trajectory.h5")["unreadable"]) == 3
+    assert main(["run", str(recording), *QUICK]) == 3  # reused, and still incomplete
+
+
+def test_help_is_there_for_every_command_and_comes_at_once():
+    best = float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-m", "disctrack", "--help"], capture_output=True, text=True, check=True)
+        best = min(best, time.perf_counter() - start)
+    for name in COMMANDS:
+        assert name in done.stdout
+    assert best < 1.0  # 0.06 s where this was written; numpy alone would double it, OpenCV and SciPy make it 1 s
+    for name in COMMANDS:
+        with pytest.raises(SystemExit) as stop:
+            main([name, "--help"])
+        assert stop.value.code == 0

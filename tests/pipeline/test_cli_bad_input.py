@@ -1,0 +1,252 @@
+"""Bad input: one line that says where, what and what to do; an exit code; nothing lost, nothing half-written."""
+
+import errno
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from disctrack import whole_files
+from disctrack.cli import main
+from disctrack.storage import read_trajectory
+
+QUICK = ["--no-figures", "--no-video"]
+
+
+def failure(capsys, *words) -> str:
+    """The one line that a failing command prints."""
+    assert main([str(word) for word in words]) == 1
+    errors = capsys.readouterr().err
+    assert errors.startswith("disctrack: ")
+    assert errors.count("\n") == 1
+    assert "Traceback" not in errors
+    return errors
+
+
+def edit(recording: Path, written: str, found: str) -> None:
+    text = (recording / "recording.toml").read_text()
+    assert written in text
+    (recording / "recording.toml").write_text(text.replace(written, found, 1))
+
+
+def replace(file: Path, image: np.ndarray) -> None:
+    """Write another image; the file is linked to the original, which must stay."""
+    file.unlink()
+    assert cv2.imwrite(str(file), image)
+
+
+def test_a_folder_that_is_not_there(tmp_path, capsys):
+    assert "no such folder" in failure(capsys, "run", tmp_path / "nowhere")
+
+
+def test_a_misspelt_key(recording, capsys):
+    edit(recording, "frame_rate_hz", "framerate_hz")
+    assert "Did you mean 'frame_rate_hz'?" in failure(capsys, "run", recording)
+
+
+def test_a_missing_key(recording, capsys):
+    edit(recording, "mass_g = 209.69", "")
+    assert "[disc] mass_g is missing" in failure(capsys, "run", recording)
+
+
+def test_no_image_matched(recording, capsys):
+    edit(recording, '"left/*.png"', '"left/*.tif"')
+    message = failure(capsys, "run", recording)
+    assert "no image matched for the left camera" in message
+    assert "000000.png" in message
+
+
+def test_left_and_right_of_different_number(recording, capsys):
+    (recording / "right" / "000023.png").unlink()
+    assert re.search("left has 24 frames.*right has 23", failure(capsys, "run", recording))
+
+
+def test_left_and_right_of_different_size(recording, capsys):
+    for file in (recording / "right").iterdir():
+        replace(file, cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[:400])
+    assert re.search("512 x 512 px.*512 x 400 px", failure(capsys, "run", recording))
+
+
+def test_colour_images(recording, rng, capsys):
+    for camera in ("left", "right"):
+        for file in (recording / camera).iterdir():
+            replace(file, rng.integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    assert "colour" in failure(capsys, "run", recording)
+
+
+def test_grey_stored_as_colour_and_sixteen_bits_are_measured_and_said(recording, capsys):
+    poses = []
+    for change in (lambda g: g, lambda g: cv2.cvtColor(g, cv2.COLOR_GRAY2BGR), lambda g: g.astype(np.uint16) * 16):
+        for camera in ("left", "right"):
+            for file in sorted((recording / camera).iterdir()):
+                grey = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+                grey = grey[..., 0] if grey.ndim == 3 else grey
+                replace(file, change(grey))
+        assert main(["run", str(recording), "--overwrite", *QUICK]) == 0
+        poses.append((read_trajectory(recording / "results" / "trajectory.h5"), capsys.readouterr().out))
+    (plain, _), (colour, said_colour), (deep, said_deep) = poses
+    np.testing.assert_array_equal(colour.q, plain.q)
+    assert "channels of equal value" in said_colour
+    assert "16 bits" in said_deep
+    # the same grey values on a finer scale: the pose may move by what the noise model's constants cost, not more
+    assert np.nanmax(np.abs(deep.q - plain.q)[:, :3]) < 1e-6
+
+
+def test_a_rig_of_another_image_size(recording, rig_file, tmp_path, capsys):
+    for camera in ("left", "right"):
+        for file in (recording / camera).iterdir():
+            replace(file, cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[:400])
+    message = failure(capsys, "track", recording, "--rig", rig_file, "-o", tmp_path / "t.h5")
+    assert "512 x 400 px" in message
+    assert "512 x 512 px" in message
+
+
+def test_a_rig_file_that_is_none(recording, tmp_path, capsys):
+    assert "no such rig file" in failure(capsys, "track", recording, "--rig", tmp_path / "nowhere.h5")
+    (tmp_path / "bad.h5").write_bytes(b"nothing")
+    assert "bad.h5" in failure(capsys, "track", recording, "--rig", tmp_path / "bad.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1.0
+    assert "other.h5" in failure(capsys, "track", recording, "--rig", tmp_path / "other.h5")
+
+
+def test_markers_never_found(recording, capsys):
+    for camera in ("left", "right"):
+        for file in (recording / camera).iterdir():
+            replace(file, np.full((512, 512), 90, np.uint8))
+    assert "found in none" in failure(capsys, "run", recording)
+    assert not (recording / "results" / "trajectory.h5").exists()
+
+
+def test_an_output_that_exists(recording, tmp_path, capsys):
+    path = tmp_path / "mine.h5"
+    path.write_text("something dear")
+    assert "--overwrite" in failure(capsys, "track", recording, "-o", path)
+    assert path.read_text() == "something dear"
+
+
+@pytest.mark.parametrize("range_", ["30:40", "9:5"])
+def test_a_range_without_frames(recording, capsys, range_):
+    assert "holds no frame; the recording has 24" in failure(capsys, "track", recording, "--frames", range_)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["track"],
+        ["measure", "x"],
+        ["track", "x", "--frames", "abc"],
+        ["calibrate", "--corners", "9"],
+        ["calibrate", "--square-mm", "-3"],
+    ],
+)
+def test_wrong_usage_is_explained_with_exit_code_2(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 2
+    assert "usage:" in capsys.readouterr().err
+
+
+def test_calibrate_without_anything_to_calibrate_from(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert "--left, --right, --corners, --square-mm missing" in failure(capsys, "calibrate")
+    words = ("calibrate", "--left", "l*.png", "--right", "r*.png", "--corners", "9x6", "--square-mm", "8")
+    assert "no image matched for the left camera" in failure(capsys, *words)
+
+
+def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsys):
+    for camera in ("left", "right"):
+        (tmp_path / "calibration" / camera).mkdir(parents=True)
+        for file in (short_recording / "calibration" / camera).iterdir():
+            os.link(file, tmp_path / "calibration" / camera / file.name)
+        os.symlink(short_recording / camera, tmp_path / camera)
+    os.link(short_recording / "recording.toml", tmp_path / "recording.toml")
+    (tmp_path / "calibration" / "right" / "04.png").unlink()
+    message = failure(capsys, "calibrate", tmp_path)
+    assert "20 left and 19 right" in message
+    assert "left 04.png" in message
+
+
+def test_a_table_view_that_is_damaged_or_not_there(short_recording, tmp_path, capsys):
+    for camera in ("left", "right"):
+        (tmp_path / "calibration" / camera).mkdir(parents=True)
+        for file in (short_recording / "calibration" / camera).iterdir():
+            os.link(file, tmp_path / "calibration" / camera / file.name)
+    text = (short_recording / "recording.toml").read_text()
+    (tmp_path / "recording.toml").write_text(text.replace("view = 0", "view = 20"))
+    assert "there are 20 calibration views" in failure(capsys, "calibrate", tmp_path)
+    (tmp_path / "recording.toml").write_text(text)
+    (tmp_path / "calibration" / "left" / "00.png").unlink()
+    (tmp_path / "calibration" / "left" / "00.png").write_bytes(b"")
+    message = failure(capsys, "calibrate", tmp_path)
+    assert "00.png" in message
+    assert "table view" in message
+
+
+@pytest.mark.parametrize(("code", "word"), [(errno.EROFS, "read-only"), (errno.EACCES, "permission")])
+def test_a_recording_folder_that_is_read_only(recording, monkeypatch, capsys, code, word):
+    """Simulated: the superuser may write everywhere."""
+
+    def refuse(self, *arguments, **named):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    message = failure(capsys, "run", recording)
+    assert word in message
+    assert "-o" in message
+
+
+def test_a_disk_that_fills_up_while_the_result_is_written(recording, monkeypatch, capsys):
+    written = whole_files.os.fsync
+
+    def full(descriptor):
+        if ".part" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written(descriptor)
+
+    if not Path("/proc/self/fd").exists():
+        pytest.skip("needs /proc to tell one file from another")
+    monkeypatch.setattr(whole_files.os, "fsync", full)
+    assert "disk is full" in failure(capsys, "run", recording, *QUICK)
+    assert os.listdir(recording / "results") == []
+    monkeypatch.undo()
+    assert main(["run", str(recording), *QUICK]) == 0
+
+
+def start(*words, **environment) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "disctrack", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+    )
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+@pytest.mark.parametrize("delay", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
+def test_a_run_that_is_stopped_leaves_nothing_half_and_the_next_completes(recording, capsys, kind, delay):
+    process = start("run", recording, "--no-video")
+    time.sleep(delay)
+    was_running = process.poll() is None
+    process.send_signal(kind)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode != 0 or not was_running
+    if was_running and kind == signal.SIGINT and delay > 0.5:  # the interpreter itself may still be starting before
+        assert "interrupted" in errors
+        assert "Traceback" not in errors
+    results = recording / "results"
+    if (results / "trajectory.h5").exists():
+        read_trajectory(results / "trajectory.h5")  # whole
+    assert main(["run", str(recording), *QUICK]) == 0
+    assert len(read_trajectory(results / "trajectory.h5")) == 24
+    assert not list(results.glob("*.part*"))
