@@ -1,8 +1,8 @@
 """Exact derivatives of the motion with respect to its initial state and to the parameters of its effects.
 
 Each column is one more run of the same compiled integrator with an imaginary part of 1e-30 on one number (complex-step
-derivative): exact to rounding for the numerical solution, on the very steps of the real one, and including the way in
-which the instants of the switches between rolling, slip and flight move.
+derivative): no difference is taken, and the way in which the instants of the switches between rolling, slip and flight
+move is included.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import coordinates
-from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS
+from disctrack.rolling.records import STATE_COMPONENTS
 from disctrack.rolling.simulate import RTOL, _grid, _start, check_in_model, follow
 from disctrack.rolling.state import State
 
@@ -58,7 +58,10 @@ def sensitivities(
     names = (*components, *parameters)
     dq, dqdot = np.full((2, len(grid), 6, len(names)), np.nan)
     q, qdot = np.full((2, len(grid), 6), np.nan)
-    for column, name in enumerate(names or ROLLING_COMPONENTS[:1]):
+    path = follow(Assembly(enlarged, theta_end), y0, grid, rtol)
+    n = len(path.samples.time)
+    q[:n], qdot[:n] = coordinates(path.samples.kinematics)
+    for column, name in enumerate(names):
         y, values = y0.astype(complex), {}
         if column < len(components):
             y[STATE_COMPONENTS.index(name)] += 1j * _SEED
@@ -67,9 +70,7 @@ def sensitivities(
         path = follow(Assembly(enlarged, theta_end, complex, values), y, grid, rtol)
         n = len(path.samples.time)
         complex_q, complex_qdot = coordinates(path.samples.kinematics)
-        q[:n], qdot[:n] = complex_q.real, complex_qdot.real
-        if names:
-            dq[:n, :, column], dqdot[:n, :, column] = complex_q.imag / _SEED, complex_qdot.imag / _SEED
+        dq[:n, :, column], dqdot[:n, :, column] = complex_q.imag / _SEED, complex_qdot.imag / _SEED
     return Sensitivities(grid, q, qdot, names, dq, dqdot)
 
 

@@ -134,3 +134,20 @@ def test_a_parameter_that_is_not_there_is_named():
 def test_a_friction_that_is_never_reached_has_no_influence():
     found = rolling.sensitivities(Model(MA_2014), STATE, TIMES, ["slip.mu"], components=[])
     assert (found.dq == 0).all()
+
+
+def test_a_law_that_switches_within_a_step_has_its_derivative_at_null():
+    """Pivoting friction absent from a motion whose omega_z passes through zero, where the motion feels nothing."""
+    model = Model(MA_2014, effects=(CATALOGUE["km"](),))
+    state = steady_precession(np.radians(9), MA_2014, omega3=-0.6)
+    times = np.linspace(0, 1.2, 121)
+    plain = rolling.simulate(model, state, times=times)
+    omega_z = plain.omega_world[:, 2]
+    assert omega_z.max() > 0.1
+    assert omega_z.min() < -0.1
+    found = rolling.sensitivities(model, state, times, ["kz.k_z"], components=[])
+    tiny = 1e-9  # lever arm at which the response is linear: it moves omega_z by 1e-4 of the width of the sign
+    moved = rolling.simulate(model.with_values({"kz.k_z": tiny}), state, times=times)
+    for component in range(6):
+        slope = (moved.q - plain.q)[:, component] / tiny
+        assert_allclose(found.dq[:, component, 0], slope, atol=2e-3 * np.abs(slope).max())

@@ -68,6 +68,7 @@ class Effect:
     passive: ClassVar[bool] = True  # its power is never positive ...
     counter_rotating: ClassVar[bool] = False  # ... provided that psidot phidot < 0, as in every rolling down
     airborne: ClassVar[bool] = False  # acts also without contact
+    candidate: ClassVar[bool] = True  # may be proposed as an explanation; False for tools
     law: ClassVar[Any] = None  # static method law(p, s, w), or None
     adjust: ClassVar[Any] = None  # static method adjust(body, p), or None
 
