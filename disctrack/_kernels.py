@@ -342,8 +342,8 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
-    noise (2,): variance = noise[0] + noise[1] grey; rim: radius of an edge about the plane's origin whose
-    blur must not reach the pixels used, as that of `neighbours` (k, 2), the other dots' centres; scratch (SCRATCH_ROWS, N).
+    noise (2,): variance = noise[0] + noise[1] grey; rim: radius of an edge about the plane's origin whose blur must
+    not reach the pixels used, nor that of `neighbours` (k, 2), the other dots' centres; scratch (SCRATCH_ROWS, N).
     p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (12,) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """

@@ -47,8 +47,9 @@ def levenberg_marquardt(
     damping = np.full(n, 1e-8)
     converged = np.zeros(n, bool)
     identity = np.eye(p, dtype=bool)
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):
+    n_iterations = 0
+    while n_iterations < max_iterations:
+        n_iterations += 1
         diagonal = np.where(identity, normal, 0.0)
         # a parameter that no datum sees stays where it is
         unseen = identity & (np.abs(normal) <= 1e-300)
@@ -70,7 +71,7 @@ def levenberg_marquardt(
         damping = np.where(better, np.maximum(damping * 0.1, 1e-10), np.maximum(damping * 30.0, 1e-4))
         if np.all(converged | (damping > MAX_DAMPING)):
             break
-    return BatchFit(state, cost, normal, converged, iteration)
+    return BatchFit(state, cost, normal, converged, n_iterations)
 
 
 def _normal_equations(residuals: Array, jacobian: Array) -> tuple[Array, Array]:
