@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from disctrack.rolling._assembly import Assembly
-from disctrack.rolling.model import DEFAULT_THETA_END, Model
+from disctrack.rolling.effects import effect_class
+from disctrack.rolling.model import DEFAULT_THETA_END, Model, split_name
 from disctrack.rolling.motion import coordinates
 from disctrack.rolling.records import STATE_COMPONENTS
 from disctrack.rolling.simulate import RTOL, _grid, _start, check_in_model, follow
@@ -52,7 +53,7 @@ def sensitivities(
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
-    enlarged = model.with_values({name: value for name, value in _missing(model, parameters).items()})
+    enlarged = model.with_values(_missing(model, parameters))
     check_in_model(enlarged, list(parameters))
     components = STATE_COMPONENTS[: len(y0)] if components is None else components
     names = (*components, *parameters)
@@ -76,9 +77,6 @@ def sensitivities(
 
 def _missing(model: Model, parameters: Sequence[str]) -> dict[str, float]:
     """Null values of parameters whose effect the model lacks."""
-    from disctrack.rolling.effects import effect_class
-    from disctrack.rolling.model import split_name
-
     present = {e.name for e in model.effects}
     missing = {}
     for full_name in parameters:

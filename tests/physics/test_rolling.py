@@ -10,6 +10,7 @@ from scipy.integrate import simpson
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Model, State, steady_precession
+from tests.oracles import steady_precession as oracle
 
 IDEAL = Model(MA_2014)
 STEEL = Model(MA_2014, effects=(CATALOGUE["km"](k_m=0.381e-7),))
@@ -46,11 +47,32 @@ def test_steady_precession_stays_steady_and_its_centre_on_the_circle(theta_deg, 
     state = steady_precession(theta, MA_2014, omega3=omega3, psi=0.4, x=0.01)
     motion = rolling.simulate(IDEAL, state, 0.5)
     assert_allclose(motion.q[:, 4], theta, atol=1e-9)  # integration error over 20-200 rad of precession
-    p, q = state.psidot, state.omega3
-    radius = (MA_2014.half_thickness * p * np.sin(theta) - MA_2014.radius * q) / p  # (2.12) with its sign corrected
-    t = motion.time
-    assert_allclose(motion.q[:, 0], 0.01 + radius * (np.sin(p * t + 0.4) - np.sin(0.4)), atol=1e-10)
-    assert_allclose(motion.q[:, 1], -radius * (np.cos(p * t + 0.4) - np.cos(0.4)), atol=1e-10)
+    r, h, p, q = MA_2014.radius, MA_2014.half_thickness, state.psidot, state.omega3
+    expected = oracle.centre(r, h, theta, p, q, 0.4, 0.01, 0.0, motion.time)
+    assert_allclose(motion.q[:, :3], expected, atol=1e-10)
+    psi = motion.q[:, 3]
+    contact = motion.q[:, :2] + (r * np.cos(theta) - h * np.sin(theta)) * np.column_stack([np.sin(psi), -np.cos(psi)])
+    middle = oracle.circle_middle(r, h, theta, p, q, 0.4, 0.01, 0.0)
+    run_on = np.linalg.norm(contact - middle, axis=1)
+    assert_allclose(run_on, oracle.contact_circle_radius(r, h, theta, p, q), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 4e-4}},
+        {"inertia_product": {"J_13": 3e-6, "J_23": -1e-6}, "inertia_axial": {"e": 0.1}},
+        {"edge_radius": {"rho": 1e-3}, "contact_radius": {"r_error": 5e-4}},
+        {"table_tilt": {"tilt_x": 0.02, "tilt_y": 0.03}, "gravity": {"g_error": -0.3}},
+    ],
+)
+def test_a_changed_body_or_table_conserves_energy_too(effects):
+    model = Model(MA_2014, effects=tuple(CATALOGUE[n](**v) for n, v in effects.items()))
+    state = steady_precession(np.radians(20), MA_2014, omega3=1.0, nutation_amplitude=np.radians(2))
+    motion = rolling.simulate(model, state, 1.0)
+    ideal = rolling.simulate(IDEAL, state, 1.0)
+    assert np.abs(motion.q - ideal.q).max() > 1e-2
+    assert np.abs(motion.energy / motion.energy[0] - 1).max() < 1e-9
 
 
 def test_small_nutation_has_the_predicted_frequency_and_phase():

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Effect, Model, ModelError, Parameter, State, steady_precession
-from disctrack.rolling.effects import effect_from_formulas
+from disctrack.rolling.effects import catalogue_table, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None]
@@ -238,3 +238,11 @@ def test_spin_drifts_whichever_direction_the_dissipative_moment_has():
     assert_allclose(along_m0.energy[-1], along_e2.energy[-1], rtol=0.05)
     assert along_m0.state[-1, 7] < 0.05 < state.omega3
     assert along_e2.state[-1, 7] < along_m0.state[-1, 7] - 0.1
+
+
+def test_catalogue_table_names_every_effect_with_its_parameters():
+    table = catalogue_table().splitlines()
+    assert len(table) == len(CATALOGUE) + 2
+    for row, effect in zip(table[2:], CATALOGUE.values(), strict=True):
+        assert row.startswith(f"| `{effect.name}` |")
+        assert all(f"`{p.name}`" in row for p in effect.parameters)

@@ -3,11 +3,28 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
-from disctrack.rolling.effects.base import CATALOGUE, Effect, ModelError, Parameter, catalogue, effect_class
+from disctrack.rolling.effects.base import (
+    CATALOGUE,
+    Effect,
+    ModelError,
+    Parameter,
+    catalogue,
+    catalogue_table,
+    effect_class,
+)
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 
 from disctrack.rolling.effects.learned import effect_from_formulas  # noqa: E402 (after its package is read)
 
-__all__ = ["CATALOGUE", "Effect", "ModelError", "Parameter", "catalogue", "effect_class", "effect_from_formulas"]
+__all__ = [
+    "CATALOGUE",
+    "Effect",
+    "ModelError",
+    "Parameter",
+    "catalogue",
+    "catalogue_table",
+    "effect_class",
+    "effect_from_formulas",
+]

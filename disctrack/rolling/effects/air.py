@@ -76,6 +76,22 @@ class SpinAirDrag(Effect):
         w.M_z -= p.a * s.omega3 * s.cos_theta
 
 
+class RotationDrag(Effect):
+    """Moment -c Omega on the whole disc."""
+
+    name = "drag_rotation"
+    title = "linear drag on the rotation of the whole disc, M = -c Omega"
+    source = "viscous drag of a fluid at rest, Stokes' law for rotation"
+    parameters = (Parameter("c", "N m s", 1e-6, "moment per angular velocity", lower=0.0),)
+    airborne = True
+
+    @staticmethod
+    def law(p: Any, s: Any, w: Any) -> None:
+        w.M_n -= p.c * s.thetadot
+        w.M_m += p.c * s.phidot * s.sin_theta
+        w.M_z -= p.c * s.omega_z
+
+
 class LinearDrag(Effect):
     """Force -c v_O on the disc as a whole."""
 

@@ -128,3 +128,14 @@ def effect_class(name: str) -> type[Effect]:
 def catalogue() -> Iterator[type[Effect]]:
     """All effects in the order of their definition."""
     return iter(CATALOGUE.values())
+
+
+def catalogue_table() -> str:
+    """The catalogue as a Markdown table: name, law, parameters with unit and nominal value, source."""
+    rows = ["| effect | law | parameters (nominal) | source |", "|---|---|---|---|"]
+    for effect in catalogue():
+        numbers = "; ".join(
+            f"`{p.name}` {p.nominal:g} {p.unit if p.unit != '1' else ''}".strip() for p in effect.parameters
+        )
+        rows.append(f"| `{effect.name}` | {effect.title.replace('|', chr(92) + '|')} | {numbers} | {effect.source} |")
+    return "\n".join(rows) + "\n"
