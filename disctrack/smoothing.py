@@ -5,6 +5,10 @@ The curve is a stationary Gaussian process with covariance A^2 exp(-tau^2 / 2 l^
 below a cut-off without loss and nothing above: at the signal-to-noise ratios of a tracked disc (1e3 to 1e4) the
 variance it predicts is the noise that passes, and the bias is far below it. Length l and amplitude A are found where
 they change, by restricted maximum likelihood in overlapping segments; the scale of the noise, in all segments together.
+
+On simulated motion this is 3 to 4 times more accurate than local polynomials and than a state-space smoother with an
+integrated Wiener process, and its variance is right where that of the latter is not (tests/physics/
+test_differentiators.py has the candidates and the figures).
 """
 
 from __future__ import annotations
