@@ -167,6 +167,7 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
             "loss_sigma_calibration_J": energy.loss_sigma_calibration,
             "precession_level_over_4g_r": energy.level_ratio,
             "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
+            "precession_level_over_4g_r_steady": energy.level_ratio_steady,
         },
     )
     _write_scaling(path, analysis.scaling)

@@ -42,6 +42,7 @@ class Energy:
     loss_sigma_calibration: float  # [J]; most of the calibration's error is common to both ends and cancels
     level_ratio: float  # mean of psidot^2 sin theta over 4 g / r, over whole nutation periods if there are any
     level_ratio_sigma: float  # from the scatter about it
+    level_ratio_steady: float  # what steady precession of this disc with its centre at rest has at the median theta
 
 
 def energy_quantities(state: State, disc: Disc, gravity: float) -> Array:
@@ -70,7 +71,26 @@ def analyse_energy(motion: Motion) -> Energy:
     found = propagate(motion, lambda state: energy_quantities(state, motion.disc, motion.gravity))
     loss, noise, common = _loss(found)
     ratio, ratio_sigma = _level_ratio(motion, found.value[:, 8])
-    return Energy(found.series(ENERGY), found, loss, noise, common, ratio, ratio_sigma)
+    theta = motion.euler[np.isfinite(found.value[:, 8]), 1]
+    steady = float("nan")
+    if theta.size:
+        typical = float(np.median(theta))
+        steady = steady_precession_rate(typical, motion.disc, motion.gravity) ** 2 * np.sin(typical)
+        steady = float(steady / (4 * motion.gravity / motion.disc.radius))
+    return Energy(found.series(ENERGY), found, loss, noise, common, ratio, ratio_sigma, steady)
+
+
+def steady_precession_rate(theta: float, disc: Disc, gravity: float) -> float:
+    """Precession rate [rad/s] at constant nutation theta [rad] with the centre at rest: omega_3 = h psidot s / r.
+
+    First of equations (2.9) with all rates constant: (2.11) with I2 in place of J1 and one sin theta less in its
+    mixed term than printed.
+    """
+    m, r, h = disc.mass, disc.radius, disc.half_thickness
+    I2, I3 = disc.moment_diametral + m * h * h, disc.moment_axial + m * r * r
+    s, c = np.sin(theta), np.cos(theta)
+    stiffness = I2 * s * c - (I3 * s + m * r * h * c) * h * s / r + m * r * h * s * s
+    return float(np.sqrt(m * gravity * (r * c - h * s) / stiffness))
 
 
 def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:

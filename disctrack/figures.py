@@ -228,8 +228,8 @@ def contact_locus(analysis: Analysis) -> Drawn | None:
     axes.legend(frameon=False, fontsize=9)
     caption = (
         f"Contact point from {circle.start:.3f} to {circle.end:.3f} s with the fitted circle: radius "
-        f"{1e3 * circle.radius:.4f} ± {1e3 * circle.sigma:.4f} (scatter) ± {1e3 * circle.sigma_calibration:.4f} "
-        f"(calibration) mm. With the centre at rest it would be r cos θ - h sin θ = {1e3 * circle.expected:.4f} mm on "
+        f"{1e3 * circle.radius:.4f} ± {1e3 * circle.sigma:.4f} mm (scatter) ± {1e6 * circle.sigma_calibration:.2g} µm "
+        f"(calibration). With the centre at rest it would be r cos θ - h sin θ = {1e3 * circle.expected:.4f} mm on "
         f"average; the locus departs from the circle by {1e3 * circle.rms:.3f} mm rms. The paper found 37.286 mm."
     )
     return Drawn("09_contact_locus", "Locus of the contact", caption, figure)
@@ -282,8 +282,8 @@ def adiabatic_level(analysis: Analysis) -> Drawn | None:
     energy = analysis.energy
     caption = (
         f"Adiabatic check: averaged over the turns of precession, ψ̇² sin θ is {energy.level_ratio:.4f} ± "
-        f"{energy.level_ratio_sigma:.4f} times 4 g / r. It is 1 for a thin disc at small θ; a thick or tilted one "
-        "departs from it."
+        f"{energy.level_ratio_sigma:.4f} times 4 g / r. It is 1 for a thin disc at small θ; steady precession "
+        f"of this disc has {energy.level_ratio_steady:.4f} at the median θ."
     )
     return Drawn("12_adiabatic_level", "Adiabatic condition", caption, figure)
 

@@ -18,6 +18,7 @@ from scipy.signal import find_peaks
 from scipy.stats import t as student_t
 
 from disctrack.disc import Disc
+from disctrack.energy import steady_precession_rate
 
 Array = NDArray[np.float64]
 
@@ -113,7 +114,10 @@ def fit_power_laws(
         left = fit.t_f - time
         chosen = usable & (left <= window)
         if chosen.sum() < 20:
-            return _undetermined("fewer than 20 frames in the window")
+            return _undetermined(
+                f"the recording ends about {fit.t_f - end:.2g} s before collapse, outside the window of the last "
+                f"{window:g} s: record closer to the end, or ask for a longer window"
+            )
         again = _Fit.start(time[chosen], psi[chosen], np.log(theta[chosen]), np.log(psidot[chosen]), fit)
         moved, fit = abs(again.t_f - fit.t_f), again
         if moved < 1e-5:
@@ -373,10 +377,11 @@ def nutation_ratio(theta: float, disc: Disc) -> float:
     m, r, h, J1, J3 = disc.mass, disc.radius, disc.half_thickness, disc.moment_diametral, disc.moment_axial
     I1, I2, I3 = J1 + m * (r * r + h * h), J1 + m * h * h, J3 + m * r * r
     s, c = np.sin(theta), np.cos(theta)
-    L1, L2 = r * c - h * s, r * s + h * c
+    L2 = r * s + h * c
     coupling = I3 + m * r * h * c / s
-    w2 = np.sqrt(m * L1 / (I2 * c / s - coupling * h / r + m * r * h))  # for unit gravity
-    w3, psidot = h * w2 / r, w2 / s
+    psidot = steady_precession_rate(theta, disc, 1.0)
+    w2 = psidot * s
+    w3 = h * w2 / r
     follow = np.linalg.solve(
         [[I2, -m * h * r], [-m * h * r, I3]],
         [-J1 * psidot * c + J3 * w3 - m * h * psidot * L2, m * r * psidot * L2],
