@@ -56,13 +56,15 @@ def consistency_factor(refinement: Refinement) -> float:
     """
     s1 = refinement.problem.stereo_basis.shape[1]
     information, gradient = refinement.normal.view_information()
-    total = information.sum(0)
-    covariance = np.linalg.pinv(total, hermitian=True)[:, :s1]
+    scale = 1.0 / np.sqrt(np.diag(information.sum(0)))  # the parameters' units differ by 10^6
+    information, gradient = information * scale[:, None] * scale, gradient * scale
+    inverse = np.linalg.inv(information.sum(0))
+    covariance = inverse[:, :s1]
     # the board's own shape is nuisance: compare the stereo parameters' shifts only
     metric = np.linalg.inv(covariance[:s1])
     shift = gradient @ covariance
     seen = float(np.einsum("vi,ij,vj->", shift, metric, shift))
-    spread = information - information @ np.linalg.pinv(total, hermitian=True) @ information
+    spread = information - information @ inverse @ information
     expected = float(np.einsum("si,ij,vst,tj->", covariance, metric, spread, covariance))
     return seen / expected if expected > 0 else float("nan")
 
@@ -167,7 +169,7 @@ def assess(
     share = (coverage(refinement, 0), coverage(refinement, 1))
     tilt, spread = tilts(refinement)
     pixel_sigma, point_sigma = point_uncertainty(rig, measurement_volume(refinement, rig, table_view))
-    chosen = next((c for c in candidates if c.terms == refinement.terms), None)
+    chosen = next((c for c in reversed(candidates) if c.terms == refinement.terms), None)
     n_views = len(np.unique(kept.view))
     warnings = _warnings(refinement, share, tilt, spread, n_views, inflation, halves, chosen)
     point_length = np.linalg.norm(point_sigma, axis=-1)

@@ -104,7 +104,8 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int]) -> CornerView |
     view = _fit_view(values, rough, inner_corners)
     if view.accepted.mean() < MIN_ACCEPTED:
         return BoardNotFound(
-            f"only {view.accepted.sum()} of {len(view.accepted)} corners look like two crossing edges "
+            f"only {view.accepted.sum()} of {len(view.accepted)} corners look like two crossing edges; "
+            f"is {inner_corners[0]} x {inner_corners[1]} the number of INNER corners? "
             f"(first reason: {next(r for r in view.reasons if r)})"
         )
     beyond = _larger_board(values, view, inner_corners)
@@ -151,7 +152,10 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
     signs = [_first_square_is_dark(corners[order], grey, inner_corners) for order in orders]
     dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
     if not dark:
-        return BoardNotFound("no corner square of the board is dark: dark and light seem exchanged (a negative print?)")
+        return BoardNotFound(
+            f"no corner square of a board of {inner_corners[0]} x {inner_corners[1]} inner corners is dark: "
+            "a negative print, or other counts than declared"
+        )
     if len(dark) == 1:
         return dark[0]
     # the colouring leaves several orders: i to the right in this image; the stereo pair makes the two cameras agree

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.camera import Array
 from calibration.refinement import (
@@ -36,19 +37,25 @@ class Candidate:
     n_parameters: int  # shared by all views
     rms_px: float  # on the views that were fitted
     held_out_rms_px: float  # on views left out, each with its own pose fitted
-    held_out_chi_square: float  # per observation, in units of the common noise, truncated
+    held_out_chi_square: float  # per observation, truncated, in units of the noise of this comparison
+    noise_px: float  # sigma per axis of this comparison beyond the corners' own noise: the least of its models
     per_view: Array  # (n_views,) the same, NaN where a view was not used
 
 
-def held_out(refinement: Refinement, sigma: float) -> tuple[Array, Array, Array]:
-    """Chi-square (truncated), squared distance [px^2] and number of points per view, each view left out in turn.
+def held_out(
+    refinement: Refinement, sigma: float, good: NDArray[np.bool_]
+) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Per view, each view left out in turn: chi-square (truncated) of all points, squared distance [px^2] of good ones.
 
     sigma : unexplained noise [px] for the comparison, the same for every candidate
+    good : (m,) the observations that count in the distance
+    returns : chi-square, squared distance, number of all and of good points, each (n_views,)
     """
     used = refinement.observations[refinement.kept]
     everything = refinement.observations
     n_views = refinement.problem.n_views
-    chi2, square, count = np.full(n_views, np.nan), np.full(n_views, np.nan), np.zeros(n_views)
+    chi2, square = np.full(n_views, np.nan), np.full(n_views, np.nan)
+    count, good_count = np.zeros(n_views, int), np.zeros(n_views, int)
     views = np.unique(used.view)
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
@@ -57,17 +64,17 @@ def held_out(refinement: Refinement, sigma: float) -> tuple[Array, Array, Array]
             refinement.problem, observations=train, weights=inverse_covariance(train.covariance, sigma**2)
         )
         model = minimise(problem, refinement.model, iterations=12, tolerance=1e-6, damping=1e-7).model
-        test = everything[np.isin(everything.view, left_out)]
+        tested = np.isin(everything.view, left_out)
+        test = everything[tested]
         model = fit_poses(test, model, sigma)
         residuals = test.pixels - predict(model, test)[0]
         distance = np.einsum("mi,mij,mj->m", residuals, inverse_covariance(test.covariance, sigma**2), residuals)
-        good = distance < TRUNCATE
         for v in left_out:
             of_view = test.view == v
             chi2[v] = np.minimum(distance[of_view], TRUNCATE).sum()
-            square[v] = np.sum(residuals[of_view & good] ** 2) if (of_view & good).any() else np.nan
-            count[v] = of_view.sum()
-    return chi2, square, count
+            square[v] = np.sum(residuals[of_view & good[tested]] ** 2)
+            count[v], good_count[v] = of_view.sum(), (of_view & good[tested]).sum()
+    return chi2, square, count, good_count
 
 
 def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> StereoModel:
@@ -83,17 +90,18 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
     return minimise(problem, model, iterations=12, tolerance=1e-6, damping=1e-7).model
 
 
-def candidate(refinement: Refinement, sigma: float) -> Candidate:
-    """The row of one fitted model."""
-    chi2, square, count = held_out(refinement, sigma)
+def candidate(refinement: Refinement, sigma: float, good: NDArray[np.bool_]) -> Candidate:
+    """The row of one fitted model; see `held_out`."""
+    chi2, square, count, good_count = held_out(refinement, sigma, good)
     with np.errstate(invalid="ignore"):
         per_view = chi2 / np.where(count > 0, count, np.nan)
     return Candidate(
         terms=refinement.terms,
         n_parameters=refinement.problem.stereo_basis.shape[1] + refinement.problem.shape_basis.shape[-1],
         rms_px=refinement.rms(),
-        held_out_rms_px=float(np.sqrt(np.nansum(square) / max(count.sum(), 1))),
+        held_out_rms_px=float(np.sqrt(np.nansum(square) / max(good_count.sum(), 1))),
         held_out_chi_square=float(np.nansum(chi2) / max(count.sum(), 1)),
+        noise_px=sigma,
         per_view=per_view,
     )
 
@@ -121,18 +129,17 @@ def choose_terms(
 ) -> tuple[Refinement, tuple[Candidate, ...]]:
     """Choose distortion terms, then the board's shape, then the distortion again if the board is not flat.
 
-    Returns the refinement of the chosen terms and the table of everything that was compared. Names that are given as
+    Returns the refinement of the chosen terms and the table of everything that was compared: up to three comparisons
+    in turn, each with a noise of its own; the last row of a model is the one that counted last. Names that are given as
     one-element tuples are taken, not chosen.
     """
     distortions = tuple(DISTORTION_MODELS) if distortions is None else distortions
     richest = max(distortions, key=lambda name: len(DISTORTION_MODELS[name]))
     board = boards[0]
     fits = {(richest, board): refine_stereo(observations, start, nominal, Terms(richest, board, equal_aspect))}
-    table: dict[tuple[str, str], Candidate] = {}
-    sigma = fits[richest, board].unexplained_sigma
+    table: list[Candidate] = []
 
     def compare(keys: list[tuple[str, str]], begin: Refinement) -> tuple[str, str]:
-        nonlocal sigma
         for key in keys:
             if key not in fits:
                 progress(f"trying distortion {key[0]!r}, {key[1]} board")
@@ -140,10 +147,10 @@ def choose_terms(
                 fits[key] = refine_stereo(observations, start, nominal, terms, begin=begin)
         if len(keys) == 1:
             return keys[0]
-        sigma = min(fits[key].unexplained_sigma for key in keys)
-        for key in keys:
-            table[key] = candidate(fits[key], sigma)
-        return keys[best([table[key] for key in keys])]
+        quietest = min((fits[key] for key in keys), key=lambda fit: fit.unexplained_sigma)
+        rows = [candidate(fits[key], quietest.unexplained_sigma, quietest.kept) for key in keys]
+        table.extend(rows)
+        return keys[best(rows)]
 
     chosen = compare([(d, board) for d in distortions], fits[richest, board])
     if len(boards) > 1:
@@ -152,6 +159,7 @@ def choose_terms(
             least = len(DISTORTION_MODELS[chosen[0]]) - 1  # far fewer terms were seen to fail with the flat board
             again = [(d, chosen[1]) for d in distortions if len(DISTORTION_MODELS[d]) >= least]
             chosen = compare(again, fits[chosen])
-    if chosen not in table:
-        table[chosen] = candidate(fits[chosen], fits[chosen].unexplained_sigma)
-    return fits[chosen], tuple(table.values())
+    fit = fits[chosen]
+    if not table:
+        table.append(candidate(fit, fit.unexplained_sigma, fit.kept))
+    return fit, tuple(table)

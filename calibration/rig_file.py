@@ -75,6 +75,7 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
                 "rms_px": c.rms_px,
                 "held_out_rms_px": c.held_out_rms_px,
                 "held_out_chi_square": c.held_out_chi_square,
+                "noise_px": c.noise_px,
             }
             for c in calibration.candidates
         ],

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pytest
 
@@ -64,3 +65,51 @@ def make_scene(n_views=12, inner_corners=(9, 6), square=8e-3, distortion=True, d
 @pytest.fixture(scope="session")
 def scene_maker():
     return make_scene
+
+
+def draw_board(camera, R, t, board, sub=4, sigma=0.6, light=200.0, dark=20.0, table=80.0, rng=None, rim=1.6) -> Array:
+    """Image of a chessboard, drawn without any corner model.
+
+    sub x sub rays per pixel, each the mean of its own footprint, optical blur on that grid, mean over the pixel, then shot and read noise (variance 0.65 + 0.02 grey) and whole grey values.
+
+    Without rng: exact grey values, float.
+    """
+    pad = 4
+    width, height = (n + 2 * pad for n in camera.image_size)
+    offsets = (np.arange(sub) + 0.5) / sub - 0.5 - pad
+    x = (np.arange(width)[:, None] + offsets).ravel()
+    y = (np.arange(height)[:, None] + offsets).ravel()
+    k1, k2, p1, p2, k3 = camera.distortion
+    xd, yd = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    a, b = xd, yd
+    for _ in range(6):  # the inverse of weak distortion by repeated substitution
+        r2 = a * a + b * b
+        f = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        a, b = (xd - 2 * p1 * a * b - p2 * (r2 + 2 * a * a)) / f, (yd - p1 * (r2 + 2 * b * b) - 2 * p2 * a * b) / f
+    normal = R[:, 2]
+    depth = (normal @ t) / (a * normal[0] + b * normal[1] + normal[2])
+    points = np.stack([a * depth - t[0], b * depth - t[1], depth - t[2]])
+    X, Y = np.tensordot(R[:, :2].T, points, axes=1) / board.square
+    columns, rows = board.inner_corners
+    inside = (np.floor(X) >= -1) & (np.floor(X) < columns) & (np.floor(Y) >= -1) & (np.floor(Y) < rows)
+    paper = (-rim - 1 < X) & (columns + rim > X) & (-rim - 1 < Y) & (rows + rim > Y)
+    ink = 0.5 * (1 + _stripes(X) * _stripes(Y))  # the square outside corner (0, 0) is dark
+    grey = np.where(paper, light + np.where(inside, ink, 0) * (dark - light), table).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), sigma * sub)
+    image = grey.reshape(height, sub, width, sub).mean((1, 3), dtype=float)[pad:-pad, pad:-pad]
+    if rng is None:
+        return image
+    noisy = image + rng.normal(size=image.shape) * np.sqrt(0.65 + 0.02 * image)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def _stripes(X: Array) -> Array:
+    """-1 or 1 in turn with each whole number passed, mixed over the footprint of a ray on the lines."""
+    footprint = np.hypot(*np.gradient(X))
+    nearest = np.rint(X)
+    return np.clip(2 * (X - nearest) / footprint, -1, 1) * np.where(nearest % 2 == 0, 1, -1)
+
+
+@pytest.fixture(scope="session")
+def board_drawer():
+    return draw_board

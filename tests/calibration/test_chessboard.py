@@ -1,0 +1,169 @@
+"""Corners: where they are, how well that is known, in which order, and what is refused."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
+from calibration.camera import project, rotation_from_vector
+from calibration.chessboard import _local_axes, grey_values
+
+CAMERA = Camera(900.0, 905.0, 158.0, 122.0, (-0.1, 0.1, 3e-4, -2e-4, 0.0), (320, 240))
+FACING = np.diag([1.0, -1.0, -1.0])
+
+
+def pose(board, tilt_deg=(20.0, 15.0, 10.0), distance=0.36):
+    R = rotation_from_vector(np.radians(tilt_deg)) @ FACING
+    return R, np.array([0.0, 0.0, distance]) - R @ board.points.mean(0)
+
+
+def truth(board, R, t):
+    return project(board.points @ R.T + t, CAMERA)
+
+
+@pytest.fixture(scope="module")
+def views(board_drawer):
+    """(located, true) corners of views from frontal to steep, edges along the rows and askew."""
+    board = Board((9, 6), 8e-3)
+    rng = np.random.default_rng(11)
+    found = []
+    # no edges at 0 or 45 deg, where the grid of rays of the drawing itself would show
+    for tilt in (
+        (3, 4, 7),
+        (20, 15, 10),
+        (-35, 10, 33),
+        (10, -50, 5),
+        (55, 0, -20),
+        (5, 8, 38),
+    ):
+        R, t = pose(board, tilt)
+        view = find_corners(board_drawer(CAMERA, R, t, board, rng=rng), (9, 6))
+        assert isinstance(view, CornerView), view
+        found.append((view, truth(board, R, t)))
+    return found
+
+
+def test_corners_are_located_to_a_hundredth_of_a_pixel_at_every_slant(views):
+    for view, true in views:
+        assert view.accepted.all()
+        rms = np.sqrt(np.mean((view.points - true) ** 2))
+        assert rms < 0.01  # squares of 12 to 20 px at this noise: the light's limit is 0.004 to 0.007 px
+        assert np.abs(view.points - true).max() < 0.05
+
+
+def test_corner_errors_have_the_predicted_size(views):
+    squares = []
+    for view, true in views:
+        L = np.linalg.cholesky(np.linalg.inv(view.covariance))
+        z = np.einsum("nji,nj->ni", L, view.points - true)
+        squares.append(np.mean(z**2))
+    # 648 coordinates: scatter of the mean square 0.056, four of these; no smaller than the noise
+    assert 0.78 < np.mean(squares) < 1.25
+
+
+def test_corners_have_no_bias(views):
+    for view, true in views:
+        mean = np.mean(view.points - true, axis=0)
+        sigma = np.sqrt(np.mean(view.covariance[:, [0, 1], [0, 1]], axis=0) / len(true))
+        assert np.abs(mean).max() < 4 * sigma.max() + 5e-4  # rays 1/6 px apart: their grid leaves some 5e-4 px
+
+
+def test_noise_and_blur_are_measured(views):
+    for view, _ in views:
+        a, b = view.noise
+        # read and shot noise, and 1/12 for whole grey values; medians of some 100 pixels per corner
+        assert_allclose([a + 20 * b, a + 200 * b], [0.65 + 0.083 + 0.4, 0.65 + 0.083 + 4.0], rtol=0.25)
+        assert_allclose(np.median(view.blur), np.sqrt(0.6**2 + 1 / 12), atol=0.02)
+
+
+def test_opencv_corners_at_the_usual_window_are_worse(board_drawer):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board, (10, -50, 5))
+    image = board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(3))
+    ours, true = find_corners(image, (9, 6)).points, truth(board, R, t)
+    theirs = cv2.cornerSubPix(
+        image, np.ascontiguousarray(true, np.float32).reshape(-1, 1, 2), (5, 5), (-1, -1), (3, 100, 1e-4)
+    ).reshape(-1, 2)
+    error = [np.sqrt(np.mean((points - true) ** 2)) for points in (ours, theirs)]
+    assert error[0] < 0.5 * error[1]
+
+
+@pytest.mark.parametrize("turn", [0, 37, 90, 145, 180, 222, 270, 301])
+def test_order_follows_the_dark_side_however_the_board_lies(board_drawer, turn):
+    board = Board((9, 6), 6e-3)
+    R, t = pose(board, (0, 0, turn))
+    R = rotation_from_vector(np.array([0.3, -0.2, 0.0])) @ R
+    t = np.array([0.0, 0.0, 0.36]) - R @ board.points.mean(0)
+    view = find_corners(board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(turn)), (9, 6))
+    assert_allclose(view.points, truth(board, R, t), atol=0.05)
+
+
+@pytest.mark.parametrize("counts", [(5, 4), (4, 5), (7, 6), (12, 7), (3, 4)])
+def test_other_boards_are_found_in_their_own_order(board_drawer, counts):
+    board = Board(counts, 70e-3 / max(counts))
+    assert board.symmetry == 1
+    R, t = pose(board, (20, 15, 130))
+    view = find_corners(board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(1)), counts)
+    assert isinstance(view, CornerView), view
+    assert_allclose(view.points, truth(board, R, t), atol=0.1)  # squares down to 10 px, and blur of 0.6 px
+
+
+@pytest.mark.parametrize("counts", [(8, 6), (9, 5), (10, 6), (9, 7), (6, 4)])
+def test_wrong_counts_are_refused(board_drawer, counts):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board)
+    found = find_corners(board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(2)), counts)
+    assert isinstance(found, BoardNotFound)
+    assert "inner corners" in found.reason.lower()
+
+
+def test_an_empty_or_noisy_image_holds_no_board(rng):
+    for image in (np.full((240, 320), 90, np.uint8), rng.integers(0, 256, (240, 320)).astype(np.uint8)):
+        assert isinstance(find_corners(image, (9, 6)), BoardNotFound)
+
+
+def test_a_dirty_corner_is_rejected_with_its_reason(board_drawer):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board)
+    image = board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(4))
+    true = truth(board, R, t)
+    cv2.circle(image, tuple(int(v) for v in np.rint(true[22] + [3, 2])), 5, 110, -1)
+    view = find_corners(image, (9, 6))
+    assert isinstance(view, CornerView)
+    assert not view.accepted[22]
+    assert view.reasons[22]
+    others = np.delete(np.arange(54), 22)
+    assert view.accepted[others].mean() > 0.95
+    assert np.abs(view.points - true)[view.accepted].max() < 0.05
+
+
+def test_depth_and_equal_channels_change_nothing(board_drawer):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board)
+    image = board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(5))
+    plain = find_corners(image, (9, 6))
+    deep = find_corners(image.astype(np.uint16) * 64, (9, 6))
+    assert_allclose(deep.points, plain.points, atol=2e-4)  # quantisation floor of the noise differs
+    triple = find_corners(np.dstack([image] * 3), (9, 6))
+    assert np.array_equal(triple.points, plain.points)
+    assert not triple.notes
+    tinted = np.dstack([image, image, (image * 0.9).astype(np.uint8)])
+    assert "luminance" in find_corners(tinted, (9, 6)).notes[0]
+
+
+def test_an_image_of_another_type_is_refused():
+    with pytest.raises(ValueError, match="8 or 16 bit"):
+        grey_values(np.zeros((10, 10), np.int64))
+    with pytest.raises(ValueError, match="height, width"):
+        grey_values(np.zeros((10, 10, 2), np.uint8))
+
+
+def test_local_axes_are_differences_of_neighbours():
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board)
+    points = truth(board, R, t)
+    axes = _local_axes(points, np.ones(54, bool), (9, 6)).reshape(6, 9, 2, 2)
+    grid = points.reshape(6, 9, 2)
+    assert_allclose(axes[:, 1:-1, 0], 0.5 * (grid[:, 2:] - grid[:, :-2]), atol=0.1)
+    assert_allclose(axes[1:-1, :, 1], 0.5 * (grid[2:] - grid[:-2]), atol=0.1)

@@ -1,0 +1,267 @@
+"""From images to a rig: the lab frame is right, its uncertainty honest, and bad views are named."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration import (
+    Board,
+    BoardNotFound,
+    CalibrationError,
+    CalibrationSettings,
+    Camera,
+    CornerView,
+    StereoModel,
+    calibrate_from_corners,
+    calibrate_stereo,
+)
+from calibration.camera import rotation_from_vector, triangulate
+from calibration.images import calibrate_files, find_pairs
+from calibration.rig_file import read_rig_file, write_rig
+from calibration.table_frame import table_pose
+
+BOARD = Board((7, 4), 9e-3)
+THICKNESS = 2e-3
+FLAT = CalibrationSettings(distortion="k1", board="flat")
+
+
+def small_scene(scene_maker, **options):
+    """The scene seen by cameras of fewer pixels, so that drawing it is quick."""
+    scene = scene_maker(inner_corners=BOARD.inner_corners, square=BOARD.square, **options)
+    cameras = tuple(
+        Camera(c.fx * 0.45, c.fy * 0.45, 119.0 + i, 96.0 - i, (-0.15, 0, 0, 0, 0), (240, 192))
+        for i, c in enumerate(scene.model.cameras)
+    )
+    return replace(scene, model=replace(scene.model, cameras=cameras))
+
+
+def draw(scene, board_drawer, rng, board=BOARD, sub=4):
+    m = scene.model
+    images = ([], [])
+    for R, t in zip(m.R_left_board, m.t_left_board, strict=True):
+        images[0].append(board_drawer(m.cameras[0], R, t, board, sub=sub, rng=rng))
+        images[1].append(
+            board_drawer(m.cameras[1], m.R_right_left @ R, m.R_right_left @ t + m.t_right_left, board, sub=sub, rng=rng)
+        )
+    return images
+
+
+@pytest.fixture(scope="module")
+def drawn(scene_maker, board_drawer):
+    scene = small_scene(scene_maker, n_views=8)
+    return scene, draw(scene, board_drawer, np.random.default_rng(8))
+
+
+@pytest.fixture(scope="module")
+def calibrated(drawn):
+    scene, (left, right) = drawn
+    return scene, calibrate_stereo(left, right, BOARD, FLAT, table_view=3, board_thickness=THICKNESS)
+
+
+def corner_views(scene, rng, sigma=0.02, board=BOARD):
+    """What `find_corners` would return, without images."""
+    n = len(board.points)
+    views = []
+    for camera in (0, 1):
+        pixels = scene.pixels(camera)
+        views.append(
+            [
+                CornerView(
+                    (240, 192), p + rng.normal(size=p.shape) * sigma, np.tile(np.eye(2) * sigma**2, (n, 1, 1)),
+                    np.ones(n, bool), ("",) * n, np.ones(n), np.full(n, 180.0), np.ones(n), 15.0, (1.0, 0.0),
+                )
+                for p in pixels
+            ]
+        )  # fmt: skip
+    return views
+
+
+def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
+    scene, found = calibrated
+    R, t = table_pose(scene.model.R_left_board[3], scene.model.t_left_board[3], THICKNESS)
+    points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 25e-3, 0], [25e-3, 10e-3, 10e-3]])
+    m = scene.model
+    true_rig = replace(
+        found.rig, left=m.cameras[0], right=m.cameras[1], R_right_left=m.R_right_left, t_right_left=m.t_right_left,
+        R_left_world=R, t_left_world=t,
+    )  # fmt: skip
+    error = triangulate(true_rig.project(points), found.rig) - points
+    from calibration.assessment import point_uncertainty
+
+    _, sigma = point_uncertainty(found.rig, points)
+    assert np.abs(error / sigma).max() < 4.5
+    assert np.abs(error).max() < 20e-6  # cameras of 240 x 192 px, 0.55 mm per px, 8 views
+    assert sigma.max() < 20e-6
+
+
+def test_covariance_of_the_table_frame_is_not_taken_from_the_pair_alone(calibrated):
+    _, found = calibrated
+    C = found.rig.covariance
+    assert np.diag(C)[24:].min() > 0
+    assert np.abs(C[:24, 24:]).max() > 0  # pose of the table and intrinsics err together
+    free = np.diag(C) > 0
+    scale = np.sqrt(np.diag(C)[free])
+    eigenvalues = np.linalg.eigvalsh(C[np.ix_(free, free)] / scale / scale[:, None])
+    assert eigenvalues.min() > -1e-9
+
+
+def test_a_calibration_survives_the_rig_file(calibrated, tmp_path):
+    _, found = calibrated
+    write_rig(tmp_path / "rig.h5", found)
+    back = read_rig_file(tmp_path / "rig.h5")
+    assert np.array_equal(back.rig.covariance, found.rig.covariance)
+    assert back.rig.left == found.rig.left
+    assert np.array_equal(back.record.residuals, found.refinement.residuals)
+    assert back.record.figures["assessment"]["verdict"] == found.assessment.verdict
+
+
+def test_sixteen_bit_and_colour_views_give_the_same_rig(drawn, calibrated):
+    _, (left, right) = drawn
+    deep = [image.astype(np.uint16) * 257 for image in left]
+    colour = [np.dstack([image] * 3) for image in right]
+    found = calibrate_stereo(deep, colour, BOARD, FLAT, table_view=3, board_thickness=THICKNESS)
+    # the floor of the noise, 1/12 of a grey value squared, weighs less at 16 bit: a small part of a sigma
+    change = found.rig.t_left_world - calibrated[1].rig.t_left_world
+    assert np.abs(change / np.sqrt(np.diag(found.rig.covariance)[27:])).max() < 0.1
+
+
+def test_left_and_right_of_different_number_are_an_error(drawn):
+    _, (left, right) = drawn
+    with pytest.raises(CalibrationError, match="8 left and 7 right"):
+        calibrate_stereo(left, right[:-1], BOARD)
+
+
+def test_a_view_of_another_size_is_named(drawn):
+    _, (left, right) = drawn
+    odd = [*left[:4], left[4][:-10], *left[5:]]
+    with pytest.raises(CalibrationError, match="left 4: left image is 240 x 182 px"):
+        calibrate_stereo(odd, right, BOARD)
+
+
+def test_views_without_a_board_are_left_out_with_the_reason(drawn):
+    _, (left, right) = drawn
+    blank = np.full_like(left[0], 90)
+    found = calibrate_stereo([*left[:6], blank, left[7]], [*right[:5], blank, blank, right[7]], BOARD, FLAT)
+    assert list(found.rejected_views) == [6]
+    assert "left 6: no board of 7 x 4" in found.rejected_views[6]
+    assert any("view 5 is used in one camera only: right 5" in w for w in found.warnings)
+    assert np.isnan(found.rms_per_view_px[5, 1])
+    assert np.isfinite(found.rms_per_view_px[5, 0])
+
+
+def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
+    _, (left, right) = drawn
+    blank = np.full_like(left[0], 90)
+    with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*view 0: no board"):
+        calibrate_stereo([blank] * 8, right, BOARD)
+    with pytest.raises(CalibrationError, match="not found in the table view 0"):
+        calibrate_stereo([blank, *left[1:]], [blank, *right[1:]], BOARD, FLAT, table_view=0)
+    with pytest.raises(CalibrationError, match="table view 11 does not exist"):
+        calibrate_stereo(left, right, BOARD, FLAT, table_view=11)
+
+
+def test_wrong_counts_are_an_error_that_asks_for_inner_corners(drawn):
+    _, (left, right) = drawn
+    with pytest.raises(CalibrationError, match="inner corners"):
+        calibrate_stereo(left, right, Board((8, 5), 9e-3))
+
+
+def test_exchanged_images_are_found_out(scene_maker, rng):
+    scene = small_scene(scene_maker, n_views=10)
+    left, right = corner_views(scene, rng)
+    right[2], right[7] = right[7], right[2]
+    found = calibrate_from_corners(left, right, BOARD, FLAT)
+    assert list(found.rejected_views) == [2, 7]
+    assert "not a pair" in found.rejected_views[2]
+    assert found.rms_px < 0.05
+    with pytest.raises(CalibrationError, match="table view 2 cannot be used"):
+        calibrate_from_corners(left, right, BOARD, FLAT, table_view=2)
+
+
+def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng):
+    scene = small_scene(scene_maker, n_views=10)
+    left, right = corner_views(scene, rng)
+    right[4] = replace(right[4], points=right[4].points + np.array([1.5, -1.0]))
+    found = calibrate_from_corners(left, right, BOARD, FLAT)
+    assert list(found.rejected_views) == [4]
+    assert found.rms_px < 0.05
+
+
+def test_parallel_views_are_warned_of(scene_maker, rng):
+    scene = small_scene(scene_maker, n_views=8)
+    m = scene.model
+    shift = rng.uniform(-0.02, 0.02, (8, 3))
+    parallel = StereoModel(
+        m.cameras, m.R_right_left, m.t_right_left,
+        np.stack([m.R_left_board[0] @ rotation_from_vector(np.array([0, 0, 0.1 * v])) for v in range(8)]),
+        m.t_left_board[0] + shift, m.points,
+    )  # fmt: skip
+    found = calibrate_from_corners(*corner_views(replace(scene, model=parallel), rng), BOARD, FLAT)
+    many = calibrate_from_corners(*corner_views(scene, rng), BOARD, FLAT)
+    assert found.assessment.tilt_spread_deg < 1
+    assert any("normals differ" in w for w in found.warnings)
+    assert not any("normals differ" in w for w in many.warnings)
+    # and the covariance says the same as the warning
+    assert found.rig.covariance[0, 0] > 4 * many.rig.covariance[0, 0]
+
+
+@pytest.mark.parametrize("counts", [(7, 5), (6, 4), (5, 5), (4, 4)])
+def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_maker, rng, counts):
+    board = Board(counts, 9e-3)
+    assert board.symmetry > 1
+    scene = scene_maker(n_views=8, inner_corners=counts, square=9e-3)
+    scene = replace(scene, board=board)
+    left, right = corner_views(scene, rng, 0.01, board)
+    from calibration.chessboard import board_orders
+
+    orders = board_orders(counts)
+    orders = orders if board.symmetry == len(orders) else orders[::2]
+    turned = [view.reordered(orders[v % len(orders)]) for v, view in enumerate(right)]
+    found = calibrate_from_corners(left, turned, board, CalibrationSettings("k1 k2 p1 p2", "flat"))
+    assert not found.rejected_views
+    assert found.rms_px < 0.03
+    assert any("looks the same after a turn" in w for w in found.warnings)
+    assert_allclose(found.rig.t_right_left, scene.model.t_right_left, atol=5e-3)  # 5 x 5 corners tell little
+
+
+def test_unknown_settings_are_refused():
+    with pytest.raises(CalibrationError, match="k1 k2"):
+        CalibrationSettings(distortion="k7")
+    with pytest.raises(CalibrationError, match="flat"):
+        CalibrationSettings(board="round")
+    with pytest.raises(CalibrationError, match="3 x 3"):
+        Board((2, 9), 1e-3)
+    with pytest.raises(CalibrationError, match="positive"):
+        Board((9, 6), 0.0)
+
+
+def test_files_are_paired_by_name_and_faults_are_named(drawn, tmp_path):
+    _, (left, right) = drawn
+    for i, (a, b) in enumerate(zip(left, right, strict=True)):
+        cv2.imwrite(str(tmp_path / f"left{i:02d}.png"), a)
+        cv2.imwrite(str(tmp_path / f"right{i:02d}.png"), b)
+    pairs = find_pairs("left*.png", "right*.png", tmp_path)
+    assert [p[1].name for p in pairs] == [f"right{i:02d}.png" for i in range(8)]
+    stages = []
+    found = calibrate_files(pairs, BOARD, FLAT, progress=lambda *state: stages.append(state))
+    assert found.view_names[3][0].endswith("left03.png")
+    assert ("corners", 16, 16) in stages
+    with pytest.raises(CalibrationError, match=r"no left calibration view matches"):
+        find_pairs("links*.png", "right*.png", tmp_path)
+    (tmp_path / "right07.png").unlink()
+    with pytest.raises(CalibrationError, match=r"8 left views match .* but 7"):
+        find_pairs("left*.png", "right*.png", tmp_path)
+    data = (tmp_path / "left02.png").read_bytes()
+    (tmp_path / "left02.png").write_bytes(data[: len(data) // 30])
+    with pytest.raises(CalibrationError, match=r"left02\.png"):
+        calibrate_files(pairs[:5], BOARD, FLAT)
+    (tmp_path / "left02.png").write_bytes(b"")
+    with pytest.raises(CalibrationError, match=r"left02\.png: not an image"):
+        calibrate_files(pairs[:5], BOARD, FLAT)
+
+
+def test_board_not_found_is_told_from_a_view():
+    assert BoardNotFound("why").reason == "why"
