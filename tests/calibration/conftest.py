@@ -70,7 +70,8 @@ def scene_maker():
 def draw_board(camera, R, t, board, sub=4, sigma=0.6, light=200.0, dark=20.0, table=80.0, rng=None, rim=1.6) -> Array:
     """Image of a chessboard, drawn without any corner model.
 
-    sub x sub rays per pixel, each the mean of its own footprint, optical blur on that grid, mean over the pixel, then shot and read noise (variance 0.65 + 0.02 grey) and whole grey values.
+    sub x sub rays per pixel, each the mean of its own footprint, optical blur on that grid, mean over the pixel, then
+    shot and read noise (variance 0.65 + 0.02 grey) and whole grey values.
 
     Without rng: exact grey values, float.
     """
