@@ -179,40 +179,51 @@ def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
 
 
 @njit(error_model="numpy")
-def _locate(
-    system: Any,
+def _fill(
+    rates: int,
     args: Any,
-    e: int,
     t: Any,
     y: Any,
-    h_max: float,
+    h: Any,
     tableau: Any,
     K: Any,
     box: Any,
     y_new: Any,
-    margin: Any,
-) -> float:
-    """Length of the step after which margin e has just run out, by bisection; inf if it has not after h_max."""
-    rates, margins = system
-    unit = 0.0 * y[0] + 1.0
-    low, high, trial = 0.0, h_max, h_max
-    for i in range(60):
-        _step(rates, args, t, y, trial * unit, tableau, K, box, y_new)
-        _call(margins, t + trial * unit, y_new, margin, box[1], args)
-        if margin[e].real > 0.0:
-            if i == 0:
-                return np.inf
-            low = trial
-        else:
-            high = trial
-        trial = 0.5 * (low + high)
-        if trial in (low, high) or high - low < 1e-16:
-            break
-    return high
+    F: Any,
+    grid: Any,
+    i_grid: int,
+    solution: Any,
+) -> int:
+    """Write the grid points from number i_grid up to the end of the step; returns the number of the next one."""
+    A, B, C, _, _, D = tableau
+    _stages(rates, args, t, y, h, B.size + 1, C.size, A, C, K, box)
+    _interpolant(y, y_new, h, K, D, F)
+    while i_grid < grid.size and grid[i_grid] <= (t + h).real:
+        _interpolate(y, F, (grid[i_grid] - t) / h, solution[i_grid])
+        i_grid += 1
+    return i_grid
 
 
 @njit(error_model="numpy")
-def _first_event(
+def _first_step(y: Any, f: Any, atol: Any) -> float:
+    """A hundredth of the time in which the fastest component changes by its own size."""
+    fastest = 0.0
+    for k in range(y.size):
+        fastest = max(fastest, abs(f[k].real) / (atol[k] * 1e6 + abs(y[k].real)))
+    return 0.01 / (1.0 + fastest)
+
+
+@njit(error_model="numpy")
+def _ran_out(before: Any, after: Any) -> int:
+    """Number of the first margin that was positive and is no longer, or -1."""
+    for e in range(after.size):
+        if before[e].real > 0.0 and after[e].real <= 0.0:
+            return e
+    return -1
+
+
+@njit(error_model="numpy")
+def _locate(
     system: Any,
     args: Any,
     t: Any,
@@ -225,16 +236,26 @@ def _first_event(
     before: Any,
     after: Any,
 ) -> Any:
-    """Number and step length of the earliest margin that ran out within the step, or (-1, h)."""
-    event, ran_out = -1, np.zeros(after.size, np.bool_)
-    for e in range(after.size):
-        ran_out[e] = before[e].real > 0.0 and after[e].real <= 0.0
-    for e in range(after.size):
-        if ran_out[e]:
-            root = _locate(system, args, e, t, y, h, tableau, K, box, y_new, after)
-            if root <= h:
-                event, h = e, root
-    return event, h
+    """Shorten the step to where the first margin has just run out, by bisection; y_new and `after` hold there.
+
+    Returns the number of the margin and the length of the step.
+    """
+    rates, margins = system
+    unit = 0.0 * y[0] + 1.0
+    low, high, trial = 0.0, h, 0.5 * h
+    while True:
+        _step(rates, args, t, y, trial * unit, tableau, K, box, y_new)
+        _call(margins, t + trial * unit, y_new, after, box[1], args)
+        event = _ran_out(before, after)
+        if trial == high:
+            return event, high
+        if event >= 0:
+            high = trial
+        else:
+            low = trial
+        trial = 0.5 * (low + high)
+        if not low < trial < high or high - low < 1e-16:
+            trial = high
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -255,10 +276,9 @@ def _dop853(
     t_last: Any,
     y_last: Any,
 ) -> Any:
-    A, B, C, _, _, D = tableau
-    n, n_stages = y0.size, B.size
+    n, n_stages = y0.size, tableau[1].size
     unit = 0.0 * y0[0] + 1.0  # one, in the kind of number of the state
-    K, F = np.zeros((C.size, n), y0.dtype), np.zeros((7, n), y0.dtype)
+    K, F = np.zeros((tableau[2].size, n), y0.dtype), np.zeros((7, n), y0.dtype)
     y, y_new, margin_new = y0.copy(), y0.copy(), margin.copy()
     box = (y0.copy(), t0.copy())
     t, size = t0[0], np.zeros(1)
@@ -266,14 +286,11 @@ def _dop853(
         size[0] = max(size[0], abs(y[k].imag) / atol[k])
     _call(rates, t, y, K[0], box[1], args)
     _call(margins, t, y, margin, box[1], args)
-    steepest = 0.0
-    for k in range(n):
-        steepest = max(steepest, abs(K[0, k].real) / (atol[k] * 1e6 + abs(y[k].real)))
-    h_next, i_grid = 0.01 / (1.0 + steepest), 0
+    h_next, i_grid = _first_step(y, K[0], atol), 0
     for steps in range(max_steps):
         t_last[0], y_last[:] = t, y
         if i_grid == grid.size:
-            return 0, i_grid, -1, steps
+            return REACHED_END, i_grid, -1, steps
         room = grid[-1] - t
         h = room if room.real <= h_next else h_next * unit
         if room.real < 1e-15:  # the last points coincide with t up to rounding
@@ -288,27 +305,23 @@ def _dop853(
         if not error <= 1.0:  # also when not a number
             h_next = h.real * (max(0.2, 0.9 * error**-0.125) if np.isfinite(error) else 0.1)
             if h_next < 1e-15:
-                return 3, i_grid, -1, steps
+                return NOT_FINITE, i_grid, -1, steps
             continue
         h_next = h.real * (5.0 if error == 0.0 else min(5.0, 0.9 * error**-0.125))
         _call(margins, t + h, y_new, margin_new, box[1], args)
-        event, h_event = _first_event((rates, margins), args, t, y, h.real, tableau, K, box, y_new, margin, margin_new)
+        event = _ran_out(margin, margin_new)
         if event >= 0:
+            event, h_event = _locate((rates, margins), args, t, y, h.real, tableau, K, box, y_new, margin, margin_new)
             h = h_event * unit
-            _step(rates, args, t, y, h, tableau, K, box, y_new)
         _call(rates, t + h, y_new, K[n_stages], box[1], args)
-        if i_grid < grid.size and grid[i_grid] <= (t + h).real:
-            _stages(rates, args, t, y, h, n_stages + 1, C.size, A, C, K, box)
-            _interpolant(y, y_new, h, K, D, F)
-            while i_grid < grid.size and grid[i_grid] <= (t + h).real:
-                _interpolate(y, F, (grid[i_grid] - t) / h, solution[i_grid])
-                i_grid += 1
+        if grid[i_grid] <= (t + h).real:
+            i_grid = _fill(rates, args, t, y, h, tableau, K, box, y_new, F, grid, i_grid, solution)
         t, y[:] = t + h, y_new
         if event >= 0:
             t_last[0], y_last[:] = t, y
-            return 1, i_grid, event, steps
+            return EVENT, i_grid, event, steps
         K[0], margin[:] = K[n_stages], margin_new
-    return 2, i_grid, -1, max_steps
+    return TOO_MANY_STEPS, i_grid, -1, max_steps
 
 
 @njit(cache=True, error_model="numpy")
