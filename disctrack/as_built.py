@@ -184,11 +184,11 @@ def _shared_normal_equations(
         seen = used[block]
         W = np.where(seen[..., None, None], whitening(np.where(seen[..., None, None], covariance[block], np.eye(2))), 0)
         r = (W @ np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None])[..., 0].reshape(len(block), -1)
-        P = (W @ P).reshape(len(block), -1, 6)
-        C = (W @ C[..., free]).reshape(len(block), -1, size)
-        PtP = np.swapaxes(P, 1, 2) @ P + 1e-12 * np.eye(6)
-        projected = C - P @ np.linalg.solve(PtP, np.swapaxes(P, 1, 2) @ C)
+        J = (W @ P).reshape(len(block), -1, 6)
+        S = (W @ C[..., free]).reshape(len(block), -1, size)
+        JtJ = np.swapaxes(J, 1, 2) @ J + 1e-12 * np.eye(6)
+        projected = S - J @ np.linalg.solve(JtJ, np.swapaxes(J, 1, 2) @ S)
         flat = projected.reshape(-1, size)
-        normal += flat.T @ C.reshape(-1, size)
+        normal += flat.T @ S.reshape(-1, size)
         gradient += flat.T @ r.reshape(-1)
     return 0.5 * (normal + normal.T), gradient

@@ -161,7 +161,7 @@ def locate_on_plane(
     results = np.full((len(centres), kernels.N_RESULT), np.nan)
     status = np.zeros(len(centres), np.uint8)
     scratch = np.empty((kernels.SCRATCH_ROWS, 40000))
-    image = np.ascontiguousarray(image)
+    contiguous = np.ascontiguousarray(image)
     for i, (x, y) in enumerate(centres):  # the body is one compiled call
         p = np.empty(8)
         u = H[i] @ (x, y, 1.0)
@@ -169,7 +169,7 @@ def locate_on_plane(
         others = np.delete(centres, i, axis=0)
         near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
         status[i] = kernels.fit_dot(
-            image, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, scratch, p,
+            contiguous, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, scratch, p,
             results[i],
         )  # fmt: skip
         if status[i] == MarkerStatus.MEASURED:

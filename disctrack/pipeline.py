@@ -18,7 +18,7 @@ from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, iter_pair_blocks
 from disctrack.recording import Recording
 from disctrack.storage import Provenance
-from disctrack.tracking import TrackingSettings, track
+from disctrack.tracking import TrackingSettings, prepare, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Progress = Callable[[int], None]
@@ -109,6 +109,7 @@ def measure(
             yield block
 
     stamps = pairs.left.timestamps
+    prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
     began = time.perf_counter()
     tracking = track(
         read_blocks,
@@ -129,6 +130,7 @@ def measure(
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,
+        "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
     }
     trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start)

@@ -91,8 +91,10 @@ def fit_poses(
     without a start, is NaN. One camera alone is enough for a pose; its covariance tells how much worse it is.
     """
     n = len(markers_px)
-    seen = np.isfinite(markers_px).all(-1) & np.isfinite(markers_covariance_px2).all((-1, -2))
-    possible = np.isfinite(R_start).all((1, 2)) & np.isfinite(t_start).all(1)
+    seen = np.asarray(np.isfinite(markers_px).all(-1))
+    seen &= np.isfinite(markers_covariance_px2).all((-1, -2))
+    possible = np.asarray(np.isfinite(R_start).all((1, 2)))
+    possible &= np.isfinite(t_start).all(1)
     used = seen & possible[:, None, None]
     W = whitening(np.where(seen[..., None, None], markers_covariance_px2, np.eye(2)))
     observed = np.where(seen[..., None], markers_px, 0.0)

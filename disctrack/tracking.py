@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from calibration.camera import StereoRig
 from disctrack import _kernels as kernels
@@ -228,6 +228,32 @@ def track(
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     return _assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
+
+
+def prepare(dtype: DTypeLike = np.uint8) -> None:
+    """Compile the inner loops for images of this type, or load them: 20 s once per installation, then nothing."""
+    zeros = np.zeros
+    kernels.track_frames(
+        zeros((0, 2, 8, 8), dtype),
+        zeros((0, 2), bool),
+        zeros((2, 8, 8)),
+        zeros((2, 8, 8)),
+        zeros((2, 9)),
+        zeros((2, 3, 3)),
+        zeros((2, 3)),
+        zeros((1, 3)),
+        1.0,
+        1.0,
+        zeros(2),
+        zeros((2, 2)),
+        zeros(4),
+        *(np.eye(3), zeros(3), np.eye(3), zeros(3)),
+        zeros((0, 2, 1, kernels.N_RESULT)),
+        zeros((0, 2, 1), np.uint8),
+        zeros((0, 3, 3)),
+        zeros((0, 3)),
+        MAX_PREDICTION_RMS_PX,
+    )
 
 
 def _empty_tables(n: int, m: int) -> _Tables:
