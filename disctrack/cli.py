@@ -18,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("disctrack.commands.run", "calibrate and track a recording: folder in, trajectory and pictures out"),
     "calibrate": ("disctrack.commands.calibrate", "views of a chessboard -> stereo rig with covariance"),
     "track": ("disctrack.commands.track", "recording and rig -> trajectory with covariance"),
+    "simulate": ("disctrack.commands.simulate", "rolling model: scene -> motion, energies, contact forces"),
 }
 
 DONE = 0

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from disctrack.cli import main
 from disctrack.errors import OutputError, SceneError
 from disctrack.rolling import CATALOGUE, effects_from_tables, effects_toml
 from disctrack.rolling.run import run_simulate
@@ -111,3 +112,30 @@ def test_effects_survive_their_toml():
     effects = tuple(effect() for effect in CATALOGUE.values())
     tables = tomllib.loads(effects_toml(effects))["motion"]["rolling"]["effects"]
     assert effects_from_tables(tables) == effects
+
+
+def test_command_writes_the_motion_and_tells_how_it_went(scene, capsys):
+    assert main(["simulate", str(scene), "--duration", "0.05", "--rate", "1000"]) == 0
+    said = capsys.readouterr().out
+    assert "scene_motion.h5" in said
+    assert "nutation 8" in said
+    with h5py.File(scene.with_name("scene_motion.h5")) as file:
+        assert len(file["time"]) == 51
+
+
+def test_command_answers_mistakes_with_one_line(scene, capsys):
+    assert main(["simulate", str(scene.with_name("nowhere.toml"))]) == 1
+    assert "nowhere.toml" in capsys.readouterr().err
+    scene.write_text(SCENE.replace("k_z = 6e-5", "k_z = -6e-5"))
+    assert main(["simulate", str(scene)]) == 1
+    assert "a passive effect cannot feed the disc with energy" in capsys.readouterr().err
+    scene.write_text(SCENE.replace("effects.kz", "effects.kx"))
+    assert main(["simulate", str(scene)]) == 1
+    said = capsys.readouterr().err
+    assert "there is no effect 'kx'" in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_command_lists_the_effects(capsys):
+    assert main(["simulate", "--list-effects"]) == 0
+    assert "| `km` |" in capsys.readouterr().out
