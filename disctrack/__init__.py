@@ -1,3 +1,88 @@
-"""Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras."""
+"""Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.
+
+The public verbs in the order of the measurement; each is imported when it is first used:
+
+    recording = read_recording("clip")                          # what recording.toml declares
+    found, problems = calibrate_recording(recording)            # -> StereoCalibration, views that could not be read
+    pairs = open_pairs(recording)                               # both cameras' frames, checked to belong together
+    measurement = measure(recording, found.rig, pairs)          # -> Measurement with .trajectory
+    write_trajectory(path, measurement.trajectory, trajectory_provenance(recording, found.rig, pairs, None))
+    trajectory = read_trajectory(path)
+
+Conventions (frames, angles, units, pixels) have one home: the docstring of disctrack.frames.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from disctrack.chessboard_views import calibrate_recording, calibrate_views, find_views
+    from disctrack.disc import Disc
+    from disctrack.errors import DiscTrackError
+    from disctrack.overlay import write_overlay
+    from disctrack.pipeline import Measurement, measure, open_pairs, trajectory_provenance
+    from disctrack.readers import FrameReader, open_frames
+    from disctrack.readers.blocks import iter_pair_blocks
+    from disctrack.recording import Recording, read_recording
+    from disctrack.storage import (
+        Provenance,
+        read_group,
+        read_trajectory,
+        write_csv,
+        write_group,
+        write_trajectory,
+    )
+    from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+_HOME = {
+    "recording": ("Recording", "read_recording"),
+    "readers": ("FrameReader", "open_frames"),
+    "readers.blocks": ("iter_pair_blocks",),
+    "chessboard_views": ("find_views", "calibrate_views", "calibrate_recording"),
+    "disc": ("Disc",),
+    "pipeline": ("open_pairs", "Measurement", "measure", "trajectory_provenance"),
+    "trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
+    "storage": ("Provenance", "write_trajectory", "read_trajectory", "write_csv", "write_group", "read_group"),
+    "overlay": ("write_overlay",),
+    "errors": ("DiscTrackError",),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [  # noqa: RUF022 (in the order of the measurement, not of the alphabet)
+    "read_recording",
+    "Recording",
+    "open_frames",
+    "FrameReader",
+    "iter_pair_blocks",
+    "find_views",
+    "calibrate_views",
+    "calibrate_recording",
+    "Disc",
+    "open_pairs",
+    "measure",
+    "Measurement",
+    "Trajectory",
+    "FrameStatus",
+    "MarkerStatus",
+    "trajectory_provenance",
+    "Provenance",
+    "write_trajectory",
+    "read_trajectory",
+    "write_csv",
+    "write_group",
+    "read_group",
+    "write_overlay",
+    "DiscTrackError",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'disctrack' has no attribute {name!r}")
+    return getattr(import_module(f"disctrack.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

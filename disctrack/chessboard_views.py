@@ -15,6 +15,7 @@ from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers.files import file_number, match_files
 from disctrack.readers.images import decode
+from disctrack.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,21 @@ def _refuse_unpaired(files: Sequence[Sequence[Path]], numbers: Sequence[Sequence
         + (f": without a partner are {' and '.join(odd)}" if odd else "")
         + ". Views are pairs, one image of each camera: add the missing ones, or move these away."
     )
+
+
+def calibrate_recording(
+    recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
+) -> tuple[StereoCalibration, tuple[str, ...]]:
+    """`calibrate_views` with the views, board and table that a recording names. Raises RecordingError if it does not."""
+    chessboard, table = recording.chessboard, recording.table
+    if chessboard is None or table is None:
+        raise RecordingError(
+            f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
+            "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
+        )
+    views = find_views(chessboard.left, chessboard.right, recording.folder)
+    board = Board(chessboard.inner_corners, chessboard.square)
+    return calibrate_views(views, board, table.view, table.board_thickness, settings, progress)
 
 
 def calibrate_views(

@@ -45,3 +45,11 @@ def test_importing_the_package_loads_nothing_heavy():
     heavy = {"cv2", "scipy", "matplotlib", "h5py", "numba"}
     done = run(f"import disctrack, sys; print(sorted({heavy!r} & set(sys.modules)))")
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_every_public_name_is_there():
+    import disctrack
+
+    assert {type(getattr(disctrack, name)).__name__ for name in disctrack.__all__}
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        disctrack.nothing  # noqa: B018
