@@ -64,7 +64,7 @@ def _refuse_unpaired(files: Sequence[Sequence[Path]], numbers: Sequence[Sequence
 def calibrate_recording(
     recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
-    """`calibrate_views` with the views, board and table that a recording names. Raises RecordingError if it does not."""
+    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
     chessboard, table = recording.chessboard, recording.table
     if chessboard is None or table is None:
         raise RecordingError(
