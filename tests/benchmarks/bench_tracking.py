@@ -2,17 +2,17 @@
 
     python tests/benchmarks/bench_tracking.py RECORDING [--rig RIG] [--threads N] [--repeats N]
 
-Prints pairs per second and ratios. Every figure is the best of the repeats, so that other work on the machine counts
-for little; ratios are taken within one run. Not a test: nothing fails here.
+Prints pairs per second, processor time per pair and ratios. Every figure is the best of the repeats; on a busy machine
+trust the processor's time. Not a test: nothing fails here.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -54,34 +54,49 @@ def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int
         run_track(recording, rig, n, lambda a, b: iter_pair_blocks(pairs.left, pairs.right, a, b, threads=threads), 1)
 
     track_memory(1)  # compiles
-    seconds = {
-        f"decode alone: cv2.imread, {threads} threads": best(lambda: decode_alone(pairs, threads), repeats),
-        f"our reader alone, {threads} threads": best(lambda: read_alone(pairs, threads), repeats),
-        f"reading + tracking, {threads} reading threads": best(track_files, repeats),
-        "tracking, frames in memory, 1 worker": best(lambda: track_memory(1), repeats),
-        f"tracking, frames in memory, {threads} workers": best(lambda: track_memory(threads), repeats),
-        "plain OpenCV + SciPy, frames in memory": best(lambda: plain_script(recording, rig, memory, from_memory[0]), 1),
-    }
+    track_files()
+    decode, reader, files, one, many, plain = (
+        Timing.of(f"decode alone: cv2.imread, {threads} threads", lambda: decode_alone(pairs, threads), repeats),
+        Timing.of(f"our reader alone, {threads} threads", lambda: read_alone(pairs, threads), repeats),
+        Timing.of(f"reading + tracking, {threads} reading threads", track_files, repeats),
+        Timing.of("tracking, frames in memory, 1 worker", lambda: track_memory(1), repeats),
+        Timing.of(f"tracking, frames in memory, {threads} workers", lambda: track_memory(threads), repeats),
+        Timing.of(
+            "plain OpenCV + SciPy, frames in memory", lambda: plain_script(recording, rig, memory, from_memory[0]), 1
+        ),
+    )
     print(f"{recording.name}: {n} pairs of {memory.shape[3]} x {memory.shape[2]} px, {threads} threads")
-    for name, value in seconds.items():
-        print(f"  {name:<48} {n / value:8.0f} pairs/s")
-    decode, reader, files, one, many, plain = seconds.values()
-    print(f"  our reader / decode alone                        {reader / decode:8.2f}   (time)")
-    print(f"  reading + tracking / decode alone                {files / decode:8.2f}   (time; 1.25 is the aim)")
-    print(f"  plain script / ours, frames in memory, 1 worker  {plain / one:8.1f}   (time)")
-    print(f"  {threads} workers / 1 worker                            {one / many:8.2f}   (speed)")
-    print(f"  largest memory, {memory.nbytes >> 20} MB of frames held included  "
-          f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10:8d} MB")  # fmt: skip
+    for timing in (decode, reader, files, one, many, plain):
+        print(
+            f"  {timing.what:<46} {n / timing.wall:7.0f} pairs/s  {1e3 * timing.processor / n:7.2f} ms of a core/pair"
+        )
+    print(f"  {'ratios of time':<46} {'elapsed':>8} {'of a core':>10}")
+    for what, a, b in (
+        ("our reader / decode alone", reader, decode),
+        ("reading + tracking / decode alone (aim: 1.25)", files, decode),
+        ("plain script / ours, frames in memory", plain, one),
+        (f"1 worker / {threads} workers", one, many),
+    ):
+        print(f"  {what:<46} {a.wall / b.wall:8.2f} {a.processor / b.processor:10.2f}")
 
 
-def best(action: Callable[[], object], repeats: int) -> float:
-    """Shortest time of `repeats` runs [s]."""
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - began)
-    return min(times)
+@dataclass(frozen=True)
+class Timing:
+    """Shortest elapsed and shortest processor time [s] of some repeats; the latter is blind to a busy machine."""
+
+    what: str
+    wall: float
+    processor: float
+
+    @classmethod
+    def of(cls, what: str, action: Callable[[], object], repeats: int) -> Timing:
+        walls, processors = [], []
+        for _ in range(repeats):
+            wall, processor = time.perf_counter(), time.process_time()
+            action()
+            walls.append(time.perf_counter() - wall)
+            processors.append(time.process_time() - processor)
+        return cls(what, min(walls), min(processors))
 
 
 def run_track(recording: Recording, rig: StereoRig, n: int, read_blocks: Callable, workers: int) -> Tracking:
