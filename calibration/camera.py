@@ -62,22 +62,15 @@ def project(points_camera: Array, camera: Camera) -> Array:
 
 def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array, Array, Array]:
     """Pixels (..., 2), d pixel / d point (..., 2, 3) and d pixel / d intrinsics (..., 2, 9); NaN behind the camera."""
-    k1, k2, p1, p2, k3 = camera.distortion
     X, Y, Z = np.moveaxis(np.asarray(points_camera, float), -1, 0)
     Z = np.where(Z > 0, Z, np.nan)
     iz = 1.0 / Z
     a, b = X * iz, Y * iz
     r2 = a * a + b * b
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    radial_r2 = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2
-    xd = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    yd = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
+    yd_a = xd_b
     pixels = np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
 
-    xd_a = radial + 2 * a * a * radial_r2 + 2 * p1 * b + 6 * p2 * a
-    xd_b = 2 * a * b * radial_r2 + 2 * p1 * a + 2 * p2 * b
-    yd_a = xd_b
-    yd_b = radial + 2 * b * b * radial_r2 + 6 * p1 * b + 2 * p2 * a
     d_point = np.empty((*a.shape, 2, 3))
     d_point[..., 0, 0] = camera.fx * xd_a * iz
     d_point[..., 0, 1] = camera.fx * xd_b * iz
@@ -99,33 +92,42 @@ def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array,
     return pixels, d_point, d_intrinsics
 
 
+def _distorted(a: Array, b: Array, camera: Camera) -> tuple[Array, Array, Array, Array, Array]:
+    """Brown's distortion of normalised coordinates: xd, yd, dxd/da, dxd/db (= dyd/da), dyd/db."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = a * a + b * b
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial_r2 = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2
+    xd = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    yd = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    xd_a = radial + 2 * a * a * radial_r2 + 2 * p1 * b + 6 * p2 * a
+    xd_b = 2 * a * b * radial_r2 + 2 * p1 * a + 2 * p2 * b
+    yd_b = radial + 2 * b * b * radial_r2 + 6 * p1 * b + 2 * p2 * a
+    return xd, yd, xd_a, xd_b, yd_b
+
+
 def normalise(pixels: Array, camera: Camera, iterations: int = 20) -> Array:
     """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `project` up to depth.
 
     Newton's method on the distortion; NaN where it does not return to the pixel within 1e-6 px (beyond the radius at
     which the distortion polynomial folds).
     """
-    target = np.asarray(pixels, float)
-    ab = np.stack([(target[..., 0] - camera.cx) / camera.fx, (target[..., 1] - camera.cy) / camera.fy], axis=-1)
-    ones = np.ones((*ab.shape[:-1], 1))
-    for _ in range(iterations):
-        found, d_point, _ = project_with_jacobians(np.concatenate([ab, ones], axis=-1), camera)
-        residual = target - found
-        J = d_point[..., :2]
-        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        step = np.stack(
-            [
-                (J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]) / det,
-                (J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]) / det,
-            ],
-            axis=-1,
-        )
-        ab = ab + step
-        if not np.any(np.abs(step) > 1e-13):
-            break
-    found = project(np.concatenate([ab, ones], axis=-1), camera)
-    bad = ~(np.linalg.norm(found - target, axis=-1) < 1e-6)
-    return np.where(bad[..., None], np.nan, ab)
+    pixels = np.asarray(pixels, float)
+    x, y = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
+    a, b = x.copy(), y.copy()
+    with np.errstate(all="ignore"):  # beyond the fold the iteration may run away; it is judged below
+        for _ in range(iterations):
+            xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
+            rx, ry = x - xd, y - yd
+            det = xd_a * yd_b - xd_b * xd_b
+            step_a, step_b = (yd_b * rx - xd_b * ry) / det, (xd_a * ry - xd_b * rx) / det
+            a, b = a + step_a, b + step_b
+            largest = np.fmax.reduce(np.abs(np.concatenate([step_a.ravel(), step_b.ravel()])), initial=0.0)  # NaN-blind
+            if largest < 1e-13:
+                break
+        xd, yd, *_ = _distorted(a, b, camera)
+        good = np.hypot(camera.fx * (xd - x), camera.fy * (yd - y)) < 1e-6
+    return np.where(good[..., None], np.stack([a, b], axis=-1), np.nan)
 
 
 @dataclass(frozen=True)

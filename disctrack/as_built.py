@@ -173,12 +173,12 @@ def _shared_normal_equations(
     m = disc.n_markers
     for block in np.array_split(np.arange(len(R)), max(1, len(R) // 256)):
         pixels, P = marker_pixels(R[block], t[block], rig, disc.marker_centres_body)
-        _, d_world, d_rig = rig.project_with_jacobians(
-            disc.marker_centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None]
-        )
-        d_body = d_world @ R[block][:, None, None]
+        # d pixel / d point of the body = d pixel / d translation turned into body axes
+        d_body = P[..., :3] @ R[block][:, None, None]
         C = np.zeros((len(block), 2, m, 2, N_RIG + 2 * m))
-        C[..., :N_RIG] = d_rig
+        if free[:N_RIG].any():
+            points = disc.marker_centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None]
+            C[..., :N_RIG] = rig.project_with_jacobians(points)[2]
         for k in range(m):
             C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
         seen = used[block]

@@ -61,7 +61,7 @@ MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES = 12
 MIN_GOOD_DOT_IMAGES = 6
 MIN_PAIRS_PER_WORKER = 200  # a stretch must outweigh its own search for the disc
-SHARED_FRAMES = 2000  # frames that enter the refinement of what all frames share; more add nothing but time
+SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
 
 @dataclass(frozen=True)
@@ -338,7 +338,7 @@ def _measure_blur_and_noise(
     following: tuple[Array, Array] | None,
 ) -> None:
     n, m = min(NOISE_FRAMES, len(images)), follower.disc.n_markers
-    for _ in range(2):  # the second time with the blur and the noise of the first
+    for blur_known in (False, True):  # the second time with the blur of the first
         follower.start_from(pose, following)
         trial = _empty_tables(n, m)
         done = follower.run(images[:n], readable[:n], trial, slice(0, n))
@@ -349,6 +349,8 @@ def _measure_blur_and_noise(
             if not good.any():
                 continue
             follower.blur[camera] = float(np.median(trial.results[:done, camera, :, kernels.FIT_SIGMA][good]))
+            if not blur_known:
+                continue
             follower.noise[camera] = measure_noise(
                 [images[k, camera] for k in range(done)],
                 follower.rig.cameras[camera],

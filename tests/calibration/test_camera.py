@@ -1,0 +1,102 @@
+"""The camera model against OpenCV's, its derivatives against differences, its inverse against itself."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration.camera import (
+    N_RIG,
+    Camera,
+    StereoRig,
+    normalise,
+    project,
+    project_with_jacobians,
+    rotation_from_vector,
+    triangulate,
+)
+
+CAMERA = Camera(1500.0, 1510.0, 250.0, 260.0, (-0.11, 0.15, 1e-3, -2e-3, 0.02), (512, 512))
+
+
+@pytest.fixture
+def points(rng):
+    return rng.uniform([-0.07, -0.07, 0.35], [0.07, 0.07, 0.5], (200, 3))
+
+
+@pytest.fixture
+def rig():
+    turn, look = np.array([0.1, 0.5, 0.2]), np.array([1.0, 0.5, 0.2])
+    return StereoRig(
+        CAMERA,
+        Camera(1490.0, 1495.0, 262.0, 249.0, (-0.12, 0.2, -5e-4, 1e-3, 0.0), (512, 512)),
+        rotation_from_vector(turn),
+        np.array([0.1, 0.02, 0.1]),
+        rotation_from_vector(look),
+        np.array([0.0, 0.02, 0.5]),
+    )
+
+
+def test_projection_is_opencvs(points):
+    zero = np.zeros(3)
+    expected, _ = cv2.projectPoints(points, zero, zero, CAMERA.camera_matrix, np.array(CAMERA.distortion))
+    assert_allclose(project(points, CAMERA), expected.reshape(-1, 2), atol=1e-10)
+
+
+def test_derivatives_by_the_point_and_the_intrinsics_agree_with_differences(points):
+    _, d_point, d_intrinsics = project_with_jacobians(points, CAMERA)
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-6
+        numeric = (project(points + step, CAMERA) - project(points - step, CAMERA)) / 2e-6
+        assert_allclose(numeric, d_point[..., k], atol=1e-6 * np.abs(d_point).max())
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = 1e-4 * max(1.0, abs(CAMERA.parameters[k]))
+        ahead, behind = (Camera.from_parameters(CAMERA.parameters + s * step, (512, 512)) for s in (1, -1))
+        numeric = (project(points, ahead) - project(points, behind)) / (2 * step[k])
+        # linear in every intrinsic: round-off of 500 px over the step
+        assert_allclose(numeric, d_intrinsics[..., k], atol=1e-12 * 500 / step[k] + 1e-9)
+
+
+def test_a_point_behind_the_camera_has_no_image():
+    assert np.isnan(project(np.array([[0.0, 0.0, -0.3], [0.0, 0.0, 0.0]]), CAMERA)).all()
+
+
+def test_normalising_undoes_the_projection(points):
+    assert_allclose(normalise(project(points, CAMERA), CAMERA), points[:, :2] / points[:, 2:], atol=1e-13)
+
+
+def test_one_pixel_without_a_ray_does_not_spoil_the_others():
+    folding = Camera(300.0, 300.0, 256.0, 256.0, (-0.5, 0.0, 0.0, 0.0, 0.0), (512, 512))
+    grid = np.array([[256.0, 256.0], [300.0, 200.0], [0.0, 0.0], [np.nan, 5.0]])
+    rays = normalise(grid, folding)
+    # r (1 - r^2 / 2) has its largest value 0.544 at r = 0.816: the corner, at 1.2, lies beyond the fold
+    assert np.isfinite(rays[:2]).all()
+    assert np.isnan(rays[2:]).all()
+    assert_allclose(project(np.column_stack([rays[:2], np.ones(2)]), folding), grid[:2], atol=1e-9)
+
+
+def test_rig_derivatives_agree_with_differences(rig, rng):
+    world = rng.normal(scale=0.02, size=(4, 5, 3))
+    pixels, d_world, d_rig = rig.project_with_jacobians(world)
+    assert_allclose(pixels, rig.project(world), atol=1e-12)
+    for k in range(N_RIG):
+        step = np.zeros(N_RIG)
+        step[k] = 1e-6
+        numeric = (rig.perturbed(step).project(world) - rig.perturbed(-step).project(world)) / 2e-6
+        assert_allclose(numeric, d_rig[..., k], atol=1e-6 * max(1.0, np.abs(d_rig[..., k]).max()))
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-6
+        numeric = (rig.project(world + step) - rig.project(world - step)) / 2e-6
+        assert_allclose(numeric, d_world[..., k], atol=1e-6 * np.abs(d_world).max())
+
+
+def test_triangulation_returns_the_point(rig, rng):
+    world = rng.normal(scale=0.02, size=(30, 3))
+    pixels = rig.project(world)
+    pixels[0, 7] = np.nan
+    found = triangulate(pixels, rig)
+    assert np.isnan(found[7]).all()
+    assert_allclose(np.delete(found, 7, axis=0), np.delete(world, 7, axis=0), atol=1e-12)
