@@ -55,7 +55,7 @@ class RigSettings:
 class OpticsSettings:
     """Blur and fall-off of the lenses."""
 
-    blur_px: Pair = (0.80, 0.85)  # standard deviation of the Gaussian point spread, left and right
+    blur_px: Pair = (0.60, 0.65)  # standard deviation of the Gaussian point spread, left and right, without the pixel
     vignetting: float = 0.04  # loss of light at the image's corner
 
 
@@ -222,7 +222,7 @@ class Faults:
 class RenderSettings:
     """Fineness of the computation, not of the scene."""
 
-    subpixels: int = 6  # cells per pixel and axis where an edge passes
+    subpixels: int = 5  # cells per pixel and axis where an edge passes
     threads: int = 2
     png_compression: int = 3  # 0 to 9
 

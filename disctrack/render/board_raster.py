@@ -1,4 +1,4 @@
-"""The chessboard in the cells of one camera's sensor; as `disc_raster`, and cells with two edges sampled 8 x 8."""
+"""The chessboard in the cells of one camera's sensor; as `disc_raster`, and cells with two edges sampled 16 x 16."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.render.areas import between, cell_area, plane_point, ray_in_body
+from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -51,31 +51,35 @@ def _board_grid(
 
 
 @numba.njit(cache=True, nogil=True)
-def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) -> float:
-    """Mean grey of one cell that lines may cross."""
+def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) -> tuple[float, float, float]:
+    """Mean grey of one cell that lines may cross, and its first moments."""
     x, y = grid[1, 1]
     line_x, line_y = _nearest_line(x, n_x, margin), _nearest_line(y, n_y, margin)
     g = grid - np.array([line_x, line_y])
-    area_x = cell_area(g[1, 1, 0], g[0, 0, 0], g[0, 2, 0], g[2, 0, 0], g[2, 2, 0])
-    area_y = cell_area(g[1, 1, 1], g[0, 0, 1], g[0, 2, 1], g[2, 0, 1], g[2, 2, 1])
-    cut_x, cut_y = 0.0 < area_x < 1.0, 0.0 < area_y < 1.0
+    part_x = cell_part(g[1, 1, 0], g[0, 0, 0], g[0, 2, 0], g[2, 0, 0], g[2, 2, 0])
+    part_y = cell_part(g[1, 1, 1], g[0, 0, 1], g[0, 2, 1], g[2, 0, 1], g[2, 2, 1])
+    cut_x, cut_y = 0.0 < part_x[0] < 1.0, 0.0 < part_y[0] < 1.0
     if cut_x and cut_y:
-        total = 0.0
-        for i in range(8):
-            for j in range(8):
-                p, q = (i + 0.5) / 8, (j + 0.5) / 8
+        value = m_x = m_y = 0.0
+        for i in range(16):
+            for j in range(16):
+                p, q = (i + 0.5) / 16, (j + 0.5) / 16
                 point = (1 - p) * ((1 - q) * grid[0, 0] + q * grid[0, 2]) + p * ((1 - q) * grid[2, 0] + q * grid[2, 2])
-                total += colours[_board_colour(point[0], point[1], n_x, n_y, margin)]
-        return total / 64.0
+                grey = colours[_board_colour(point[0], point[1], n_x, n_y, margin)] / 256.0
+                value, m_x, m_y = value + grey, m_x + grey * (q - 0.5), m_y + grey * (p - 0.5)
+        return value, m_x, m_y
+    if not (cut_x or cut_y):
+        return colours[_board_colour(x, y, n_x, n_y, margin)], 0.0, 0.0
     if cut_x:
+        part = part_x
         high = colours[_board_colour(line_x + 1e-6, y, n_x, n_y, margin)]
         low = colours[_board_colour(line_x - 1e-6, y, n_x, n_y, margin)]
-        return area_x * high + (1 - area_x) * low
-    if cut_y:
+    else:
+        part = part_y
         high = colours[_board_colour(x, line_y + 1e-6, n_x, n_y, margin)]
         low = colours[_board_colour(x, line_y - 1e-6, n_x, n_y, margin)]
-        return area_y * high + (1 - area_y) * low
-    return colours[_board_colour(x, y, n_x, n_y, margin)]
+    step = high - low
+    return low + step * part[0], step * part[1], step * part[2]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -83,7 +87,7 @@ def draw_board(
     cells: Array32, background: Array32, rays: Array, s: int, R: Array, t: Array, square: float, n_x: int, n_y: int,
     margin: float, white: float, black: float,
 ) -> None:  # fmt: skip
-    """Write the chessboard before the background into `cells`; arguments as in `draw_disc`.
+    """Add the chessboard before the background to `cells`; arguments as in `draw_disc`.
 
     R, t     : R_camera_board, t_camera_board; the board's origin is its lower left inner corner
     n_x, n_y : inner corners along the long and the short side; `margin` in squares
@@ -98,7 +102,7 @@ def draw_board(
             x, y = grid[1, 1]
             y0, x0 = row * s, column * s
             if not ahead or abs(x) > 1e3 or abs(y) > 1e3:
-                cells[y0 : y0 + s, x0 : x0 + s] = background[y0 : y0 + s, x0 : x0 + s]
+                cells[y0 : y0 + s, x0 : x0 + s] += background[y0 : y0 + s, x0 : x0 + s]
                 continue
             reach_x = 1.5 * max(
                 abs(grid[0, 0, 0] - x), abs(grid[0, 2, 0] - x), abs(grid[2, 0, 0] - x), abs(grid[2, 2, 0] - x)
@@ -110,10 +114,11 @@ def draw_board(
                 colour = _board_colour(x, y, n_x, n_y, margin)
                 for i in range(s):
                     for j in range(s):
-                        cells[y0 + i, x0 + j] = colours[colour] if colour else background[y0 + i, x0 + j]
+                        cells[y0 + i, x0 + j] += colours[colour] if colour else background[y0 + i, x0 + j]
                 continue
             for i in range(s):
                 for j in range(s):
                     _board_grid(grid, i / s, j / s, 1.0 / s, corners, R, eye)
                     colours[0] = background[y0 + i, x0 + j]
-                    cells[y0 + i, x0 + j] = _board_cell(grid, colours, n_x, n_y, margin)
+                    value, m_x, m_y = _board_cell(grid, colours, n_x, n_y, margin)
+                    deposit(cells, y0 + i, x0 + j, value, m_x, m_y)

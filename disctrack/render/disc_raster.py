@@ -2,7 +2,7 @@
 
 A pixel that no edge crosses is one value. A crossed pixel is cut into s x s cells, and in each the area of every
 surface is found from signed distances (`areas`); the error is of third order in the cell's size. Compiled, because
-cells are many: 25 ms for a disc that fills a third of 512 x 512 with s = 6.
+cells are many: 20 ms for a disc that fills a third of 512 x 512 with s = 5.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.render.areas import between, cell_area, plane_point, ray_in_body
+from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -84,8 +84,9 @@ def _fill_circle(
             continue
         for j in range(s):
             middle = _circle_distance(corners, (i - 0.5) / s, (j + 0.5) / s, R, eye, cap, circle)
-            area = cell_area(middle, f[0, j], f[0, j + 1], f[1, j], f[1, j + 1])
-            cells[y0 + i - 1, x0 + j] += weight * (area * inner + (1.0 - area) * outer)
+            area, m_x, m_y = cell_part(middle, f[0, j], f[0, j + 1], f[1, j], f[1, j + 1])
+            step = weight * (inner - outer)
+            deposit(cells, y0 + i - 1, x0 + j, weight * outer + step * area, step * m_x, step * m_y)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -175,28 +176,42 @@ def draw_disc(
                 for j in range(s):
                     rx, ry = between(corners, (i + 0.5) / s, (j + 0.5) / s)
                     _disc_fields(rx, ry, *shape, centre)
-                    value = _disc_cell(
+                    value, m_x, m_y = _disc_cell(
                         centre, f[i, j], f[i, j + 1], f[i + 1, j], f[i + 1, j + 1],
                         background[y0 + i, x0 + j], grey, ring, upper, cap_visible,
                     )  # fmt: skip
-                    cells[y0 + i, x0 + j] += weight * value
+                    deposit(cells, y0 + i, x0 + j, weight * value, weight * m_x, weight * m_y)
+
+
+@numba.njit(cache=True, nogil=True)
+def _larger(first: tuple[float, float, float], second: tuple[float, float, float]) -> tuple[float, float, float]:
+    return first if first[0] >= second[0] else second
 
 
 @numba.njit(cache=True, nogil=True)
 def _disc_cell(
     centre: Array, a: Array, b: Array, c: Array, d: Array, back: float, grey: Array, ring: float, upper: bool,
     cap_visible: bool,
-) -> float:  # fmt: skip
-    """Mean grey of one cell from the fields at its centre and corners: body before table, cap before side, ..."""
-    area_cap = cell_area(centre[0], a[0], b[0], c[0], d[0])
-    area_body = max(area_cap, cell_area(centre[3], a[3], b[3], c[3], d[3]))
+) -> tuple[float, float, float]:  # fmt: skip
+    """Mean grey of one cell and its first moments from the fields at its centre and corners.
+
+    Painted from behind: table, body, visible cap, paper, dot; each lies within the one before.
+    """
+    cap = cell_part(centre[0], a[0], b[0], c[0], d[0])
+    body = _larger(cap, cell_part(centre[3], a[3], b[3], c[3], d[3]))
     if centre[5] > 0.0:
-        area_body = max(area_body, cell_area(centre[4], a[4], b[4], c[4], d[4]))
+        body = _larger(body, cell_part(centre[4], a[4], b[4], c[4], d[4]))
+    step = grey[3] - back
+    value, m_x, m_y = back + step * body[0], step * body[1], step * body[2]
     if not cap_visible:
-        area_cap = 0.0
-    value = (1.0 - area_body) * back + grey[3] * (area_body - area_cap)
+        return value, m_x, m_y
+    step = ring - grey[3]
+    value, m_x, m_y = value + step * cap[0], m_x + step * cap[1], m_y + step * cap[2]
     if not upper:
-        return value + ring * area_cap
-    area_paper = min(area_cap, cell_area(centre[1], a[1], b[1], c[1], d[1]))
-    area_dot = min(area_paper, cell_area(centre[2], a[2], b[2], c[2], d[2]))
-    return value + ring * (area_cap - area_paper) + grey[0] * (area_paper - area_dot) + grey[1] * area_dot
+        return value, m_x, m_y
+    paper = cell_part(centre[1], a[1], b[1], c[1], d[1])
+    step = grey[0] - ring
+    value, m_x, m_y = value + step * min(paper[0], cap[0]), m_x + step * paper[1], m_y + step * paper[2]
+    dot = cell_part(centre[2], a[2], b[2], c[2], d[2])
+    step = grey[1] - grey[0]
+    return value + step * min(dot[0], paper[0], cap[0]), m_x + step * dot[1], m_y + step * dot[2]

@@ -305,7 +305,7 @@ def render_board(
 def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stage, scene: Scene) -> Grey:
     """Expected grey values (height, width) of the chessboard at rest in one camera."""
     view, board = stage.view, scene.board
-    cells = np.empty_like(stage.cells)
+    cells = np.zeros_like(stage.cells)
     light = optics.face_brightness(R_world_board[:, 2], scene)
     draw_board(
         cells, stage.cells, stage.rays, stage.s,

@@ -22,13 +22,14 @@ _TEXEL = 0.25e-3  # [m]; the texture repeats after 256 mm
 def blur_weights(sigma: float, s: int) -> Array32:
     """Weights of the cells around a pixel: Gaussian point spread (sigma [px]) seen by a square pixel.
 
-    (2 reach s + s,) for pixels -reach ... reach. The function G * box at the cells' centres, normalised; the area
-    average within the cell itself adds 1 / (12 s^2) px^2 of variance, which is taken off sigma^2.
+    (2 reach s + s,) for pixels -reach ... reach. The function G * box at the cells' centres, normalised. Light at u
+    from a cell's centre is laid down as 1 there and +-u / 2 on its neighbours (`areas.deposit`), which has the second
+    moment -u^2 about its true place, -1 / (12 s^2) px^2 on average: that is added to sigma^2.
     """
     reach = blur_reach(sigma)
-    narrowed = np.sqrt(max(sigma**2 - 1 / (12 * s**2), 1e-4))
+    widened = np.sqrt(sigma**2 + 1 / (12 * s**2))
     offset = (np.arange((2 * reach + 1) * s) + 0.5) / s - reach - 0.5
-    scale = 1 / (narrowed * np.sqrt(2))
+    scale = 1 / (widened * np.sqrt(2))
     weights = erf((offset + 0.5) * scale) - erf((offset - 0.5) * scale)
     return (weights / weights.sum()).astype(np.float32)
 

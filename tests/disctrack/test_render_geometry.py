@@ -114,7 +114,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
     scene = replace(PLAIN, appearance=replace(PLAIN.appearance, board_white=0.0, board_black=200.0))
     R = rotation_from_euler(0.4, 0.3, -0.2)
     t = np.array([0.002, 0.004, 0.012])
-    fine = replace(scene, cameras=CameraSettings(bit_depth=16), render=replace(scene.render, subpixels=6))
+    fine = replace(scene, cameras=CameraSettings(bit_depth=16), render=replace(scene.render, subpixels=5))
     image = render.render_board(R, t, rig, fine)[0, index] / (65535 / 255)
     total, moment = 0.0, np.zeros(2)
     for i in range(-1, 9):
@@ -136,14 +136,14 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
                 area, centroid = polygon_moments(cv2_pixels(corners @ R.T + t, rig, index))
                 total, moment = total + area, moment + area * centroid
     mass, found = image_moments(image)
-    assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and 8 x 8 samples at corners: 1e-4 px
+    assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and 16 x 16 samples at corners: 1e-4 px
     assert_allclose(mass / 200, total, rtol=1e-4)
 
 
 def test_edges_have_converged(rig):
     coarse, fine = (
         render.expected_disc(POSES, rig, MA_2014, replace(PLAIN, render=replace(PLAIN.render, subpixels=s)))
-        for s in (6, 12)
+        for s in (5, 15)
     )
     assert np.abs(coarse - fine).max() < 0.1  # grey levels of 165
 
@@ -154,7 +154,7 @@ def test_chessboard_has_converged(rig):
         render.render_board(
             R, t, rig, replace(PLAIN, cameras=CameraSettings(bit_depth=16), render=replace(PLAIN.render, subpixels=s))
         )
-        for s in (6, 12)
+        for s in (5, 15)
     )
     assert np.abs(coarse.astype(int) - fine).max() / 257 < 0.1  # grey levels of 180
 
@@ -169,12 +169,14 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
     assert np.abs(shift).max() > 10e-3  # ten times the tolerance above
 
 
-def test_area_of_a_half_plane_in_a_cell(rng):
-    from disctrack.render.areas import half_plane_area
+def test_area_and_moments_of_a_half_plane_in_a_cell(rng):
+    from disctrack.render.areas import half_plane
 
     grid = (np.arange(500) + 0.5) / 500 - 0.5
-    for f0, a, b in rng.normal(size=(40, 3)) * [0.5, 1.0, 1.0]:
-        sampled = np.mean(f0 + a * grid + b * grid[:, None] > 0)
-        assert half_plane_area(f0, a, b) == pytest.approx(sampled, abs=2e-3)  # one line of 500 samples
-        assert half_plane_area(f0, a, b) + half_plane_area(-f0, a, b) == pytest.approx(1.0, abs=1e-12)
-    assert half_plane_area(0.1, 1.0, 0.0) == pytest.approx(0.6, abs=1e-12)
+    x, y = np.meshgrid(grid, grid)
+    for f0, a, b in [*(rng.normal(size=(40, 3)) * [0.5, 1.0, 1.0]), (0.1, 1.0, 0.0), (0.1, 1e-4, -1.0)]:
+        inside = f0 + a * x + b * y > 0
+        sampled = [np.mean(inside), np.mean(inside * x), np.mean(inside * y)]
+        assert_allclose(half_plane(f0, a, b), sampled, atol=2e-3)  # one line of 500 samples
+        # with the other half it makes the whole square: area 1, moments 0
+        assert_allclose(np.add(half_plane(f0, a, b), half_plane(-f0, -a, -b)), [1, 0, 0], atol=1e-9)
