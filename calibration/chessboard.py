@@ -17,6 +17,7 @@ from calibration._corner_kernel import N_CORNER, fit_corners
 
 Array = NDArray[np.float64]
 
+SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
 MIN_WINDOW = 0.3
 EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
@@ -122,13 +123,16 @@ def _as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
 
 def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Array | None:
     """Corners (n, 2) [px] to about a pixel in any of the board's orders, or None."""
+    scale = min(1.0, SEARCH_SIZE / max(grey.shape))
+    if scale < 1.0:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(grey, inner_corners, None, flags)
     if not found:
         found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
     if not found or corners is None:
         return None
-    points = np.asarray(corners, np.float64).reshape(-1, 2)
+    points = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     return points if len(points) == inner_corners[0] * inner_corners[1] else None
 
 

@@ -118,6 +118,16 @@ def test_wrong_counts_are_refused(board_drawer, counts):
     assert "inner corners" in found.reason.lower()
 
 
+def test_an_image_too_large_for_the_rough_search_loses_nothing(board_drawer):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board, (10, 20, 30))
+    image = board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(6))
+    large = np.full((1200, 2000), 80, np.uint8)
+    large[700:940, 1500:1820] = image
+    offset = np.array([1500, 700])
+    assert_allclose(find_corners(large, (9, 6)).points - offset, find_corners(image, (9, 6)).points, atol=1e-4)
+
+
 def test_an_empty_or_noisy_image_holds_no_board(rng):
     for image in (np.full((240, 320), 90, np.uint8), rng.integers(0, 256, (240, 320)).astype(np.uint8)):
         assert isinstance(find_corners(image, (9, 6)), BoardNotFound)

@@ -1,12 +1,23 @@
 """Calibration of real photographs and of the reference recording, against figures found elsewhere."""
 
 import json
+from dataclasses import replace
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 
-from calibration import Board, calibrate_stereo
+from calibration import (
+    Board,
+    CalibrationSettings,
+    Camera,
+    calibrate_from_corners,
+    calibrate_stereo,
+    find_corners,
+    triangulate,
+)
+from calibration.images import calibrate_files, find_pairs
 
 
 def read_pairs(folder, pattern, indices):
@@ -20,7 +31,8 @@ def read_pairs(folder, pattern, indices):
 def opencv_photographs(shared_data):
     folder = shared_data / "opencv_stereo_chessboard"
     reference = json.loads((folder / "reference.json").read_text())
-    return read_pairs(folder, "{side}{i:02d}.jpg", reference["pairs"]), reference
+    left, right = read_pairs(folder, "{side}{i:02d}.jpg", reference["pairs"])
+    return [[find_corners(image, (9, 6)) for image in side] for side in (left, right)], reference
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +43,7 @@ def rec_a_calibration(shared_data):
 
 def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     (left, right), reference = opencv_photographs
-    found = calibrate_stereo(left, right, Board((9, 6), 25e-3))
+    found = calibrate_from_corners(left, right, Board((9, 6), 25e-3))
     assert found.refinement.terms.board == "free"  # held-out error finds that this board is not flat
     assert found.rms_px <= 0.15  # PROVENANCE.md: a converged adjustment of cornerSubPix's corners reaches 0.1497
     assert 83.2e-3 <= found.rig.baseline <= 83.4e-3
@@ -39,6 +51,54 @@ def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     assert abs(1e3 * found.rig.baseline - reference["converged_ba_win5"]["free_board"]["baseline_mm"]) < 0.1
     assert len(found.rejected_corners()) < 0.05 * len(found.refinement.kept)
     assert np.isfinite(found.rms_per_view_px).all()
+
+
+def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
+    (left, right), reference = opencv_photographs
+    found = calibrate_from_corners(left, right, Board((9, 6), 25e-3), CalibrationSettings("k1 k2 p1 p2 k3", "flat"))
+    assert found.rms_px <= 0.20  # 0.2150 with cornerSubPix at its best fixed window
+    assert abs(1e3 * found.rig.baseline - reference["converged_ba_win5"]["flat"]["baseline_mm"]) < 0.1
+    assert found.assessment.inflation > 2  # a bent board shows as views that disagree
+
+
+def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
+    with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
+        truth = file["rig/parameters"][()]
+        rotations = {name: file["rig"][name][()] for name in ("R_right_left", "R_left_world")}
+    pairs = find_pairs("left/*.png", "right/*.png", sample_clip / "calibration")
+    found = calibrate_files(pairs, Board((9, 6), 6e-3), CalibrationSettings(board="flat"), 0, 3e-3)
+    rig = found.rig
+    error = np.concatenate(
+        [
+            rig.left.parameters - truth[:9],
+            rig.right.parameters - truth[9:18],
+            vector_of(rig.R_right_left @ rotations["R_right_left"].T),
+            rig.t_right_left - truth[21:24],
+            vector_of(rig.R_left_world @ rotations["R_left_world"].T),
+            rig.t_left_world - truth[27:30],
+        ]
+    )
+    free = np.diag(rig.covariance) > 0
+    sigma = np.sqrt(np.diag(rig.covariance)[free])
+    correlation = rig.covariance[np.ix_(free, free)] / sigma / sigma[:, None]
+    z = error[free] / sigma
+    # one draw of 28 numbers: chi-square over its degrees of freedom scatters by 0.27
+    assert 0.3 < z @ np.linalg.solve(correlation, z) / free.sum() < 2.1
+    assert np.abs(error[free][-3:] / sigma[-3:]).max() < 4
+    # what is wanted of it: points above the table within a micrometre
+    assert found.assessment.triangulation_sigma[1] < 1e-6
+    true_rig = replace(
+        rig, left=Camera.from_parameters(truth[:9], (272, 272)), right=Camera.from_parameters(truth[9:18], (272, 272)),
+        R_right_left=rotations["R_right_left"], t_right_left=truth[21:24],
+        R_left_world=rotations["R_left_world"], t_left_world=truth[27:30],
+    )  # fmt: skip
+    points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 30e-3, 0], [25e-3, 15e-3, 20e-3]])
+    assert np.abs(triangulate(true_rig.project(points), rig) - points).max() < 2e-6
+
+
+def vector_of(R):
+    """Small rotation vector of R (3, 3)."""
+    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
 def test_rec_a_lab_frame_is_where_the_views_suggest(rec_a_calibration):

@@ -184,6 +184,10 @@ def test_opencv_yaml_without_unit_or_with_rational_distortion_is_refused(rig, tm
     (tmp_path / "no_R.yml").write_text(text.replace("\nR:", "\nQ:"))
     with pytest.raises(RigFileError, match="R missing"):
         import_opencv(tmp_path / "no_R.yml")
+    for cut in range(0, len(text), 37):
+        (tmp_path / "cut.yml").write_text(text[:cut])
+        with contextlib.suppress(RigFileError):
+            import_opencv(tmp_path / "cut.yml")
     (tmp_path / "junk.yml").write_text("%YAML:1.0\n---\nM1: [1, 2")
     with pytest.raises(RigFileError, match=r"junk\.yml"):
         import_opencv(tmp_path / "junk.yml")
