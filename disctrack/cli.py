@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("disctrack.commands.calibrate", "views of a chessboard -> stereo rig with covariance"),
     "track": ("disctrack.commands.track", "recording and rig -> trajectory with covariance"),
     "simulate": ("disctrack.commands.simulate", "rolling model: scene -> motion, energies, contact forces"),
+    "render": ("disctrack.commands.render", "scene -> recording as the cameras would write it, and its truth"),
 }
 
 DONE = 0
