@@ -207,6 +207,7 @@ def measure_noise(
     poses_camera_body: list[tuple[Array, Array]],
     disc: Disc,
     maps: tuple[Array, Array],
+    blur_px: float = TYPICAL_BLUR_PX,
 ) -> NoiseModel:
     """Photon transfer from the dots themselves: variance against mean in the flat parts inside and beside each dot.
 
@@ -216,16 +217,16 @@ def measure_noise(
     """
     means, variances, weights = [], [], []
     radius = 0.5 * disc.marker_diameter
+    flat = max(4.0 * blur_px, 2.5)  # [px] from the edge: beyond, the blur's tail is below 1e-4 of the contrast
     for image, (R, t) in zip(images, poses_camera_body, strict=True):
-        pixels = _dot_windows(camera, R, t, disc, image.shape)
-        for centre, (x0, x1, y0, y1) in pixels:
+        for centre, (x0, x1, y0, y1) in _dot_windows(camera, R, t, disc, image.shape, flat + 5.0):
             M = np.column_stack([R[:, 0], R[:, 1], R[:, 2] * centre[2] + t])
             xn, yn = maps[0][y0:y1, x0:x1], maps[1][y0:y1, x0:x1]
             plane = np.einsum("ij,jvu->ivu", np.linalg.inv(M), np.stack([xn, yn, np.ones_like(xn)]))
             rho = np.hypot(plane[0] / plane[2] - centre[0], plane[1] / plane[2] - centre[1])
             step = np.hypot(*np.gradient(rho))  # plane units per pixel
             distance = (rho - radius) / step
-            for part in (distance < -3.5, (distance > 3.5) & (distance < 8.0)):
+            for part in (distance < -flat, (distance > flat) & (distance < flat + 4.5)):
                 v, u = np.nonzero(part)
                 if len(v) < 20:
                     continue
@@ -256,7 +257,7 @@ def measure_noise(
 
 
 def _dot_windows(
-    camera: Camera, R: Array, t: Array, disc: Disc, shape: tuple[int, ...]
+    camera: Camera, R: Array, t: Array, disc: Disc, shape: tuple[int, ...], margin: float
 ) -> list[tuple[Array, tuple[int, int, int, int]]]:
     result = []
     angle = np.radians(np.arange(0, 360, 15))
@@ -265,7 +266,7 @@ def _dot_windows(
         outline = project((centre + ring) @ R.T + t, camera)
         if not np.isfinite(outline).all():
             continue
-        (x0, y0), (x1, y1) = np.floor(outline.min(0)) - 9, np.ceil(outline.max(0)) + 10
+        (x0, y0), (x1, y1) = np.floor(outline.min(0) - margin), np.ceil(outline.max(0) + margin) + 1
         if x0 < 0 or y0 < 0 or x1 > shape[1] or y1 > shape[0]:
             continue
         result.append((centre, (int(x0), int(x1), int(y0), int(y1))))

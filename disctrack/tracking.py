@@ -357,6 +357,7 @@ def _measure_blur_and_noise(
                 [(R_cw @ trial.R[k], R_cw @ trial.t[k] + t_cw) for k in range(done)],
                 follower.disc,
                 (follower.maps_x[camera], follower.maps_y[camera]),
+                follower.blur[camera],
             )
     follower.measured = True
 
