@@ -21,4 +21,4 @@ def test_two_cores_render_five_moving_pairs_per_second():
     start = time.process_time()  # of all threads: other work on the machine does not count
     render.render_disc(q, rig, MA_2014, scene, np.random.default_rng(1), qdot=qdot)
     seconds_per_pair = (time.process_time() - start) / n
-    assert seconds_per_pair < 2 / 5  # two cores; measured 0.18 s
+    assert seconds_per_pair < 2 / 5  # two cores; measured 0.15 s
