@@ -13,13 +13,15 @@ from calibration.errors import CalibrationError, DiscTrackError, RigFileError
 
 if TYPE_CHECKING:
     from calibration.chessboard import BoardNotFound, CornerView, find_corners
-    from calibration.refinement import Observations, StereoModel, Terms, refine_stereo
+    from calibration.refinement import refine_stereo
     from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners, calibrate_stereo
+    from calibration.stereo_model import Observations, StereoModel, Terms
 
 # Imported when asked for: the physics needs the camera model and the errors, not the image library behind these.
 _ON_DEMAND = {
     "chessboard": ("BoardNotFound", "CornerView", "find_corners"),
-    "refinement": ("Observations", "StereoModel", "Terms", "refine_stereo"),
+    "refinement": ("refine_stereo",),
+    "stereo_model": ("Observations", "StereoModel", "Terms"),
     "stereo": ("CalibrationSettings", "StereoCalibration", "calibrate_from_corners", "calibrate_stereo"),
 }
 

@@ -9,7 +9,8 @@ import numpy as np
 from calibration.camera import N_INTRINSIC, Array, StereoRig
 from calibration.errors import CalibrationError
 from calibration.model_choice import Candidate
-from calibration.refinement import Problem, Refinement, minimise
+from calibration.normal_equations import Problem, minimise
+from calibration.refinement import Refinement
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
@@ -239,7 +240,7 @@ def _verdict(
 ) -> str:
     rms = refinement.rms()
     if rms <= 0.05:
-        word = "excellent: rendered views or an etched target reach 0.005 to 0.05 px"
+        word = "excellent: rendered views or an etched target reach 0.002 to 0.05 px"
     elif rms <= GOOD_RMS_PX:
         word = f"good: printed boards usually give 0.1 to {GOOD_RMS_PX} px"
     elif rms <= POOR_RMS_PX:

@@ -1,8 +1,6 @@
-"""Inner corners of a chessboard in one image, with the covariance of each.
+"""Inner corners of a chessboard in one image, in an order that the squares' colours make unambiguous.
 
-OpenCV finds the board roughly; each corner is then fitted to the grey values of its own two edges (`_corner_kernel`),
-in a window that reaches almost to the neighbouring edges whatever the size and slant of the squares. The noise of the
-image is measured inside the squares, so that every corner has a variance and a chi-square of its own.
+OpenCV finds the board roughly; `corner_fit` locates the corners.
 """
 
 from __future__ import annotations
@@ -13,48 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration._corner_kernel import N_CORNER, fit_corners
-
-Array = NDArray[np.float64]
+from calibration.camera import Array
+from calibration.corner_fit import CornerView, fit_view, local_axes
 
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
-MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
-MIN_WINDOW = 0.3
-EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
-MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of two crossing edges
-BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
-MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered or in glare
-MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
-
-
-@dataclass(frozen=True)
-class CornerView:
-    """Inner corners of one view, in the order of `Board.points`."""
-
-    image_size: tuple[int, int]  # width, height [px]
-    points: Array  # (n, 2) [px]; NaN where no fit was possible
-    covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
-    accepted: NDArray[np.bool_]  # (n,)
-    reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds
-    chi_square: Array  # (n,) reduced, of the pixels on the edges
-    contrast: Array  # (n,) light minus dark [grey]
-    blur: Array  # (n,) sigma of the edges [px]
-    spacing: float  # median distance of neighbouring corners [px]
-    noise: tuple[float, float]  # variance of a pixel = noise[0] + noise[1] * grey
-    notes: tuple[str, ...] = ()
-
-    @property
-    def sigma_px(self) -> float:
-        """Root mean square of the accepted corners' standard deviation per axis [px]."""
-        traces = np.trace(self.covariance[self.accepted], axis1=-2, axis2=-1)
-        return float(np.sqrt(np.mean(traces) / 2)) if len(traces) else float("nan")
-
-    def reordered(self, order: NDArray[np.intp]) -> CornerView:
-        """The same view with corner order[i] in place i: for boards whose colouring allows several orders."""
-        arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted", "chi_square")}
-        arrays |= {name: getattr(self, name)[order] for name in ("contrast", "blur")}
-        return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
 
 
 @dataclass(frozen=True)
@@ -102,7 +63,7 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int]) -> CornerView |
     rough = _orient(start, values, inner_corners)
     if isinstance(rough, BoardNotFound):
         return rough
-    view = _fit_view(values, rough, inner_corners)
+    view = fit_view(values, rough, inner_corners)
     if view.accepted.mean() < MIN_ACCEPTED:
         return BoardNotFound(
             f"only {view.accepted.sum()} of {len(view.accepted)} corners look like two crossing edges; "
@@ -178,227 +139,6 @@ def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int,
     return float(values[~like_first].mean() - values[like_first].mean())
 
 
-def _fit_view(grey: Array, rough: Array, inner_corners: tuple[int, int]) -> CornerView:
-    """Fit every corner twice: first to learn blur, noise and the bend of the lines, then with them."""
-    noise, blur, curvature = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 2))
-    points, ok = rough, np.ones(len(rough), bool)
-    axes = _local_axes(points, ok, inner_corners)
-    starts = _starts(grey, points, axes, blur)
-    for iterations, tolerance in ((12, 1e-2), (30, 1e-5)):
-        windows = _windows(points, axes, blur, grey.shape)
-        fit = _Fit(*fit_corners(grey, windows, starts, curvature, noise, iterations, tolerance))
-        displaced = _displacement(fit.found[:, :2], axes, inner_corners)
-        ok = fit.converged & (displaced < MAX_DISPLACEMENT)
-        if not ok.any():
-            break
-        noise, blur = _measured_noise(fit.sums[ok]), float(np.median(fit.found[ok, 4]))
-        points = np.where(ok[:, None], fit.found[:, :2], rough)
-        axes = _local_axes(points, ok, inner_corners)
-        curvature = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
-        starts = np.where(ok[:, None], fit.found, starts)
-    fit = _with_smaller_windows(grey, fit, windows, starts, curvature, noise)
-    displaced = _displacement(fit.found[:, :2], axes, inner_corners)
-    return _judged(grey, fit, displaced, noise, axes)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """What the kernel returns for the corners of a view."""
-
-    found: Array
-    covariance: Array
-    sums: Array
-    converged: NDArray[np.bool_]
-
-    @property
-    def chi_square(self) -> Array:
-        """Reduced chi-square over the whole window (n,); inf where there was no fit."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            value = self.sums[:, 0] / np.maximum(self.sums[:, 1] - N_CORNER, 1.0)
-        return np.where(self.converged & np.isfinite(value), value, np.inf)
-
-
-def _with_smaller_windows(
-    grey: Array, fit: _Fit, windows: Array, starts: Array, curvature: Array, noise: Array
-) -> _Fit:
-    """Fit again, nearer to the corner, where something else reaches into the window (a narrow or dirty square)."""
-    for factor in (0.6, 0.35):
-        limit = BAD_WINDOW * max(float(np.median(fit.chi_square)), 1.0)
-        bad = np.flatnonzero(fit.chi_square > limit)
-        if not len(bad):
-            break
-        smaller = windows[bad].copy()
-        smaller[:, 10:12] *= factor
-        again = _Fit(*fit_corners(grey, smaller, starts[bad], curvature[bad], noise, 30, 1e-5))
-        better = again.chi_square < 0.5 * fit.chi_square[bad]
-        merged = [np.array(getattr(fit, name)) for name in ("found", "covariance", "sums", "converged")]
-        for old, name in zip(merged, ("found", "covariance", "sums", "converged"), strict=True):
-            old[bad[better]] = getattr(again, name)[better]
-        fit = _Fit(*merged)
-    return fit
-
-
-def _grid_homography(points: Array, ok: NDArray[np.bool_], inner_corners: tuple[int, int]) -> Array:
-    columns, rows = inner_corners
-    j, i = np.mgrid[:rows, :columns]
-    board = np.stack([i.ravel(), j.ravel()], axis=-1).astype(float)
-    if ok.sum() < 8:
-        ok = np.ones(len(points), bool)
-    H, _ = cv2.findHomography(board[ok], points[ok])
-    return np.asarray(H, float)
-
-
-def _local_axes(points: Array, ok: NDArray[np.bool_], inner_corners: tuple[int, int]) -> Array:
-    """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
-    columns, rows = inner_corners
-    H = _grid_homography(points, ok, inner_corners)
-    j, i = np.mgrid[:rows, :columns]
-    board = np.stack([i.ravel(), j.ravel(), np.ones(i.size)], axis=-1).astype(float)
-    w = board @ H[2]
-    image = (board @ H[:2].T) / w[:, None]
-    return np.stack([(H[:2, axis] - image * H[2, axis]) / w[:, None] for axis in (0, 1)], axis=1)
-
-
-def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...]) -> Array:
-    """Window of every corner as the kernel wants it (n, 13)."""
-    A = np.swapaxes(axes, 1, 2)  # columns are the images of i and j
-    inverse = np.linalg.inv(A)
-    area = np.abs(np.linalg.det(A))
-    lengths = np.linalg.norm(axes, axis=-1)
-    between = area[:, None] / lengths[:, ::-1]  # distance of neighbouring parallel edges, across them [px]
-    half = np.clip(1.0 - (EDGE_MARGIN * blur + 0.7) / between, MIN_WINDOW, MAX_WINDOW)
-    reach = np.abs(A * half[:, None, :]).sum(-1)
-    low, high = np.ceil(points - reach), np.floor(points + reach)
-    size = np.array([shape[1], shape[0]])
-    low, high = np.clip(low, 0, size - 1), np.clip(high, -1, size - 1)
-    step = 0.5 * between.min(axis=1)
-    return np.column_stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1], points, inverse.reshape(-1, 4), half, step])
-
-
-def _starts(grey: Array, points: Array, axes: Array, blur: float) -> Array:
-    """Start values (n, 9): levels from the four squares round the corner."""
-    offsets = 0.4 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    at = np.rint(points[:, None] + offsets @ axes).astype(int)
-    x = np.clip(at[..., 0], 0, grey.shape[1] - 1)
-    y = np.clip(at[..., 1], 0, grey.shape[0] - 1)
-    levels = grey[y, x]
-    same, other = levels[:, :2].mean(-1), levels[:, 2:].mean(-1)
-    starts = np.zeros((len(points), N_CORNER))
-    starts[:, :2] = points
-    starts[:, 2:4] = np.arctan2(axes[..., 1], axes[..., 0])
-    starts[:, 4] = blur
-    starts[:, 5] = 0.5 * (same + other)
-    # sign(u) sign(v): where alpha and beta are both positive, u = across i has the sign of the area, v the opposite
-    starts[:, 6] = -0.5 * (same - other)
-    return starts
-
-
-def _displacement(found: Array, axes: Array, inner_corners: tuple[int, int]) -> Array:
-    """Distance of every corner from where its neighbours along the lines put it, in squares; (n,)."""
-    columns, rows = inner_corners
-    grid = found.reshape(rows, columns, 2)
-    with np.errstate(invalid="ignore"):
-        predicted = np.full((4, rows, columns, 2), np.nan)
-        predicted[0, :, 1:-1] = 0.5 * (grid[:, 2:] + grid[:, :-2])
-        predicted[1, 1:-1] = 0.5 * (grid[2:] + grid[:-2])
-        predicted[2, :, :-2], predicted[2, :, -2:] = 2 * grid[:, 1:-1] - grid[:, 2:], np.nan
-        predicted[2, :, -2:] = (2 * grid[:, 1:-1] - grid[:, :-2])[:, -2:]
-        predicted[3, :-2] = 2 * grid[1:-1] - grid[2:]
-        predicted[3, -2:] = (2 * grid[1:-1] - grid[:-2])[-2:]
-        distance = np.linalg.norm(predicted - grid, axis=-1).reshape(4, -1)
-        scale = np.linalg.norm(axes, axis=-1).max(-1)
-        distance = np.where(np.isfinite(distance), distance, np.inf)
-    return np.min(distance, axis=0) / scale
-
-
-def _measured_noise(sums: Array) -> Array:
-    """Noise (a, b), variance = a + b grey, from the residuals inside dark and light squares.
-
-    The median over the corners, so that a square with dirt or writing does not count as noise.
-    """
-    floor = 1.0 / 12.0  # quantisation to whole grey values
-    levels = []
-    for r2, grey, n in ((2, 3, 4), (5, 6, 7)):
-        use = sums[sums[:, n] >= 20]
-        levels.append(np.median(use[:, [r2, grey]] / use[:, n : n + 1], axis=0) if len(use) else None)
-    dark, light = levels
-    if dark is None or light is None or not light[1] > dark[1]:
-        either = dark if dark is not None else light
-        return np.array([max(float(either[0]), floor) if either is not None else 1.0, 0.0])
-    low, high = max(dark[0], floor), max(light[0], floor)
-    slope = max((high - low) / (light[1] - dark[1]), 0.0)
-    if slope == 0.0:
-        return np.array([0.5 * (low + high), 0.0])
-    if low - slope * dark[1] < floor:
-        return np.array([floor, max((high - floor) / light[1], 0.0)])
-    return np.array([low - slope * dark[1], slope])
-
-
-def _line_curvature(points: Array, ok: NDArray[np.bool_], angles: Array, inner_corners: tuple[int, int]) -> Array:
-    """Bend of the board's lines at every corner (n, 2) [1/px], half the second derivative across each edge.
-
-    A parabola along each row and column of corners: lens distortion bends a line by far less than a corner's own
-    window could tell.
-    """
-    columns, rows = inner_corners
-    index = np.arange(columns * rows).reshape(rows, columns)
-    curvature = np.zeros((len(points), 2))
-    for axis, lines in ((0, index), (1, index.T)):
-        for line in lines:
-            use = line[ok[line]]
-            if len(use) < 4:
-                continue
-            centre = points[use].mean(0)
-            direction = points[use[-1]] - points[use[0]]
-            direction = direction / np.linalg.norm(direction)
-            d = points[use] - centre
-            bend = np.polyfit(d @ direction, d @ np.array([-direction[1], direction[0]]), 2)[0]
-            # an edge angle may point either way along its line, the kernel's normal follows it
-            edge = np.stack([np.cos(angles[line, axis]), np.sin(angles[line, axis])], axis=-1)
-            curvature[line, axis] = bend * np.sign(edge @ direction)
-    return curvature
-
-
-def _judged(grey: Array, fit: _Fit, displaced: Array, noise: Array, axes: Array) -> CornerView:
-    """Test every corner, and say why one does not hold."""
-    found, covariance, sums, converged = fit.found, fit.covariance, fit.sums, fit.converged
-    edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
-    contrast = 2 * np.abs(found[:, 6])
-    typical = float(np.median(contrast[converged])) if converged.any() else 0.0
-    spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
-    chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
-    reasons = []
-    for i in range(len(found)):
-        if not converged[i] or not np.isfinite(covariance[i]).all():
-            reasons.append("no fit: fewer pixels than parameters, or no crossing edges near the rough corner")
-        elif not displaced[i] < MAX_DISPLACEMENT:
-            reasons.append(f"{displaced[i]:.2f} squares away from where its neighbours put it")
-        elif contrast[i] < MIN_CONTRAST_RATIO * typical:
-            reasons.append(f"contrast {contrast[i]:.1f} grey, the view's median is {typical:.1f}")
-        elif chi_square[i] > chi_limit:
-            reasons.append(
-                f"edges do not fit: reduced chi-square {chi_square[i]:.1f}, the view's median is {spread:.1f}"
-            )
-        else:
-            reasons.append("")
-    accepted = np.array([not reason for reason in reasons])
-    enlarged = covariance * np.maximum(chi_square, 1.0)[:, None, None]
-    return CornerView(
-        image_size=(grey.shape[1], grey.shape[0]),
-        points=np.where(converged[:, None], found[:, :2], np.nan),
-        covariance=np.where(converged[:, None, None], enlarged, np.nan),
-        accepted=accepted,
-        reasons=tuple(reasons),
-        chi_square=chi_square,
-        contrast=contrast,
-        blur=found[:, 4],
-        spacing=float(np.median(np.linalg.norm(axes, axis=-1))),
-        noise=(float(noise[0]), float(noise[1])),
-    )
-
-
 def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:
     """A message if a full line of further corners lies beyond one side: the board is larger than was declared."""
     columns, rows = inner_corners
@@ -407,7 +147,7 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
         "i": (2 * grid[:, 0] - grid[:, 1], 2 * grid[:, -1] - grid[:, -2]),
         "j": (2 * grid[0] - grid[1], 2 * grid[-1] - grid[-2]),
     }
-    axes = _local_axes(view.points, view.accepted, inner_corners).reshape(rows, columns, 2, 2)
+    axes = local_axes(view.points, view.accepted, inner_corners).reshape(rows, columns, 2, 2)
     local = {"i": (axes[:, 0], axes[:, -1]), "j": (axes[0], axes[-1])}
     typical = float(np.median(view.contrast[view.accepted]))
     offsets = 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
@@ -428,3 +168,6 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
                     "count the inner corners again"
                 )
     return None
+
+
+__all__ = ["BoardNotFound", "CornerView", "board_orders", "find_corners", "grey_values"]

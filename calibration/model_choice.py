@@ -9,19 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import Array
-from calibration.refinement import (
+from calibration.normal_equations import Problem, inverse_covariance, minimise
+from calibration.refinement import Refinement, refine_stereo
+from calibration.stereo_model import (
     BOARD_MODELS,
     DISTORTION_MODELS,
     N_STEREO,
     Observations,
-    Problem,
-    Refinement,
     StereoModel,
     Terms,
-    inverse_covariance,
-    minimise,
     predict,
-    refine_stereo,
 )
 
 FOLDS = 5

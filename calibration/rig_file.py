@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from calibration.board import Board
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Array, Camera, StereoRig
 from calibration.errors import RigFileError
-from calibration.refinement import Observations
 from calibration.stereo import StereoCalibration
+from calibration.stereo_model import Observations
 
 SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1

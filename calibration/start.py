@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibration.camera import Array, Camera, rotation_from_vector
 from calibration.errors import CalibrationError
-from calibration.refinement import Observations, StereoModel
+from calibration.stereo_model import Observations, StereoModel
 
 MIN_POINTS = 8  # of one view in one camera, to start its pose
 MIN_VIEWS = 3  # Zhang: fewer do not determine a camera

@@ -15,8 +15,9 @@ from calibration.camera import Array, StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
 from calibration.errors import CalibrationError
 from calibration.model_choice import Candidate, choose_terms
-from calibration.refinement import BOARD_MODELS, DISTORTION_MODELS, Observations, Refinement
+from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
+from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
 from calibration.table_frame import rig_with_covariance
 
 CAMERA_NAMES = ("left", "right")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.camera import N_RIG, Array, StereoRig
-from calibration.refinement import N_STEREO, Refinement
+from calibration.refinement import Refinement
+from calibration.stereo_model import N_STEREO
 
 
 def table_pose(R_left_board: Array, t_left_board: Array, board_thickness: float) -> tuple[Array, Array]:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from calibration.camera import Array
 from calibration.errors import CalibrationError
-from calibration.refinement import Observations, Refinement, Terms, refine_stereo
+from calibration.refinement import Refinement, refine_stereo
 from calibration.start import start_stereo
+from calibration.stereo_model import Observations, Terms
 from disctrack.markers import Image, NoiseModel, locate_on_plane
 from disctrack.trajectory import MarkerStatus
 

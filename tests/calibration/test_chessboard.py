@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 
 from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
 from calibration.camera import project, rotation_from_vector
-from calibration.chessboard import _local_axes, grey_values
+from calibration.chessboard import grey_values
+from calibration.corner_fit import local_axes
 
 CAMERA = Camera(900.0, 905.0, 158.0, 122.0, (-0.1, 0.1, 3e-4, -2e-4, 0.0), (320, 240))
 FACING = np.diag([1.0, -1.0, -1.0])
@@ -173,7 +174,7 @@ def test_local_axes_are_differences_of_neighbours():
     board = Board((9, 6), 8e-3)
     R, t = pose(board)
     points = truth(board, R, t)
-    axes = _local_axes(points, np.ones(54, bool), (9, 6)).reshape(6, 9, 2, 2)
+    axes = local_axes(points, np.ones(54, bool), (9, 6)).reshape(6, 9, 2, 2)
     grid = points.reshape(6, 9, 2)
     assert_allclose(axes[:, 1:-1, 0], 0.5 * (grid[:, 2:] - grid[:, :-2]), atol=0.1)
     assert_allclose(axes[1:-1, :, 1], 0.5 * (grid[2:] - grid[:-2]), atol=0.1)

@@ -11,8 +11,8 @@ from calibration import CalibrationError, Terms, refine_stereo
 from calibration.assessment import consistency_factor
 from calibration.camera import N_RIG
 from calibration.model_choice import choose_terms
-from calibration.refinement import board_basis, moved, predict
 from calibration.start import start_stereo
+from calibration.stereo_model import board_basis, moved, predict
 from calibration.table_frame import rig_with_covariance, table_pose
 
 FULL = Terms("k1 k2 p1 p2")

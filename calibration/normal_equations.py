@@ -1,0 +1,194 @@
+"""Levenberg-Marquardt over cameras, stereo pose, board poses and board shape, the views' poses eliminated.
+
+Parameters fall into shared ones and six per view that only their own view sees, so the normal equations are solved
+through the Schur complement of the views' 6 x 6 blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.camera import Array
+from calibration.errors import CalibrationError
+from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved, predict
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of one linearisation: shared parameters first, the views' poses kept apart."""
+
+    shared: Array  # (n_views, s, s) each view's part
+    gradient: Array  # (n_views, s)
+    cross: Array  # (n_views, s, 6)
+    pose: Array  # (n_views, 6, 6)
+    pose_gradient: Array  # (n_views, 6)
+    cost: float  # chi-square, or Huber's sum when robust
+    residuals: Array  # (m, 2) observed - predicted [px]
+
+    def solve(self, damping: float) -> tuple[Array, Array]:
+        """Damped step of the shared parameters (s,) and of the poses (n_views, 6)."""
+        pose = self.pose * (1 + damping * np.eye(6))
+        carried, own = self._eliminated(pose)
+        total = self.shared.sum(0)
+        schur = total + damping * np.diag(np.diag(total)) - np.einsum("vsi,vit->st", self.cross, carried)
+        step = _scaled_solve(schur, (self.gradient - np.einsum("vsi,vi->vs", self.cross, own)).sum(0))
+        return step, own - carried @ step
+
+    def _eliminated(self, pose: Array) -> tuple[Array, Array]:
+        carried = np.linalg.solve(pose, np.swapaxes(self.cross, 1, 2))  # (v, 6, s)
+        own: Array = np.asarray(np.linalg.solve(pose, self.pose_gradient[..., None])[..., 0], np.float64)
+        return np.asarray(carried, np.float64), own
+
+    def view_information(self) -> tuple[Array, Array]:
+        """What each view, its pose eliminated, tells of the shared parameters: (v, s, s) and gradient (v, s)."""
+        carried, own = self._eliminated(self.pose)
+        return self.shared - self.cross @ carried, self.gradient - np.einsum("vsi,vi->vs", self.cross, own)
+
+    def covariances(self) -> tuple[Array, Array, Array]:
+        """Of the shared parameters (s, s), of each pose (v, 6, 6), and between shared and pose (v, s, 6)."""
+        carried, _ = self._eliminated(self.pose)
+        information = self.shared.sum(0) - np.einsum("vsi,vit->st", self.cross, carried)
+        shared = _scaled_solve(information, np.eye(len(information)))
+        cross = -shared @ np.swapaxes(carried, 1, 2)
+        return shared, np.linalg.inv(self.pose) - carried @ cross, cross
+
+
+def _scaled_solve(A: Array, b: Array) -> Array:
+    """Solve A x = b after scaling A to a unit diagonal: the parameters' units differ by 10^6."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+    columns = scale if b.ndim == 1 else scale[:, None]
+    try:
+        return np.linalg.solve(A * scale[:, None] * scale, b * columns) * columns
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(
+            "the views do not determine all parameters: add views with the board tilted in several directions"
+        ) from error
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a refinement needs besides a start."""
+
+    observations: Observations  # sorted by view
+    weights: Array  # (m, 2, 2) inverse covariance [1/px^2]
+    stereo_basis: Array  # (24, s1) free directions of intrinsics and stereo pose
+    shape_basis: Array  # (n, 3, s2) free directions of the target's points
+    n_views: int
+    huber: float = np.inf  # residuals beyond this many sigmas count linearly
+
+    def linearise(self, model: StereoModel) -> Normal:
+        """Normal equations at the model."""
+        o = self.observations
+        pixels, d_stereo, d_pose, d_point = predict(model, o)
+        residuals = o.pixels - pixels
+        m, s1, s2 = len(o), self.stereo_basis.shape[1], self.shape_basis.shape[-1]
+        s = s1 + s2
+        block = np.empty((m, 2, s + 7))  # derivatives by shared parameters and pose, then the residual
+        block[..., :s1] = (d_stereo.reshape(2 * m, N_STEREO) @ self.stereo_basis).reshape(m, 2, s1)
+        if s2:
+            block[..., s1:s] = d_point @ self.shape_basis[o.point]
+        block[..., s : s + 6] = d_pose
+        block[..., s + 6] = residuals
+        mahalanobis = np.sqrt(quadratic(self.weights, residuals))
+        cost, factor = _huber(mahalanobis, self.huber)
+        block = _whitened(block, self.weights * factor[:, None, None]).reshape(2 * m, s + 7)
+        V = self.n_views
+        squares = np.zeros((V, s + 7, s + 7))
+        bounds = 2 * np.searchsorted(o.view, np.arange(V + 1))
+        for v in range(V):
+            rows = block[bounds[v] : bounds[v + 1]]
+            squares[v] = rows.T @ rows
+        pose = squares[:, s : s + 6, s : s + 6]
+        pose[bounds[1:] == bounds[:-1]] = np.eye(6)
+        return Normal(
+            shared=squares[:, :s, :s],
+            gradient=squares[:, :s, s + 6],
+            cross=squares[:, :s, s : s + 6],
+            pose=pose,
+            pose_gradient=squares[:, s : s + 6, s + 6],
+            cost=cost,
+            residuals=residuals,
+        )
+
+    def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
+        """The model after a step."""
+        s1 = self.stereo_basis.shape[1]
+        return moved(model, self.stereo_basis @ shared[:s1], poses, self.shape_basis @ shared[s1:])
+
+
+def _whitened(block: Array, weights: Array) -> Array:
+    """L^T block for weights = L L^T; block (m, 2, k), weights (m, 2, 2)."""
+    a = np.sqrt(weights[:, 0, 0])
+    b = weights[:, 0, 1] / np.where(a > 0, a, 1.0)
+    c = np.sqrt(np.maximum(weights[:, 1, 1] - b * b, 0.0))
+    return np.stack([a[:, None] * block[:, 0] + b[:, None] * block[:, 1], c[:, None] * block[:, 1]], axis=1)
+
+
+def quadratic(matrix: Array, vector: Array) -> Array:
+    """v^T M v of (m, 2, 2) and (m, 2)."""
+    x, y = vector[:, 0], vector[:, 1]
+    value: Array = matrix[:, 0, 0] * x * x + 2 * matrix[:, 0, 1] * x * y + matrix[:, 1, 1] * y * y
+    return value
+
+
+def inverse_covariance(covariance: Array, extra: float) -> Array:
+    """Inverse of covariance (m, 2, 2) + extra [px^2] in both axes."""
+    a, b, c = covariance[:, 0, 0] + extra, covariance[:, 0, 1], covariance[:, 1, 1] + extra
+    inverse = np.stack([np.stack([c, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)
+    result: Array = inverse / (a * c - b * b)[:, None, None]
+    return result
+
+
+def _huber(mahalanobis: Array, limit: float) -> tuple[float, Array]:
+    """Huber's sum (chi-square below the limit) and the factor on each weight; inf where a prediction failed."""
+    if not np.isfinite(mahalanobis).all():
+        return np.inf, np.zeros_like(mahalanobis)
+    beyond = mahalanobis > limit
+    if not beyond.any():
+        return float(np.sum(mahalanobis**2)), np.ones_like(mahalanobis)
+    cost = np.where(
+        beyond, 2 * np.where(beyond, limit, 0) * mahalanobis - np.where(beyond, limit, 0) ** 2, mahalanobis**2
+    )
+    return float(np.sum(cost)), np.where(beyond, limit / np.maximum(mahalanobis, 1e-300), 1.0)
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where Levenberg-Marquardt ended."""
+
+    model: StereoModel
+    normal: Normal
+    iterations: int
+    converged: bool
+
+
+def minimise(
+    problem: Problem, start: StereoModel, iterations: int = 60, tolerance: float = 1e-10, damping: float = 1e-3
+) -> Minimum:
+    """Levenberg-Marquardt; converged when the cost to be gained by a full step is below tolerance x cost.
+
+    The predicted gain g^T H^-1 g is free of the parameters' units, and a vanishing gradient is what it says.
+    """
+    model, normal = start, problem.linearise(start)
+    if not np.isfinite(normal.cost):
+        raise CalibrationError(
+            "the start of the refinement puts the board behind a camera: check the order of the views"
+        )
+    for iteration in range(1, iterations + 1):
+        shared, poses = normal.solve(damping)
+        gain = float(shared @ normal.gradient.sum(0) + np.sum(poses * normal.pose_gradient))
+        trial = problem.stepped(model, shared, poses)
+        trial_normal = problem.linearise(trial)
+        if trial_normal.cost <= normal.cost * (1 + 1e-14):
+            model, normal, damping = trial, trial_normal, max(damping * 0.1, 1e-12)
+            if damping < 1e-4 and gain <= tolerance * max(normal.cost, 1.0):
+                return Minimum(model, normal, iteration, True)
+        else:
+            if gain <= tolerance * max(normal.cost, 1.0):
+                return Minimum(model, normal, iteration, damping < 1e-2)
+            damping *= 10.0
+            if damping > 1e10:
+                break
+    return Minimum(model, normal, iterations, False)
