@@ -21,6 +21,7 @@ from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observatio
 from calibration.table_frame import rig_with_covariance
 
 CAMERA_NAMES = ("left", "right")
+MAX_LOST = 0.3  # share of one image's corners that do not fit the others: beyond, the view as a whole is at fault
 MAX_VIEW_RATIO = 5.0  # a view's misfit against the median view's: beyond, the board moved between the two exposures
 Progress = Callable[[str, int, int], None]
 
@@ -204,7 +205,11 @@ def calibrate_from_corners(
     if bad:
         rejected |= bad
         observations = observations[~np.isin(observations.view, list(bad))]
-        refinement, candidates = choose_terms(observations, start, board.points, *choice, settings.equal_aspect, report)
+        terms = refinement.terms
+        refinement, again = choose_terms(
+            observations, start, board.points, (terms.distortion,), (terms.board,), settings.equal_aspect, report
+        )
+        candidates = (*candidates, *again)
     if table_view in rejected:
         raise CalibrationError(f"the table view {table_view} cannot be used: {rejected[table_view]}")
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
@@ -348,12 +353,16 @@ def _misfitting_views(refinement: Refinement, names: Sequence[tuple[str, str]]) 
     o = refinement.observations
     views = np.unique(o.view)
     rms = np.array([refinement.rms(o.view == v) for v in views])
-    lost = np.array([1 - refinement.kept[o.view == v].mean() for v in views])
     typical = float(np.nanmedian(rms))
     bad = {}
-    for v, value, share in zip(views, rms, lost, strict=True):
-        if share > 0.5:
-            bad[int(v)] = f"{names[v][0]}, {names[v][1]}: {100 * share:.0f} % of the corners do not fit the other views"
+    for v, value in zip(views, rms, strict=True):
+        lost = [1 - refinement.kept[(o.view == v) & (o.camera == c)] for c in np.unique(o.camera[o.view == v])]
+        share = max(float(np.mean(part)) for part in lost)
+        if share > MAX_LOST:
+            bad[int(v)] = (
+                f"{names[v][0]}, {names[v][1]}: {100 * share:.0f} % of the corners in one image do not fit the other "
+                "views: the board moved between the exposures, or bent"
+            )
         elif value > MAX_VIEW_RATIO * typical:
             bad[int(v)] = (
                 f"{names[v][0]}, {names[v][1]}: RMS {value:.3f} px, the median view has {typical:.3f} px: "
