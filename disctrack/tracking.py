@@ -404,7 +404,7 @@ def _assemble(
         as_built=as_built,
         variance_factor=factor,
         acquisitions=sum(f.acquisitions for f in followers),
-        warnings=_warnings(first, factor),
+        warnings=_warnings(first, factor, trajectory.frame_status),
     )
 
 
@@ -466,8 +466,14 @@ def _trajectory(
     )
 
 
-def _warnings(follower: _Follower, variance_factor: float) -> tuple[str, ...]:
+def _warnings(follower: _Follower, variance_factor: float, status: NDArray[np.uint8]) -> tuple[str, ...]:
     warnings = []
+    one, both = (int(np.sum(status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
+    if one > both:
+        warnings.append(
+            f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
+            "exchanged, does the rig belong to this recording, does one camera look at the underside?"
+        )
     order = symmetry_order(follower.disc)
     if order > 1:
         warnings.append(

@@ -1,0 +1,146 @@
+"""Measured against true poses, and the numbers that sum up their differences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.frames import rotation_from_euler, rotation_from_quaternion, vector_from_rotation
+from disctrack.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+GROSS_POSITION = 0.5e-3  # [m] and
+GROSS_ROTATION = np.radians(1.0)  # beyond: not an error of measurement but another pose
+QUANTITIES = ("x", "y", "z", "psi", "theta", "phi", "rotation")
+# "rotation": the rotation vector between measured and true attitude, per axis (its three components together)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences measured - true of n poses; NaN where there is no answer."""
+
+    q: Array  # (n, 6) true
+    error: Array  # (n, 6) POSE_COMPONENTS [m, rad]: position, rotation vector in world axes
+    angles: Array  # (n, 3) psi, theta, phi [rad], in (-pi, pi]
+    covariance: Array  # (n, 6, 6) reported, this pose's noise
+    calibration_covariance: Array  # (n, 6, 6) reported, the rig's share
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """(n,) True where a pose was reported."""
+        return np.asarray(np.isfinite(self.error).all(axis=1))
+
+    @property
+    def gross(self) -> NDArray[np.bool_]:
+        """(n,) True where what was reported is another pose altogether."""
+        size = [np.linalg.norm(self.error[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))]
+        with np.errstate(invalid="ignore"):
+            return np.asarray((size[0] > GROSS_POSITION) | (size[1] > GROSS_ROTATION))
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(n,) found and not gross."""
+        return np.asarray(self.found & ~self.gross)
+
+    def of(self, quantity: str) -> Array:
+        """Errors of one of QUANTITIES [m, rad]: (n,), for "rotation" (3 n,), only of usable poses."""
+        ok, i = self.usable, QUANTITIES.index(quantity)
+        if quantity == "rotation":
+            return self.error[ok, 3:].ravel()
+        return self.error[ok, i] if i < 3 else self.angles[ok, i - 3]
+
+    def part(self, rows: NDArray[np.bool_]) -> Comparison:
+        """The poses where `rows` (n,) is True."""
+        return Comparison(
+            self.q[rows], self.error[rows], self.angles[rows], self.covariance[rows], self.calibration_covariance[rows]
+        )
+
+
+def compare(trajectory: Trajectory, q_true: Array) -> Comparison:
+    """Comparison of a trajectory with the true poses (n, 6) of its frames."""
+    turn = rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(
+        rotation_from_euler(q_true[:, 3], q_true[:, 4], q_true[:, 5]), 1, 2
+    )
+    error = np.concatenate([trajectory.q[:, :3] - q_true[:, :3], vector_from_rotation(turn)], axis=1)
+    angles = np.angle(np.exp(1j * (trajectory.q[:, 3:] - q_true[:, 3:])))
+    lost = ~trajectory.measured
+    error[lost], angles[lost] = np.nan, np.nan
+    return Comparison(q_true, error, angles, trajectory.pose_covariance, trajectory.calibration_covariance)
+
+
+def joined(parts: Sequence[Comparison]) -> Comparison:
+    """All poses of several comparisons."""
+    names = Comparison.__dataclass_fields__
+    return Comparison(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Statistics of one quantity's errors [m or rad]."""
+
+    n: int
+    bias: float  # mean
+    scatter: float  # standard deviation about the mean
+    rms: float
+    within_95: float  # 95 % of |error| lie within
+    largest: float
+
+
+def spread(errors: Array) -> Spread:
+    """Statistics of errors (n,); NaN where there is none."""
+    errors = np.asarray(errors, float)
+    if errors.size == 0:
+        return Spread(0, *5 * (float("nan"),))
+    size = np.abs(errors)
+    return Spread(
+        int(errors.size),
+        float(errors.mean()),
+        float(errors.std()),
+        float(np.sqrt(np.mean(errors**2))),
+        float(np.quantile(size, 0.95)),
+        float(size.max()),
+    )
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised squared error per degree of freedom: 1 where the reported covariance is the true one."""
+
+    value: float
+    uncertainty: float  # standard error of `value` if it were 1
+    n: int  # poses, or rigs, that are independent
+
+
+def noise_consistency(comparison: Comparison) -> Consistency:
+    """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
+    ok = comparison.usable
+    e, C = comparison.error[ok], comparison.covariance[ok]
+    n = len(e)
+    if n == 0:
+        return Consistency(float("nan"), float("nan"), 0)
+    value = np.einsum("ni,ni->n", e, np.linalg.solve(C, e[..., None])[..., 0]).mean() / 6
+    return Consistency(float(value), float(np.sqrt(2 / (6 * n))), n)
+
+
+def calibration_consistency(own: Sequence[Comparison], true: Sequence[Comparison]) -> Consistency:
+    """Squared calibration error over its reported variance, from the same images measured through two rigs.
+
+    own[k], true[k] : poses of recording k through its own calibration and through the true cameras. The image noise is
+    in both, so that their difference is the calibration's share alone. It is common to a recording: each one counts
+    once, as the mean over its poses of d^T C^-1 d / 6.
+    """
+    values = []
+    for a, b in zip(own, true, strict=True):
+        ok = a.usable & b.usable
+        if not ok.any():
+            continue
+        d, C = (a.error - b.error)[ok], a.calibration_covariance[ok]
+        values.append(np.mean(np.einsum("ni,ni->n", d, np.linalg.solve(C, d[..., None])[..., 0])) / 6)
+    n = len(values)
+    if n == 0:
+        return Consistency(float("nan"), float("nan"), 0)
+    return Consistency(float(np.mean(values)), float(np.sqrt(2 / (6 * n))), n)

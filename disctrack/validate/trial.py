@@ -1,0 +1,243 @@
+"""One validation recording: rendered with its own rig and chessboards, calibrated, measured, compared with its truth.
+
+Frames 0 ... s-1 are static poses, each measured without a prior; then come stretches of rolling motion. The recording
+is a folder like any other and passes through the readers, the calibration and the tracking as the user's would.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration import Board, StereoCalibration, calibrate_stereo
+from calibration.camera import StereoRig
+from disctrack.disc import Disc
+from disctrack.frames import CAMERAS
+from disctrack.readers import open_frames
+from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.files import match_files
+from disctrack.recording import Recording, read_recording
+from disctrack.render import Truth, rig_of, write_recording
+from disctrack.scene import MotionSettings, RollingMotion, Scene
+from disctrack.scene_motion import SceneMotion, motion_of
+from disctrack.tracking import Tracking, track
+from disctrack.trajectory import Trajectory
+from disctrack.validate.comparison import Comparison, compare
+from disctrack.validate.poses import cameras_in_sight, static_poses
+
+Array = NDArray[np.float64]
+Images = NDArray[np.uint8] | NDArray[np.uint16]
+
+ROLLING = "rolling at 8 to 12 deg"
+FINAL = "rolling to rest at 0.5 deg"
+EXPOSURE = 0.5e-3  # [s] half the time between frames: rolling at 10 deg smears the outer dots over 0.6 px
+K_M = 0.381e-7  # friction coefficient of Ma et al. 2014, equation (5.3), alone: the disc then comes to rest by
+TO_REST = (7.93, 1.5)  # (5.11): theta [deg] this time [s] before the end, and theta goes as time^(2/3)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The same images measured twice: through the recording's own calibration, and through the true cameras."""
+
+    own: Comparison
+    true: Comparison
+    cameras: NDArray[np.int64]  # (n,) that see the upper face
+    variance_factor: float  # of the run through the own calibration
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What one recording showed."""
+
+    scene: Scene
+    truth: Truth
+    calibration: StereoCalibration
+    static: Measured
+    rolling: dict[str, Measured]  # by the name of the stretch
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of images in memory, as `track` reads them."""
+
+    frames: NDArray[np.int64]
+    images: Images  # (n, 2, height, width)
+    readable: NDArray[np.bool_]  # (n, 2)
+
+
+def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
+    """The scene with n frames of rolling from `theta_deg` on, starting at random psi and phi."""
+    x, y = scene.rig.target_mm[:2]
+    start = RollingMotion(
+        theta_deg=theta_deg,
+        psi_deg=rng.uniform(-180, 180),
+        phi_deg=rng.uniform(-180, 180),
+        centre_mm=(x, y),
+        effects={"km": {"k_m": K_M}},
+    )
+    return replace(
+        scene,
+        cameras=replace(scene.cameras, n_frames=n, exposure_s=EXPOSURE),
+        motion=MotionSettings(kind="rolling", rolling=start),
+    )
+
+
+def theta_before_rest_deg(n: int, frame_rate: float) -> float:
+    """Nutation [deg] from which the disc takes n frames down to 0.5 deg, by (5.11)."""
+    theta, time = TO_REST
+    left = time * (0.5 / theta) ** 1.5 + n / frame_rate
+    return float(theta * (left / time) ** (2 / 3))
+
+
+def one_after_the_other(parts: Sequence[SceneMotion], rate: float) -> SceneMotion:
+    """Motions in one recording: frame i of part k is frame i + (all frames of the parts before)."""
+    starts = np.concatenate([[0], np.cumsum([part.n_frames for part in parts])])
+
+    def joined(name: str, time: Array) -> Array:
+        time = np.atleast_1d(np.asarray(time, float))
+        part_of = np.searchsorted(starts[1:-1], np.rint(time * rate), side="right")
+        q = np.empty((len(time), 6))
+        for k in np.unique(part_of):
+            rows = part_of == k
+            q[rows] = getattr(parts[k], name)(time[rows] - starts[k] / rate)
+        return q
+
+    return SceneMotion(partial(joined, "pose"), partial(joined, "rates"), int(starts[-1]))
+
+
+def run_trial(
+    scene: Scene,
+    folder: Path,
+    *,
+    n_static: int,
+    n_rolling: int,
+    n_final: int,
+    say: Callable[[str], object] = lambda text: None,
+) -> Trial:
+    """Render the recording of `scene` into `folder`, measure it and compare.
+
+    n_static, n_rolling, n_final : static poses, frames of the two stretches of rolling motion (0: none)
+    say : called with the name of each step as it begins
+    """
+    rng = np.random.default_rng([scene.seed, 8])
+    rig, disc = rig_of(scene), scene.declared_disc
+    poses = static_poses(n_static, rig, disc, (scene.rig.target_mm[0] * 1e-3, scene.rig.target_mm[1] * 1e-3), rng)
+    at_rest = SceneMotion(
+        lambda time: poses[np.rint(np.asarray(time) * scene.cameras.frame_rate_hz).astype(int).clip(0, n_static - 1)],
+        lambda time: np.zeros((len(time), 6)),
+        n_static,
+    )
+    start = rng.uniform(8, 12)
+    stretches: dict[str, Scene] = {}
+    if n_rolling:
+        stretches[ROLLING] = rolling_scene(scene, start, n_rolling, rng)
+    if n_final:
+        last = theta_before_rest_deg(n_final, scene.cameras.frame_rate_hz)
+        stretches[FINAL] = rolling_scene(scene, last, n_final, rng)
+    motions = [at_rest, *(motion_of(stretch) for stretch in stretches.values())]
+    base = replace(scene, motion=MotionSettings(kind="rolling"), cameras=replace(scene.cameras, exposure_s=EXPOSURE))
+    say("render")
+    truth = write_recording(folder, base, one_after_the_other(motions, scene.cameras.frame_rate_hz))
+    recording = read_recording(folder)
+    say("calibrate")
+    calibration = calibrate(recording)
+    say("measure")
+    edges = np.concatenate([[0], np.cumsum([motion.n_frames for motion in motions])])
+    measured = [
+        measure_twice(
+            read_images(recording, int(a), int(b)),
+            truth.q[a:b],
+            recording.disc,
+            calibration.rig,
+            truth.rig,
+            scene,
+            apart=k == 0,
+        )
+        for k, (a, b) in enumerate(itertools.pairwise(edges))
+    ]
+    return Trial(scene, truth, calibration, measured[0], dict(zip(stretches, measured[1:], strict=True)))
+
+
+def calibrate(recording: Recording) -> StereoCalibration:
+    """Calibration from the recording's own chessboard views."""
+    views, table = recording.chessboard, recording.table
+    assert views is not None  # a rendered recording has views
+    folder = recording.folder
+    left, right = (
+        [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) for file in match_files(pattern, folder, camera)]
+        for pattern, camera in zip((views.left, views.right), CAMERAS, strict=True)
+    )
+    return calibrate_stereo(
+        left,
+        right,
+        Board(views.inner_corners, views.square),
+        table_view=None if table is None else table.view,
+        board_thickness=0.0 if table is None else table.board_thickness,
+    )
+
+
+def read_images(recording: Recording, start: int, stop: int) -> Images:
+    """(n, 2, height, width) pairs start ... stop-1 of a recording."""
+    left, right = (
+        open_frames(pattern, recording.folder, camera)
+        for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
+    )
+    return np.concatenate([block.images.copy() for block in iter_pair_blocks(left, right, start, stop)])
+
+
+def measure_twice(
+    images: Images,
+    q_true: Array,
+    disc: Disc,
+    own: StereoRig,
+    true: StereoRig,
+    scene: Scene,
+    *,
+    apart: bool,
+) -> Measured:
+    """Comparison of images (n, 2, height, width) measured through both rigs; `apart` as in `locate`."""
+    rate = scene.cameras.frame_rate_hz
+    through_own = locate(images, own, disc, rate, apart=apart)
+    through_true = locate(images, true, disc, rate, apart=apart)
+    step = 2 if apart else 1
+    return Measured(
+        own=compare(every(through_own.trajectory, step), q_true),
+        true=compare(every(through_true.trajectory, step), q_true),
+        cameras=cameras_in_sight(q_true, true, disc),
+        variance_factor=through_own.variance_factor,
+        warnings=through_own.warnings,
+    )
+
+
+def locate(images: Images, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
+    """Track pairs in memory. apart: an unreadable pair follows each one, so that each is found without a prior."""
+    step = 2 if apart else 1
+
+    def read_blocks(start: int, stop: int) -> Iterator[Pairs]:
+        block = 32
+        for first in range(start, stop, block):
+            frames = np.arange(first, min(first + block, stop))
+            real = frames % step == 0
+            pairs = np.zeros((len(frames), *images.shape[1:]), images.dtype)
+            pairs[real] = images[frames[real] // step]
+            yield Pairs(frames, pairs, np.repeat(real[:, None], 2, axis=1))
+
+    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate)
+
+
+def every(trajectory: Trajectory, step: int) -> Trajectory:
+    """The trajectory's frames 0, step, 2 step, ..."""
+    parts = {
+        name: getattr(trajectory, name)[::step]
+        for name in type(trajectory).__dataclass_fields__
+        if isinstance(getattr(trajectory, name), np.ndarray)
+    }
+    return replace(trajectory, **parts)
