@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disctrack.cli import main
 from disctrack.frames import rotation_from_euler
 from disctrack.render import render_disc, rig_of
-from disctrack.validate import QUICK, complaints, run_validate, scene_of, summarise, validate, verdict, write_validation
+from disctrack.validate import QUICK, complaints, scene_of, summarise, validate, verdict, write_validation
 from disctrack.validate.bound import camera_maps, dot_pixels, pose_bound
 from disctrack.validate.comparison import joined, noise_consistency
 from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, static_poses
@@ -221,7 +222,13 @@ def test_full_validation_over_many_rigs(tmp_path):
     assert rows["rotation"].total.rms < np.radians(3e-3)
 
 
-def test_command_writes_its_results(tmp_path):
-    plan = replace(SMALL, bound_poses=0, planted_faults=False, static_poses=8, rolling_frames=0, final_frames=0)
-    _, files = run_validate(tmp_path / "out", quick=True, plan=plan)
-    assert {file.name for file in files} == {"validation.json", "validation.md", "error_against_nutation.png"}
+def test_command_prints_the_verdict_and_tells_of_failed_checks(outcome, tmp_path, monkeypatch, capsys):
+    """The measurement itself is that of the other tests."""
+    monkeypatch.setattr("disctrack.validate.run.validate", lambda plan, **_: outcome)
+    assert main(["validate", "--quick", "-o", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.startswith(verdict(outcome[0]))
+    assert (tmp_path / "out/validation.json").is_file()
+    bad = replace(outcome[0], controls=(replace(outcome[0].controls[1], mattered=True),))
+    monkeypatch.setattr("disctrack.validate.run.validate", lambda plan, **_: (bad, outcome[1]))
+    assert main(["validate", "--quick", "-o", str(tmp_path / "out")]) == 1
+    assert "planted fault" in capsys.readouterr().err
