@@ -69,13 +69,26 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
     return dataset
 
 
-def read_variables(group: h5py.Group) -> dict[str, NDArray]:
-    """Every dataset of a group (not of its subgroups) as an array; text as str."""
+# The most that gzip can squeeze: a damaged file that claims more than this times its own size is not read into memory.
+MOST_COMPRESSION = 1100
+
+
+def read_variables(group: h5py.Group, text: bool = True) -> dict[str, NDArray]:
+    """Every dataset of a group (not of its subgroups) as an array; text as str, or left out.
+
+    Raises ValueError if a dataset claims to be larger than the file could hold.
+    """
     return {
-        name: item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
+        name: _read(item)
         for name, item in group.items()
-        if isinstance(item, h5py.Dataset)
+        if isinstance(item, h5py.Dataset) and (text or not h5py.check_string_dtype(item.dtype))
     }
+
+
+def _read(dataset: h5py.Dataset) -> NDArray:
+    if dataset.size * dataset.dtype.itemsize > MOST_COMPRESSION * dataset.file.id.get_filesize():
+        raise ValueError(f"{dataset.name} claims {dataset.shape} values, more than the file can hold")
+    return dataset.asstr()[()] if h5py.check_string_dtype(dataset.dtype) else dataset[()]
 
 
 def flags(enum: type) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba.core import event
 
 from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
@@ -58,7 +57,6 @@ class Measurement:
     unreadable: tuple[Unreadable, ...]
     findings: dict[str, Any]  # blur, noise, warnings, ...: of JSON's types, stored with the result
     seconds: float  # spent on reading and tracking
-    compile_seconds: float  # spent on compiling the inner loops, once per installation; not part of `seconds`
 
 
 def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:
@@ -113,19 +111,17 @@ def measure(
     stamps = pairs.left.timestamps
     prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
     began = time.perf_counter()
-    compiled: list[float] = []
-    with event.install_timer("numba:compile", compiled.append):
-        tracking = track(
-            read_blocks,
-            range(pairs.start, pairs.stop),
-            rig,
-            recording.disc,
-            recording.frame_rate,
-            gravity=recording.gravity,
-            settings=settings,
-            timestamps=None if stamps is None else stamps[pairs.start : pairs.stop],
-            progress=progress,
-        )
+    tracking = track(
+        read_blocks,
+        range(pairs.start, pairs.stop),
+        rig,
+        recording.disc,
+        recording.frame_rate,
+        gravity=recording.gravity,
+        settings=settings,
+        timestamps=None if stamps is None else stamps[pairs.start : pairs.stop],
+        progress=progress,
+    )
     seconds = time.perf_counter() - began
     findings = {
         "notes": list(pairs.notes),
@@ -138,7 +134,7 @@ def measure(
         "acquisitions": tracking.acquisitions,
     }
     trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start)
-    return Measurement(trajectory, tuple(unreadable), findings, seconds - sum(compiled), sum(compiled))
+    return Measurement(trajectory, tuple(unreadable), findings, seconds)
 
 
 _FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}

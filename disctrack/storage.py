@@ -378,7 +378,7 @@ class _Reading:
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
-    root, markers = read_variables(file), read_variables(file["markers"])
+    root, markers = read_variables(file, text=False), read_variables(file["markers"])
     calibration = read_variables(file["calibration"])
     disc = {key: float(value) for key, value in file["disc"].attrs.items()}
     trajectory = Trajectory(
@@ -399,7 +399,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
             disc["radius_m"],
             disc["half_thickness_m"],
             disc["mass_kg"],
-            file["disc/marker_centres_body"][()],
+            read_variables(file["disc"])["marker_centres_body"],
             disc["marker_diameter_m"],
         ),
         rig=_rig(calibration, bool(file["calibration"].attrs["world_is_table"])),

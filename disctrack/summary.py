@@ -58,10 +58,9 @@ def file_lines(files: Sequence[Path]) -> list[str]:
     return [_line("files" if i == 0 else "", str(file)) for i, file in enumerate(files)]
 
 
-def speed_line(pairs: int, seconds: float, compile_seconds: float) -> str:
-    """Pairs per second, reading included; compiling told apart, since it happens once."""
-    once = f"; and {compile_seconds:.0f} s to compile the inner loops, once" if compile_seconds > 0.5 else ""
-    return _line("speed", f"{pairs / max(seconds, 1e-9):.0f} pairs/s ({seconds:.2f} s with reading the images{once})")
+def speed_line(pairs: int, seconds: float) -> str:
+    """Pairs per second, reading included."""
+    return _line("speed", f"{pairs / max(seconds, 1e-9):.0f} pairs/s ({seconds:.2f} s with reading the images)")
 
 
 def _line(head: str, text: str) -> str:

@@ -119,7 +119,7 @@ def track_into(
         trajectory, findings = measurement.trajectory, measurement.findings
         provenance = trajectory_provenance(recording, rig, pairs, None)
         storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, findings=findings)
-        lines.append(summary.speed_line(len(pairs), measurement.seconds, measurement.compile_seconds))
+        lines.append(summary.speed_line(len(pairs), measurement.seconds))
         fresh = True
     else:
         fresh = False

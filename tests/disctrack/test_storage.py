@@ -387,6 +387,29 @@ def test_a_file_without_some_of_its_parts_is_refused(tmp_path, whole_content, ke
         read_trajectory(path)
 
 
+@_fuzz
+@given(data=st.data())
+def test_a_file_with_flipped_bytes_is_read_or_refused(tmp_path, whole_content, data):
+    content = bytearray(whole_content)
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, min(len(content) - 1, 20_000)))] = data.draw(st.integers(0, 255))
+    path = tmp_path / "flipped.h5"
+    path.write_bytes(content)
+    try:
+        trajectory = read_trajectory(path)
+    except TrajectoryFileError:
+        return
+    assert trajectory.q.shape == (len(trajectory), 6)
+
+
+def test_a_claim_of_more_values_than_the_file_can_hold_is_refused(file):
+    with h5py.File(file, "r+") as h5:
+        del h5["x"]
+        h5.create_dataset("x", (10**12,), dtype=float, chunks=(1024,))
+    with pytest.raises(TrajectoryFileError, match="more than the file can hold"):
+        read_trajectory(file)
+
+
 def test_a_wrong_shape_is_refused(file):
     with h5py.File(file, "r+") as h5:
         del h5["quaternion"]
