@@ -227,8 +227,12 @@ def _whitened_model(scratch, n, p, G, det, clip):
     near_x, near_y = G[2, 0], G[2, 1]
     for i in range(n):
         d, slope, nx, ny, g, curvature = _edge_distance(scratch[0, i] - p[A], scratch[1, i] - p[B], p[RADIUS], G, det)
-        # the gradient was taken at the dot's centre: perspective makes the far edge's scale differ from the near one's
-        d *= 1.0 + near_x * scratch[3, i] + near_y * scratch[4, i]
+        # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
+        # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
+        half = 0.05 * d / g
+        mid_x = scratch[3, i] - half * (G[0, 0] * nx + G[1, 0] * ny)
+        mid_y = scratch[4, i] - half * (G[0, 1] * nx + G[1, 1] * ny)
+        d *= 1.0 + near_x * mid_x + near_y * mid_y
         # a curved edge blurred by sigma looks shifted inwards by sigma^2 / (2 radius of curvature)
         z = d * inv_sigma + 0.5 * curvature * sigma
         s, bell = _edge_profile(z)
@@ -361,7 +365,7 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
-        if radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], 2.0):
+        if radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], 3.5):  # in fewer px the edge distance itself is too coarse
             return BLURRED
         band = 3.0 * p[SIGMA] + 1.0
         extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
