@@ -14,7 +14,15 @@ from disctrack.energy import Energy, analyse_energy
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.labelled import Variable
 from disctrack.propagation import RATES, Series, propagate, rates
-from disctrack.scaling import WINDOW, NutationCount, PowerLaws, count_nutation, exponents_by_window, fit_power_laws
+from disctrack.scaling import (
+    WINDOW,
+    Exponent,
+    NutationCount,
+    PowerLaws,
+    count_nutation,
+    exponents_by_window,
+    fit_power_laws,
+)
 from disctrack.storage import read_provenance, read_trajectory, write_group
 from disctrack.trajectory import Trajectory
 
@@ -60,8 +68,32 @@ class AnalyseOutcome:
     """What `run_analyse` did."""
 
     analysis: Analysis
+    file: Path  # the trajectory, with the new groups
     report: Path  # report.html
     figures: tuple[Path, ...]
+
+    def lines(self) -> list[str]:
+        """What was found, for the command line."""
+        analysis = self.analysis
+        motion, energy, laws, count = analysis.motion, analysis.energy, analysis.scaling.laws, analysis.scaling.count
+        sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
+        found = [
+            f"motion        {int(motion.known.sum())} of {len(motion)} frames; sigma of the velocity "
+            f"{1e3 * np.nanmedian(sigma[:, 6:9]):.3f} mm/s, of the angular velocity "
+            f"{1e3 * np.nanmedian(sigma[:, 9:12]):.2f} mrad/s (median)",
+            f"contact       {analysis.contact.onset.verdict}",
+            f"energy        {1e3 * energy.loss:.4f} mJ lost, sigma {1e3 * energy.loss_sigma:.4f} (noise) "
+            f"{1e3 * energy.loss_sigma_calibration:.4f} (calibration)",
+        ]
+        if laws.determined:
+            found.append(
+                f"exponents     theta {_in_words(laws.n_theta)}  psidot {_in_words(laws.n_psidot)}  energy "
+                f"{_in_words(laws.n_energy)}  t_f {laws.t_f:.5f} +- {laws.t_f_sigma:.5f} s"
+            )
+        if np.isfinite(count.slope):
+            found.append(f"nutation      {count.slope:.4f} +- {count.sigma:.4f} oscillations per turn of precession")
+        found += [f"note          {text}" for text in analysis.warnings]
+        return [*found, f"files         {self.file}", f"              {self.report}"]
 
 
 def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: float = CIRCLE_DURATION) -> Analysis:
@@ -127,7 +159,11 @@ def run_analyse(
         raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
     report, figures = write_report(folder, analysis, provenance)
-    return AnalyseOutcome(analysis, report, figures)
+    return AnalyseOutcome(analysis, path, report, figures)
+
+
+def _in_words(exponent: Exponent) -> str:
+    return f"{exponent.value:.4f} +- {exponent.sigma:.4f}"
 
 
 def write_analysis(path: Path, analysis: Analysis) -> None:

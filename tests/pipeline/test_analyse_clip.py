@@ -1,0 +1,69 @@
+"""From images to physics: the sample clip calibrated, tracked, analysed, compared with the motion it was drawn from."""
+
+import contextlib
+import io
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from disctrack.cli import main
+from disctrack.storage import read_group
+
+
+@pytest.fixture(scope="module")
+def analysed_clip(sample_clip, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("clip")
+    rig, trajectory = folder / "rig.h5", folder / "trajectory.h5"
+    assert main(["calibrate", str(sample_clip), "-o", str(rig), "--no-figures"]) == 0
+    assert (
+        main(["track", str(sample_clip), "--rig", str(rig), "-o", str(trajectory), "--no-figures", "--no-video"]) == 0
+    )
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["analyse", str(trajectory), "-o", str(folder / "report")]) == 0
+    (folder / "said.txt").write_text(said.getvalue())
+    return trajectory
+
+
+def squared_error(found, true, sigma, sigma_calibration):
+    return float(np.mean((found - true) ** 2 / (sigma**2 + sigma_calibration**2)))
+
+
+def test_rates_from_images_agree_with_the_drawn_motion(analysed_clip, sample_clip):
+    """Within the stated noise and calibration; the latter is one draw common to all frames: a factor 4 at most."""
+    with h5py.File(sample_clip.parent / "truth" / f"{sample_clip.name}.h5") as file:
+        qdot = file["qdot"][()]
+    motion, _ = read_group(analysed_clip, "motion")
+    names = ("velocity_x", "velocity_y", "velocity_z", "psidot", "thetadot", "phidot")
+    for i, name in enumerate(names):
+        sigma, common = motion[f"{name}_sigma"], motion[f"{name}_sigma_calibration"]
+        assert 0.3 < squared_error(motion[name], qdot[:, i], sigma, common) < 4, name
+    assert np.sqrt(np.mean((motion["velocity_x"] - qdot[:, 0]) ** 2)) < 5e-5  # [m/s]
+
+
+def test_clip_rolls_without_slip_and_on_the_table(analysed_clip):
+    contact, verdict = read_group(analysed_clip, "contact")
+    assert verdict["rolling_probability"] > 0.99
+    assert verdict["rolling_onset_s"] < 0.02
+    slip = np.hypot(contact["slip_n"], contact["slip_m"])
+    assert np.sqrt(np.mean(slip[10:-10] ** 2)) < 1e-4  # [m/s]; 0.05 mm/s when written
+    assert abs(np.mean(contact["contact_z"])) < 2e-6  # [m]
+
+
+def test_command_says_where_the_results_are(analysed_clip):
+    said = (analysed_clip.parent / "said.txt").read_text()
+    assert "rolls without slip" in said
+    assert "report.html" in said
+    assert (analysed_clip.parent / "report" / "report.html").stat().st_size > 1e5
+
+
+def test_bad_input_is_one_line_and_an_exit_code(tmp_path, capsys):
+    foreign = tmp_path / "foreign.h5"
+    with h5py.File(foreign, "w") as file:
+        file["x"] = np.zeros(3)
+    assert main(["analyse", str(foreign)]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "foreign.h5" in said
+    assert "not a trajectory" in said
