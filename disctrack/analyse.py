@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -109,8 +109,11 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
             "and track again."
         )
     motion = differentiate(trajectory)
-    found = propagate(motion, rates)
     contact = analyse_contact(motion, circle_duration)
+    if contact.onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
+        motion = differentiate(trajectory, breaks=(contact.onset.time,))
+        contact = replace(analyse_contact(motion, circle_duration), onset=contact.onset)
+    found = propagate(motion, rates)
     energy = analyse_energy(motion)
     theta_sigma = np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
     sense = np.sign(np.nanmedian(found.value[:, 0])) if np.isfinite(found.value[:, 0]).any() else 1.0
@@ -332,7 +335,12 @@ def _warnings(trajectory: Trajectory, motion: Motion, contact: Contact, scaling:
     onset = contact.onset
     if not onset.probability >= 0.5:
         found.append(f"The disc {onset.verdict}." if np.isfinite(onset.probability) else f"Rolling: {onset.verdict}.")
-    elif onset.n_late_slips:
+    elif onset.low > motion.time[motion.known][0]:
+        found.append(
+            f"Where slip ends, at {onset.time:.4f} s, the acceleration jumps: the motion before and after was "
+            "differentiated apart, so that sigmas are larger near that instant."
+        )
+    if onset.probability >= 0.5 and onset.n_late_slips:
         found.append(
             f"After the onset of rolling, {onset.n_late_slips} frames still show slip beyond five sigmas: stick and "
             "slip, or impacts."

@@ -213,7 +213,8 @@ def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float
         return 0.0, 0.0
     noise2 = np.trace(C, axis1=1, axis2=2)
     speed = np.sqrt(np.maximum(np.sum(v * v, axis=1) - noise2, 0.0))
-    weight = np.gradient(time)
+    step = np.diff(time)
+    weight = 0.5 * (np.append(step, 0.0) + np.append(0.0, step))  # trapezoidal rule
     variance = np.sum(weight**2 * noise2 / 2 / share)
     return float(np.sum(speed * weight)), float(np.sqrt(variance))
 

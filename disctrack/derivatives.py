@@ -8,6 +8,7 @@ acceleration in world axes. Euler rates are then read off the angular velocity, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ from disctrack.smoothing import (
     SEGMENT,
     Process,
     fit_process,
+    joined,
     moving_weights,
 )
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -85,9 +87,12 @@ class Motion:
         return self.position, self.R_world_body, self.velocity, self.omega_world, self.acceleration, self.alpha_world
 
 
-def differentiate(trajectory: Trajectory) -> Motion:
+def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Motion:
     """Velocities and accelerations of a measured trajectory.
 
+    breaks : instants [s] at which the acceleration jumps (slip ends, something is hit); before and after are
+    differentiated apart, with the larger sigmas that ends have. A break that leaves fewer than MIN_FRAMES poses on a
+    side is passed over.
     Raises AnalysisError when too few frames have a pose, or time does not increase.
     """
     time = np.asarray(trajectory.time, float)
@@ -101,6 +106,7 @@ def differentiate(trajectory: Trajectory) -> Motion:
         covariance=np.where(good[:, None, None], trajectory.pose_covariance, 0.0),
         sensitivity=_usable_sensitivity(trajectory, good),
         good=good,
+        part=_parts(time, good, breaks),
     )
     processes = _fit_groups(samples)
     state, R, covariance, sensitivity = _smoothed(samples, processes)
@@ -140,6 +146,7 @@ class _Samples:
     covariance: Array  # (n, 6, 6), 0 where not measured
     sensitivity: Array  # (n, 6, 30)
     good: NDArray[np.bool_]  # (n,)
+    part: NDArray[np.int64]  # (n,) number of the stretch between breaks
 
     @property
     def variance(self) -> Array:
@@ -159,6 +166,16 @@ def _require_samples(time: Array, good: NDArray[np.bool_]) -> None:
             f"time does not increase from frame {backwards[0]} to {backwards[0] + 1} "
             f"({time[backwards[0]]} s to {time[backwards[0] + 1]} s): sort the frames, or correct the frame rate."
         )
+
+
+def _parts(time: Array, good: NDArray[np.bool_], breaks: Sequence[float]) -> NDArray[np.int64]:
+    """Number of the stretch (n,) that each frame belongs to."""
+    kept: list[float] = []
+    for instant in sorted(breaks):
+        since_last = good & (time < instant) & (time >= (kept[-1] if kept else -np.inf))
+        if min(since_last.sum(), (good & (time >= instant)).sum()) >= MIN_FRAMES:
+            kept.append(instant)
+    return np.searchsorted(np.array(kept), time, side="right")
 
 
 def _bridged_rotations(time: Array, quaternion: Array, good: NDArray[np.bool_]) -> Array:
@@ -188,29 +205,41 @@ def _usable_sensitivity(trajectory: Trajectory, good: NDArray[np.bool_]) -> Arra
 
 
 def _fit_groups(samples: _Samples) -> tuple[Process, ...]:
-    """One process per group of CHANNEL_GROUPS."""
-    n = len(samples.ticks)
+    """One process per group of CHANNEL_GROUPS, fitted to each stretch between breaks."""
+    by_part = []
+    for number in np.unique(samples.part):
+        frames = np.flatnonzero(samples.part == number)
+        segments, centres = _segments(samples, frames)
+        by_part.append(
+            [
+                fit_process([(t, d[list(g)], v[list(g)]) for t, d, v in segments], centres, len(frames))
+                for g in CHANNEL_GROUPS
+            ]
+        )
+    return tuple(joined(fits) for fits in zip(*by_part, strict=True))
+
+
+def _segments(samples: _Samples, frames: NDArray[np.int64]) -> tuple[list[tuple[Array, Array, Array]], Array]:
+    """Overlapping segments (times, data, variance) of a stretch of frames, and the middles that they stand for."""
+    n = len(frames)
     starts = np.arange(0, max(1, n - SEGMENT // 2), SEGMENT // 2)
     segments, centres = [], []
     for start in starts:
         stop = n if start == starts[-1] else start + SEGMENT
-        frames = start + np.flatnonzero(samples.good[start:stop])
-        if len(frames) < MIN_FRAMES:
+        used = frames[start:stop][samples.good[frames[start:stop]]]
+        if len(used) < MIN_FRAMES:
             continue
-        s, gain = _sine_vectors(samples.R[frames], samples.R[frames[len(frames) // 2]])
-        data = np.concatenate([samples.position[frames], s], axis=1).T
-        noise = gain @ samples.covariance[frames] @ gain.swapaxes(1, 2)
-        variance = np.diagonal(noise, axis1=1, axis2=2).T
-        segments.append((samples.ticks[frames] - samples.ticks[frames[0]], data, variance))
+        s, gain = _sine_vectors(samples.R[used], samples.R[used[len(used) // 2]])
+        data = np.concatenate([samples.position[used], s], axis=1).T
+        noise = gain @ samples.covariance[used] @ gain.swapaxes(1, 2)
+        segments.append((samples.ticks[used] - samples.ticks[used[0]], data, np.diagonal(noise, axis1=1, axis2=2).T))
         centres.append((start + stop) / 2)
     if not segments:
         raise AnalysisError(
             f"nowhere do {MIN_FRAMES} of {SEGMENT} neighbouring frames have a pose: the motion between them cannot be "
             "told. Track the recording again with better exposure, or look at frame_status for the reasons."
         )
-    return tuple(
-        fit_process([(t, d[list(g)], v[list(g)]) for t, d, v in segments], np.array(centres), n) for g in CHANNEL_GROUPS
-    )
+    return segments, np.array(centres)
 
 
 def _sine_vectors(R: Array, R_reference: Array) -> tuple[Array, Array]:
@@ -240,7 +269,7 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
         channels = list(group)
         variance = samples.variance[:, channels].mean(axis=1)
-        W, P = moving_weights(samples.ticks, variance, process, half)
+        W, P = moving_weights(samples.ticks, variance, process, half, samples.part)
         weights[:, channels], prior[:, channels] = W[:, None], P[:, None]
         scale[channels] = np.sqrt(process.noise_scale)
         open_fraction = P[:, 1, 1] * process.length**2 / process.amplitude2

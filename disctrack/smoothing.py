@@ -24,10 +24,11 @@ Array = NDArray[np.float64]
 
 LENGTHS = 2.0 * 1.15 ** np.arange(20)  # l in frame intervals: 2 (content up to the Nyquist rate) to 28
 RATIOS = 10.0 ** np.arange(0.0, 10.1, 0.5)  # (A / sigma)^2
-SEGMENT = 96  # frames in which l and A are taken as constant: about eight periods at 80 Hz and 1000 frames/s
+SEGMENT = 96  # frames in which l and A are taken as constant: 48 or 64 make the variance too small by a factor 2
 # A disc's motion is a sum of near-sinusoids, smoother than any sample of the process: the likelihood then prefers an l
 # that is a little too long. One step shorter costs 15 % in scatter and brings the squared error of accelerations from
 # 2 to 4 times the predicted variance to 0.87 to 1.0 (simulated motions at 60, 25 and 9 degrees).
+MAX_SLOPE = 0.25  # of l, in intervals per interval
 SHORTEN_STEPS = 1
 HALF_WINDOW_LENGTHS = 3.0  # half width of a window in l; 4 would gain 3 % in scatter and cost twice the time
 MIN_WINDOW_SAMPLES = 4  # a line and a curvature, and one to spare
@@ -41,6 +42,16 @@ class Process:
     length: Array  # (n,) l in sample intervals
     amplitude2: Array  # (n,) A^2 in the square of the data's unit
     noise_scale: float  # variance found over variance stated
+
+
+def joined(processes: Sequence[Process]) -> Process:
+    """Processes of successive stretches as one; the noise scale is their mean, by samples."""
+    sizes = [len(p.length) for p in processes]
+    return Process(
+        np.concatenate([p.length for p in processes]),
+        np.concatenate([p.amplitude2 for p in processes]),
+        float(np.average([p.noise_scale for p in processes], weights=sizes)),
+    )
 
 
 def kernel(lag: Array, length: float) -> Array:
@@ -67,11 +78,21 @@ def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, 
     amplitude2 = RATIOS[ratio_index] * variance
     sample = np.arange(n)
     between = np.interp(sample, centres, length_index.astype(float))
+    length = np.exp(np.interp(between, np.arange(len(LENGTHS)), np.log(LENGTHS)))
+    allowed = np.searchsorted(LENGTHS, np.sqrt(1.15) * _sloped(length), side="right") - 1  # nearest of the grid
     return Process(
-        length=LENGTHS[np.maximum(np.round(between).astype(int) - SHORTEN_STEPS, 0)],
+        length=LENGTHS[np.maximum(allowed - SHORTEN_STEPS, 0)],
         amplitude2=np.exp(np.interp(sample, centres, np.log(amplitude2))),
         noise_scale=float(NOISE_SCALES[scale_index]),
     )
+
+
+def _sloped(length: Array) -> Array:
+    """Lengths (n,) cut to a slope of MAX_SLOPE: a long window must not reach into motion that asks for a short one."""
+    ramp = MAX_SLOPE * np.arange(len(length))
+    ahead = np.minimum.accumulate(length - ramp) + ramp
+    behind = np.minimum.accumulate((length + ramp)[::-1])[::-1] - ramp
+    return np.minimum(ahead, behind)
 
 
 def _on_grid(lag: Array) -> Array:
@@ -153,10 +174,13 @@ def _own_covariance(length: float) -> Array:
     return np.array([[1.0, 0.0, -a], [0.0, a, 0.0], [-a, 0.0, 3 * a * a]])
 
 
-def moving_weights(times: Array, variance: Array, process: Process, half_window: int) -> tuple[Array, Array]:
+def moving_weights(
+    times: Array, variance: Array, process: Process, half_window: int, part: NDArray[np.int64]
+) -> tuple[Array, Array]:
     """Weights (n, 3, 2 half_window + 1) and remaining prior covariance (n, 3, 3) for every sample.
 
     times : (n,) in sample intervals; variance : (n,) stated, infinite where there is no sample
+    part : (n,) number of the stretch that a sample belongs to; windows do not reach across
     Derivatives are per interval. The ends are windows whose outer samples are missing. Windows with the same length,
     ratio and pattern of noise share one solution; noise is told apart in factors of two for this purpose (weights may
     be slightly off the optimum, their covariance is exact). A window with fewer than MIN_WINDOW_SAMPLES samples has
@@ -166,7 +190,8 @@ def moving_weights(times: Array, variance: Array, process: Process, half_window:
     index = np.arange(n)[:, None] + np.arange(-w, w + 1)
     inside = (index >= 0) & (index < n)
     clipped = np.clip(index, 0, n - 1)
-    lag = _on_grid(np.where(inside, times[clipped] - times[:, None], np.arange(-w, w + 1)))
+    inside &= part[clipped] == part[:, None]
+    lag = _on_grid(np.where(inside, times[clipped] - times[:, None], np.arange(-w, w + 1, dtype=float)))
     typical = float(np.median(variance[np.isfinite(variance)]))
     with np.errstate(divide="ignore"):
         noise_class = np.round(np.log2(variance / typical))
@@ -184,10 +209,10 @@ def moving_weights(times: Array, variance: Array, process: Process, half_window:
         unique, inverse = np.unique(keys, axis=0, return_inverse=True)
         size = 2 * reach + 1
         for start in range(0, len(unique), 256):
-            part = unique[start : start + 256]
-            noise = 2.0 ** part[:, 1 : 1 + size] / 10.0 ** part[:, :1]
+            block = unique[start : start + 256]
+            noise = 2.0 ** block[:, 1 : 1 + size] / 10.0 ** block[:, :1]
             chosen = np.flatnonzero((inverse.ravel() >= start) & (inverse.ravel() < start + 256))
-            W, P = window_weights(part[:, 1 + size :], noise, float(length))
+            W, P = window_weights(block[:, 1 + size :], noise, float(length))
             which = inverse.ravel()[chosen] - start
             weights[rows[chosen], :, columns] = W[which]
             prior[rows[chosen]] = P[which]

@@ -9,7 +9,10 @@ from numpy.testing import assert_allclose
 from disctrack.contact import analyse_contact, contact_quantities
 from disctrack.derivatives import differentiate
 from disctrack.disc import MA_2014
+from disctrack.frames import rotation_from_euler
 from disctrack.propagation import State
+from disctrack.rolling import CATALOGUE, Model, simulate
+from disctrack.rolling import State as RollingState
 
 COLUMN = {"slip": slice(3, 6), "locus": slice(6, 8), "force": slice(8, 11), "needed": 11}
 
@@ -106,6 +109,52 @@ def test_onset_of_rolling_lies_in_its_interval(onset, speed, true_motion, as_tra
     assert found.low <= found.time <= found.high
     assert found.high - found.low < 0.03
     assert_allclose(found.slip_distance, speed * onset / 2, rtol=0.01)
+
+
+@pytest.fixture(scope="module")
+def slip_to_roll():
+    """A disc at 25 degrees that slides at 0.36 m/s under Coulomb friction of 0.2 until it rolls."""
+    model = Model(MA_2014).with_effects(CATALOGUE["km"](), CATALOGUE["slip"](mu=0.2))
+    w2 = 50 * np.sin(np.radians(25))
+    start = RollingState(theta=np.radians(25), thetadot=0.5, omega2=w2, omega3=2.0, v_x=0.35, v_y=0.1)
+    return simulate(model, start, 0.5)
+
+
+def test_sliding_friction_is_measured_and_its_end_found(slip_to_roll, true_motion, as_tracked, rng):
+    """Onset to 1 ms, path of slip to 0.1 %, coefficient of friction to 0.5 %, from poses with noise alone."""
+    simulated = slip_to_roll
+    (switch,) = simulated.switches
+    base = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[: len(simulated)]
+    truth = replace(
+        base,
+        time=simulated.time,
+        position=simulated.q[:, :3],
+        R=rotation_from_euler(*simulated.q[:, 3:].T),
+        euler=simulated.q[:, 3:],
+        velocity=simulated.qdot[:, :3],
+        omega=simulated.omega_world,
+    )
+    trajectory = as_tracked(truth, rng)
+    contact = analyse_contact(differentiate(trajectory))
+    assert abs(contact.onset.time - switch.time) < 1.5e-3  # one frame, and the tolerance's share
+    assert contact.onset.high - contact.onset.low < 5e-3
+    path = np.trapezoid(np.hypot(*simulated.slip_velocity.T), simulated.time)
+    assert_allclose(contact.onset.slip_distance, path, rtol=1e-3)
+    motion = differentiate(trajectory, breaks=(contact.onset.time,))
+    propagated = analyse_contact(motion).propagated
+    needed = propagated.value[simulated.time < switch.time, COLUMN["needed"]]
+    assert_allclose(np.median(needed), 0.2, rtol=5e-3)
+    # in the last 35 ms of slip its direction turns round within 10 ms; the frame of the switch may be on the wrong side
+    fair = (simulated.time < switch.time - 0.035) | (simulated.time > switch.time + 1e-3)
+
+    def squared_error(found, frames):
+        error = found.value[frames, COLUMN["force"]] - simulated.contact_force[frames]
+        return np.mean(error**2 / np.diagonal(found.covariance, axis1=1, axis2=2)[frames, COLUMN["force"]])
+
+    assert 0.5 < squared_error(propagated, fair) < 1.8  # 3 axes of 460 frames: about 70 independent values
+    # negative control: across the jump, one smooth curve is wrong by far more than its sigma
+    soon = fair & (simulated.time > switch.time) & (simulated.time < switch.time + 0.01)
+    assert squared_error(contact.propagated, soon) > 10 > 3 > squared_error(propagated, soon)
 
 
 def test_disc_that_rolls_from_the_start_is_said_to(true_motion, as_tracked, rng):
