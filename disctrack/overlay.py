@@ -22,8 +22,11 @@ ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
 PLAYBACK_HZ = 25.0
 MOST_FRAMES = 1500  # a minute of video; of longer recordings every second, third, ... pair is shown
 OUTLINE_POINTS = 120
+CAPTION_LINE = 18  # height of a line [px]
+CAPTION_WIDTH = 950  # of the whole caption on one line [px]
 _SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
 
+_TEXT = (230, 230, 230)
 # Blue, green, red as OpenCV orders them.
 _RIM, _LOWER, _DOT, _CENTRE, _REFUSED, _CONTACT = (
     (80, 220, 80), (90, 140, 60), (255, 190, 60), (60, 60, 255), (60, 160, 255), (240, 80, 240),
@@ -73,13 +76,23 @@ def _drawn(row: int, images: NDArray, trajectory: Trajectory) -> ColourImage:
         _draw_disc(pictures, trajectory, row)
     for camera, picture in enumerate(pictures):
         _draw_centres(picture, trajectory.markers_px[row, camera], trajectory.marker_status[row, camera])
-        cv2.putText(picture, CAMERAS[camera], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (230, 230, 230), 1, cv2.LINE_AA)
-    picture = np.hstack(pictures)
-    cv2.putText(
-        picture, _caption(trajectory, row), (8, picture.shape[0] - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.45,
-        (230, 230, 230) if trajectory.measured[row] else _REFUSED, 1, cv2.LINE_AA,
-    )  # fmt: skip
+        cv2.putText(picture, CAMERAS[camera], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
+    picture = np.vstack([np.hstack(pictures), _caption_strip(trajectory, row, 2 * images.shape[2])])
     return picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]  # video codecs want even sizes
+
+
+def _caption_strip(trajectory: Trajectory, row: int, width: int) -> ColourImage:
+    """Caption below the images, (height, width, 3), on as many lines as the width asks for."""
+    parts = _caption(trajectory, row)
+    n_lines = min(-(-CAPTION_WIDTH // width), 4)
+    strip = np.zeros((CAPTION_LINE * n_lines + 6, width, 3), np.uint8)
+    colour = _TEXT if trajectory.measured[row] else _REFUSED
+    per_line = -(-len(parts) // n_lines)
+    for line in range(n_lines):
+        text = "   ".join(parts[line * per_line : (line + 1) * per_line])
+        place = (8, CAPTION_LINE * (line + 1) - 3)
+        cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return strip
 
 
 def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
@@ -89,25 +102,34 @@ def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
     return np.asarray(image * (255.0 / max(int(image.max()), 1)), np.uint8)
 
 
-def _caption(trajectory: Trajectory, row: int) -> str:
-    head = f"frame {trajectory.frame[row]}   t = {trajectory.time[row]:.4f} s"
+def _caption(trajectory: Trajectory, row: int) -> list[str]:
+    head = f"frame {trajectory.frame[row]}  t = {trajectory.time[row]:.4f} s"
     if not trajectory.measured[row]:
-        return f"{head}   {FrameStatus(trajectory.frame_status[row]).sentence}"
-    q, rms = trajectory.q[row], trajectory.reprojection_rms_px[row]
+        return [head, FrameStatus(trajectory.frame_status[row]).sentence]
+    q = trajectory.q[row]
     x, y, z = q[:3] * 1e3
     psi, theta, phi = np.degrees(q[3:])
-    errors = " ".join("-" if np.isnan(value) else f"{value:.3f}" for value in rms)
-    return (
-        f"{head}   x {x:.3f}  y {y:.3f}  z {z:.3f} mm   psi {psi:.2f}  theta {theta:.3f}  phi {phi:.2f} deg"
-        f"   error {errors} px"
-    )
+    errors = " ".join("-" if np.isnan(rms) else f"{rms:.3f}" for rms in trajectory.reprojection_rms_px[row])
+    return [
+        head,
+        f"x {x:.3f}  y {y:.3f}  z {z:.3f} mm",
+        f"psi {psi:.2f}  theta {theta:.3f}  phi {phi:.2f} deg",
+        f"error {errors} px",
+    ]
 
 
 def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) -> None:
     disc, rig = trajectory.disc, trajectory.rig
     R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
     h = disc.half_thickness
-    lines = [(_circle(np.zeros(3), disc.radius, -h), _LOWER), (_circle(np.zeros(3), disc.radius, h), _RIM)]
+    lower = _circle(np.zeros(3), disc.radius, -h) @ R.T + t
+    for picture, pixels, (R_cw, t_cw) in zip(pictures, rig.project(lower), rig.camera_poses(), strict=True):
+        # the wall is seen where its outward normal faces the camera; the other half lies behind the disc
+        facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
+        start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
+        visible = np.roll(facing, -start)
+        _polyline(picture, np.roll(pixels, -start, axis=0)[visible], _LOWER, closed=bool(facing.all()))
+    lines = [(_circle(np.zeros(3), disc.radius, h), _RIM)]
     lines += [(_circle(centre, disc.marker_diameter / 2, centre[2]), _DOT) for centre in disc.marker_centres_body]
     for points_body, colour in lines:
         for picture, pixels in zip(pictures, rig.project(points_body @ R.T + t), strict=True):
@@ -127,11 +149,11 @@ def _circle(centre: Array, radius: float, height: float) -> Array:
     )
 
 
-def _polyline(picture: ColourImage, pixels: Array, colour: tuple[int, int, int]) -> None:
+def _polyline(picture: ColourImage, pixels: Array, colour: tuple[int, int, int], closed: bool = True) -> None:
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     if len(pixels) > 1:
         fixed = np.clip(np.rint(pixels * (1 << _SUBPIXEL_BITS)), -(2**24), 2**24).astype(np.int32)
-        cv2.polylines(picture, [fixed[:, None]], True, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        cv2.polylines(picture, [fixed[:, None]], closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _draw_centres(picture: ColourImage, pixels: Array, status: NDArray[np.uint8]) -> None:
