@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.camera import StereoRig, normalise, triangulate
 from disctrack.disc import Disc
-from disctrack.frames import euler_from_rotation
+from disctrack.frames import euler_from_rotation, rotation_from_vector
 from disctrack.pose import fit_poses, marker_pixels
 
 Array = NDArray[np.float64]
@@ -194,24 +194,39 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         combinations(range(len(centres)), 3),
         key=lambda k: -np.linalg.norm(np.cross(centres[k[1]] - centres[k[0]], centres[k[2]] - centres[k[0]])),
     )[:6]
-    scored: list[tuple[float, Array, Array]] = []
+    turns: list[NDArray] = []
+    shifts: list[NDArray] = []
     for order in permutations(range(len(blobs)), 3):
         image = np.ascontiguousarray(rays[list(order)].reshape(3, 1, 2))
         for triple in triples:
             model = np.ascontiguousarray(centres[list(triple)].reshape(3, 1, 3))
             n, rvecs, tvecs = cv2.solveP3P(model, image, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
-            for r, t in zip(rvecs[:n], tvecs[:n], strict=True):
-                R = cv2.Rodrigues(r)[0]
-                points = centres @ R.T + t.ravel()
-                if np.any(points[:, 2] <= 0) or R[:, 2] @ points.mean(axis=0) > 0:
-                    continue
-                gap = np.linalg.norm((points[:, :2] / points[:, 2:])[:, None] - rays[None], axis=-1).min(axis=1)
-                reach = INLIER_DIAMETERS * disc.marker_diameter / points[:, 2].mean()
-                score = float(np.sum(np.clip(1 - (gap / reach) ** 2, 0, None)))
-                if score > MIN_EXPLAINED - 0.5:
-                    scored.append((score, R_cw.T @ R, R_cw.T @ (t.ravel() - t_cw)))
-    scored.sort(key=lambda item: -item[0])
-    return [(R, t) for _, R, t in scored[:40]]
+            turns += rvecs[:n]
+            shifts += tvecs[:n]
+    if not turns:
+        return []
+    R, t = rotation_from_vector(np.array(turns).reshape(-1, 3)), np.array(shifts).reshape(-1, 3)
+    score = _blob_score(R, t, rays, disc)
+    best = np.argsort(-score, kind="stable")[:40]
+    best = best[score[best] > MIN_EXPLAINED - 0.5]
+    return [(R_cw.T @ R[k], R_cw.T @ (t[k] - t_cw)) for k in best]
+
+
+def _blob_score(R: Array, t: Array, rays: Array, disc: Disc) -> Array:
+    """(n,) how well blobs (k, 2) [normalised] agree with poses R_camera_body (n, 3, 3), t_camera_body (n, 3).
+
+    A dot counts 1 where a blob lies on its centre, 0 from INLIER_DIAMETERS on; -1 for a face that looks away.
+    """
+    points = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]
+    middle = points.mean(axis=1)
+    possible = np.isfinite(points).all((1, 2)) & (points[..., 2] > 0).all(axis=1)
+    possible &= np.einsum("ni,ni->n", R[:, :, 2], middle) <= 0
+    score = np.full(len(R), -1.0)
+    points, middle = points[possible], middle[possible]
+    gap = np.linalg.norm((points[..., :2] / points[..., 2:])[:, :, None] - rays, axis=-1).min(axis=2)
+    reach = INLIER_DIAMETERS * disc.marker_diameter / middle[:, 2:]
+    score[possible] = np.sum(np.clip(1 - (gap / reach) ** 2, 0, None), axis=1)
+    return score
 
 
 def _best_explanation(
