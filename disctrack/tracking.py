@@ -299,7 +299,15 @@ def _follow_block(
             follower.tracking = False
             if fresh and done == 0:  # found by its blobs, but its dots are refused: this frame has no answer
                 tables.frame_status[start + i] = FrameStatus.MARKERS_NOT_FOUND
+                follower.first_reason = follower.first_reason or _refusals(tables.status[start + i])
                 i += 1
+
+
+def _refusals(status: NDArray[np.uint8]) -> str:
+    """Why the dots (2, m) of a pair were refused, in words."""
+    kinds, counts = np.unique(status, return_counts=True)
+    listed = ", ".join(f"{n} {MarkerStatus(k).name.lower()}" for k, n in zip(kinds, counts, strict=True))
+    return f"blobs lie where the dots should be, but their grey values do not fit the dots of [markers]: {listed}"
 
 
 def _acquire(follower: _Follower, images: Images, readable: NDArray[np.bool_]) -> bool:
@@ -338,6 +346,17 @@ def _measure_blur_and_noise(
     following: tuple[Array, Array] | None,
 ) -> None:
     n, m = min(NOISE_FRAMES, len(images)), follower.disc.n_markers
+    for camera, (R_cw, t_cw) in enumerate(follower.rig.camera_poses()):
+        # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
+        # the pose found by blobs is good to a fraction of a pixel, and the flat parts keep off the edges by more
+        if readable[0, camera]:
+            follower.noise[camera] = measure_noise(
+                [images[0, camera]],
+                follower.rig.cameras[camera],
+                [(R_cw @ pose[0], R_cw @ pose[1] + t_cw)],
+                follower.disc,
+                (follower.maps_x[camera], follower.maps_y[camera]),
+            )
     for blur_known in (False, True):  # the second time with the blur of the first
         follower.start_from(pose, following)
         trial = _empty_tables(n, m)

@@ -11,12 +11,12 @@ from disctrack.frames import rotation_from_euler
 from disctrack.render import render_disc, rig_of
 from disctrack.validate import QUICK, complaints, scene_of, summarise, validate, verdict, write_validation
 from disctrack.validate.bound import camera_maps, dot_pixels, pose_bound
-from disctrack.validate.comparison import joined, noise_consistency
+from disctrack.validate.comparison import compare, joined, noise_consistency
 from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, static_poses
 from disctrack.validate.run import Plan
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, DISTURBANCES, apply_stress, stress_poses
 from disctrack.validate.summary import FINAL, ROLLING, STATIC
-from disctrack.validate.trial import locate
+from disctrack.validate.trial import every, locate
 
 SMALL = replace(
     QUICK, static_poses=24, rolling_frames=16, final_frames=16, bound_poses=4, copies=8, stress_poses=0, fewest=1
@@ -232,3 +232,25 @@ def test_command_prints_the_verdict_and_tells_of_failed_checks(outcome, tmp_path
     monkeypatch.setattr("disctrack.validate.run.validate", lambda plan, **_: (bad, outcome[1]))
     assert main(["validate", "--quick", "-o", str(tmp_path / "out")]) == 1
     assert "planted fault" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("bits", "read_noise"), [(8, 16.0), (12, 3.0), (16, 0.8)])
+def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, read_noise, rng):
+    """The noise is measured before dots are judged by it: what is large in grey values is not a misfit."""
+    scene = scene_of(2, quick=True)
+    scene = replace(
+        scene,
+        cameras=replace(scene.cameras, bit_depth=bits),
+        sensor=replace(scene.sensor, read_noise_dn=read_noise),
+    )
+    rig, disc = rig_of(scene), scene.declared_disc
+    q = stress_poses(3, rig, scene, rng)
+    tracking = locate(render_disc(q, rig, disc, scene, rng), rig, disc, 1000.0, apart=True)
+    found = compare(every(tracking.trajectory, 2), q)
+    assert found.usable.all()
+    # on 40 numbers chance allows 1 +- 0.33
+    assert 0.3 < noise_consistency(found).value < 2.0
+    grey = (2**bits - 1) / 255
+    assert tracking.noise[0].variance(100 * grey) == pytest.approx(
+        (read_noise**2 + 100 / 50) * grey**2, rel=0.35
+    )  # 12 flat parts of some 100 pixels each
