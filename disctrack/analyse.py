@@ -22,6 +22,7 @@ from disctrack.scaling import (
     count_nutation,
     exponents_by_window,
     fit_power_laws,
+    power_law_end,
 )
 from disctrack.storage import read_provenance, read_trajectory, write_group
 from disctrack.trajectory import Trajectory
@@ -109,15 +110,15 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
             "and track again."
         )
     motion = differentiate(trajectory)
-    contact = analyse_contact(motion, circle_duration)
+    until, sense = _end_of_rolling(motion)
+    contact = analyse_contact(motion, circle_duration, until)
     if contact.onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
         motion = differentiate(trajectory, breaks=(contact.onset.time,))
-        contact = replace(analyse_contact(motion, circle_duration), onset=contact.onset)
+        contact = replace(analyse_contact(motion, circle_duration, until), onset=contact.onset)
     found = propagate(motion, rates)
     energy = analyse_energy(motion)
     theta_sigma = np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
-    sense = np.sign(np.nanmedian(found.value[:, 0])) if np.isfinite(found.value[:, 0]).any() else 1.0
-    psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]  # precession in either sense
+    psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]
     data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, 5])
     scaling = Scaling(
         laws=fit_power_laws(*data, window=window),
@@ -133,6 +134,16 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         scaling=scaling,
         warnings=_warnings(trajectory, motion, contact, scaling),
     )
+
+
+def _end_of_rolling(motion: Motion) -> tuple[float, float]:
+    """Instant [s] at which the precession is stopped (or the recording ends), and the sense of the precession."""
+    psidot = propagate(motion, rates).value[:, 0]
+    known = np.isfinite(psidot)
+    if not known.any():
+        return np.inf, 1.0
+    sense = float(np.sign(np.sum(psidot[known]))) or 1.0
+    return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 
 def run_analyse(

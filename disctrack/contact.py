@@ -124,24 +124,29 @@ class Contact:
     propagated: Propagated
 
 
-def analyse_contact(motion: Motion, circle_duration: float = 0.6) -> Contact:
-    """Contact point, slip, locus, forces; onset of rolling; circle through the locus of the last `circle_duration`."""
+def analyse_contact(motion: Motion, circle_duration: float = 0.6, until: float = np.inf) -> Contact:
+    """Contact point, slip, locus, forces; onset of rolling; circle through the locus of the last `circle_duration`.
+
+    until : end of the rolling motion [s]; a disc that is being stopped, or lies still, says nothing about rolling
+    """
     found = propagate(motion, lambda state: contact_quantities(state, motion.disc, motion.gravity))
     return Contact(
         series=found.series(CONTACT),
-        onset=rolling_onset(motion, found),
-        circle=locus_circle(motion, found, circle_duration),
+        onset=rolling_onset(motion, found, until=until),
+        circle=locus_circle(motion, found, circle_duration, until),
         propagated=found,
     )
 
 
-def rolling_onset(motion: Motion, found: Propagated, tolerance: float = SLIP_TOLERANCE) -> RollingOnset:
+def rolling_onset(
+    motion: Motion, found: Propagated, tolerance: float = SLIP_TOLERANCE, until: float = np.inf
+) -> RollingOnset:
     """Change from slip to rolling: posterior over the first rolling frame, flat prior, slip of unknown size before it.
 
     Before the onset each slip component has variance s^2 + noise, s unknown between 4 `tolerance` and 10 m/s, after
     it tolerance^2 + noise. Neighbouring frames share noise: their likelihoods are weighed by the independent share.
     """
-    frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1))
+    frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1) & (motion.time <= until))
     if frames.size < 2:
         return _no_onset("the contact velocity is not known in any two frames")
     v = found.value[frames, SLIP]
@@ -224,13 +229,13 @@ def _no_onset(reason: str) -> RollingOnset:
     return RollingOnset(nan, nan, nan, nan, nan, nan, nan, 0, f"not determined: {reason}")
 
 
-def locus_circle(motion: Motion, found: Propagated, duration: float) -> Circle:
-    """Circle through the contact points of the last `duration` seconds of the recording, least squares of distances.
+def locus_circle(motion: Motion, found: Propagated, duration: float, until: float = np.inf) -> Circle:
+    """Circle through the contact points of the last `duration` seconds before `until`, least squares of distances.
 
     Its sigma comes from the scatter about the circle with as many independent points as half turns; radii of arcs
     below a quarter turn are not given.
     """
-    known = np.flatnonzero(np.isfinite(found.value[:, :2]).all(axis=1))
+    known = np.flatnonzero(np.isfinite(found.value[:, :2]).all(axis=1) & (motion.time <= until))
     nan = float("nan")
     nothing = Circle(np.full(2, nan), nan, nan, nan, nan, nan, nan, nan, nan)
     if known.size < 8:

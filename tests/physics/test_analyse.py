@@ -68,6 +68,30 @@ def test_analysing_again_replaces_the_groups(tmp_path, late, analysed):
     assert_allclose(arrays["velocity_x"], analysed.motion.velocity[:, 0], atol=0)
 
 
+def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_gives(true_motion, as_tracked):
+    """A patch stops the precession at 0.5 degrees within 20 ms, then the disc lies still for 0.2 s."""
+    truth = true_motion(theta_deg=9, duration=3.0)[-600:]
+    fall = np.clip(1 - np.arange(1, 221) / 20, 0, 1)
+    turned = np.cumsum(fall)[:, None] * 1e-3 * truth.rates[-1, [0, 1, 2]] * [1, 0, 1]
+    euler = np.concatenate([truth.euler, truth.euler[-1] + turned])
+    position = np.concatenate([truth.position, np.tile(truth.position[-1], (220, 1))])
+    n = len(euler)
+    still = replace(
+        truth,
+        time=truth.time[0] + np.arange(n) * 1e-3,
+        position=position,
+        R=rotation_from_euler(*euler.T),
+        euler=euler,
+    )
+    free = analyse(as_tracked(truth, np.random.default_rng(1)))
+    stopped = analyse(as_tracked(still, np.random.default_rng(1)))
+    assert stopped.scaling.laws.determined
+    assert abs(stopped.scaling.laws.n_theta.value - free.scaling.laws.n_theta.value) < 0.005
+    assert abs(stopped.scaling.laws.t_f - free.scaling.laws.t_f) < 2e-3
+    assert "from the first frame" in stopped.contact.onset.verdict
+    assert_allclose(stopped.contact.circle.radius, free.contact.circle.radius, atol=2e-5)
+
+
 def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analysed):
     """Seen in a mirror (y -> -y) psi runs backwards, and nothing else changes."""
     q = late.q * np.array([1, -1, 1, -1, 1, -1])
