@@ -8,6 +8,7 @@ The public verbs in the order of the measurement; each is imported when it is fi
     measurement = measure(recording, found.rig, pairs)          # -> Measurement with .trajectory
     write_trajectory(path, measurement.trajectory, trajectory_provenance(recording, found.rig, pairs, None))
     trajectory = read_trajectory(path)
+    outcome = run_analyse(path)                                 # -> groups in the file, .report, .analysis
 
 Conventions (frames, angles, units, pixels) have one home: the docstring of disctrack.frames.
 """
@@ -18,7 +19,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from disctrack.analyse import Analysis, run_analyse
     from disctrack.chessboard_views import calibrate_recording, calibrate_views, find_views
+    from disctrack.derivatives import differentiate
     from disctrack.disc import Disc
     from disctrack.errors import DiscTrackError
     from disctrack.overlay import write_overlay
@@ -46,6 +49,8 @@ _HOME = {
     "trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
     "storage": ("Provenance", "write_trajectory", "read_trajectory", "write_csv", "write_group", "read_group"),
     "overlay": ("write_overlay",),
+    "derivatives": ("differentiate",),
+    "analyse": ("Analysis", "run_analyse"),
     "errors": ("DiscTrackError",),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -74,6 +79,9 @@ __all__ = [  # noqa: RUF022 (in the order of the measurement, not of the alphabe
     "write_group",
     "read_group",
     "write_overlay",
+    "differentiate",
+    "run_analyse",
+    "Analysis",
     "DiscTrackError",
 ]
 
