@@ -38,6 +38,7 @@ _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of 
 _CLIP_SIGMA = 5.0
 # Semi-minor axis in blurs: below, the two long edges melt into one another and the centre errs by more than its sigma.
 _MIN_SEMI_MINOR = 3.7
+_MIN_SEMI_MINOR_PX = 3.5  # in fewer pixels the edge distance itself is too coarse, however sharp the image
 _ATTITUDE_TOLERANCE = 1.5e-3  # [rad] farther from the expected attitude a pair is looked at once more
 
 
@@ -365,7 +366,7 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
-        if radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], 3.5):  # in fewer px the edge distance itself is too coarse
+        if radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], _MIN_SEMI_MINOR_PX):
             return BLURRED
         band = 3.0 * p[SIGMA] + 1.0
         extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
