@@ -47,6 +47,7 @@ STATE = (
 )
 N_STATE = len(STATE)  # 18
 CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
+GROUP_OF_CHANNEL = np.array([0, 0, 1, 2, 2, 3])
 GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
 KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
@@ -263,20 +264,20 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     """
     n = len(samples.ticks)
     half = int(np.ceil(HALF_WINDOW_LENGTHS * max(p.length.max() for p in processes)))
-    weights, prior = np.zeros((n, 6, 3, 2 * half + 1)), np.zeros((n, 6, 3, 3))
+    weights, prior = np.zeros((n, len(CHANNEL_GROUPS), 3, 2 * half + 1)), np.zeros((n, 6, 3, 3))
     unknown = np.zeros(n, bool)
     scale = np.zeros(6)
-    for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
+    for number, (group, process) in enumerate(zip(CHANNEL_GROUPS, processes, strict=True)):
         channels = list(group)
         variance = samples.variance[:, channels].mean(axis=1)
-        W, P = moving_weights(samples.ticks, variance, process, half, samples.part)
-        weights[:, channels], prior[:, channels] = W[:, None], P[:, None]
+        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, samples.part)
+        prior[:, channels] = P[:, None]
         scale[channels] = np.sqrt(process.noise_scale)
         open_fraction = P[:, 1, 1] * process.length**2 / process.amplitude2
         unknown |= ~np.isfinite(open_fraction) | (~samples.good & (open_fraction > KNOWN_FRACTION))
     noise = samples.covariance * np.outer(scale, scale)
     chunks = np.array_split(np.arange(n), max(1, n // 128))
-    parts = [_smoothed_rows(samples, noise, rows, weights[rows], half) for rows in chunks]
+    parts = [_smoothed_rows(samples, noise, rows, weights[rows][:, GROUP_OF_CHANNEL], half) for rows in chunks]
     state, R, covariance, sensitivity = (np.concatenate(p) for p in zip(*parts, strict=True))
     for channel in range(6):
         entries = channel + 6 * np.arange(3)

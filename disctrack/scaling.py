@@ -35,6 +35,7 @@ MIN_PERIODS = 5  # of nutation, in a window
 MIN_SPAN = 2.5  # longest over shortest time left: a power law shows only over a ratio
 MAX_TF_SIGMA = 0.3  # of t_f, over the shortest time left
 RATIO_RANGE = (0.72, 0.95)  # nutation over precession frequency: thin disc 0.7746, 3 mm at 60 degrees 0.89
+FAR_RECORDINGS = 5.0  # times its length that a recording's end may lie before collapse for a number to be given
 TREND_DEGREE = 5  # follows any power law over the window to 1e-3 rad, and no oscillation of MIN_PERIODS
 HARMONICS = ((1, 3), (2, 2))  # (harmonic, terms of its amplitude in a polynomial of the phase)
 BRAKE_DROP = 0.05  # relative fall of psidot below its peak that is taken for the brake at the very end
@@ -114,9 +115,11 @@ def fit_power_laws(
         left = fit.t_f - time
         chosen = usable & (left <= window)
         if chosen.sum() < 20:
+            still = fit.t_f - end
+            how_far = f"about {still:.2g} s" if still < FAR_RECORDINGS * np.ptp(time) else "long"
             return _undetermined(
-                f"the recording ends about {fit.t_f - end:.2g} s before collapse, outside the window of the last "
-                f"{window:g} s: record closer to the end, or ask for a longer window"
+                f"the recording ends {how_far} before collapse, outside the window of the last {window:g} s: record "
+                "closer to the end, or ask for a longer window"
             )
         again = _Fit.start(time[chosen], psi[chosen], np.log(theta[chosen]), np.log(psidot[chosen]), fit)
         moved, fit = abs(again.t_f - fit.t_f), again
