@@ -58,7 +58,7 @@ class PairBlock(Protocol):
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
-NOISE_FRAMES = 12
+NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
 MIN_GOOD_DOT_IMAGES = 6
 MIN_PAIRS_PER_WORKER = 200  # a stretch must outweigh its own search for the disc
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
@@ -370,10 +370,11 @@ def _measure_blur_and_noise(
             follower.blur[camera] = float(np.median(trial.results[:done, camera, :, kernels.FIT_SIGMA][good]))
             if not blur_known:
                 continue
+            sample = range(0, done, NOISE_STEP)
             follower.noise[camera] = measure_noise(
-                [images[k, camera] for k in range(done)],
+                [images[k, camera] for k in sample],
                 follower.rig.cameras[camera],
-                [(R_cw @ trial.R[k], R_cw @ trial.t[k] + t_cw) for k in range(done)],
+                [(R_cw @ trial.R[k], R_cw @ trial.t[k] + t_cw) for k in sample],
                 follower.disc,
                 (follower.maps_x[camera], follower.maps_y[camera]),
                 follower.blur[camera],
