@@ -28,12 +28,12 @@ class Plan:
     """How much is rendered and measured. Poses and frames are shared out among the recordings."""
 
     recordings: int = 3
-    static_poses: int = 120  # in all recordings together
-    rolling_frames: int = 120
-    final_frames: int = 120
+    static_poses: int = 96  # in all recordings together
+    rolling_frames: int = 90
+    final_frames: int = 90
     fewest: int = 12  # of each in one recording
-    bound_poses: int = 16
-    copies: int = 12
+    bound_poses: int = 12
+    copies: int = 10
     stress_poses: int = 6
     bisections: int = 2
     disturbances: tuple[str, ...] = tuple(d.name for d in DISTURBANCES)

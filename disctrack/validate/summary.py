@@ -88,10 +88,9 @@ class Summary:
     controls: tuple[Control, ...]
     warnings: tuple[str, ...]
 
-    @property
-    def law_limit_deg(self) -> float:
-        """Nutation [deg] below which 95 % of psi and phi (2 sigma) no longer lie within the claim."""
-        return float(np.degrees(np.arcsin(min(1.0, 2 * self.law / CLAIM_ROTATION))))
+    def law_limit_deg(self, sigmas: float) -> float:
+        """Nutation [deg] below which so many sigmas of psi and of phi exceed the claim."""
+        return float(np.degrees(np.arcsin(min(1.0, sigmas * self.law / CLAIM_ROTATION))))
 
 
 def summarise(
@@ -212,8 +211,9 @@ def verdict(summary: Summary) -> str:
     )
     if np.isfinite(summary.law):
         text += (
-            f"; it cannot hold for psi and phi alone below {summary.law_limit_deg:.1f} deg of nutation, because each "
-            f"scatters by {np.degrees(summary.law) * 1e3:.2f} mdeg / sin(theta)"
+            f"; it cannot hold for psi and phi alone at small nutation, because each scatters by "
+            f"{np.degrees(summary.law) * 1e3:.2f} mdeg / sin(theta): beyond 0.05 deg below "
+            f"{summary.law_limit_deg(1):.1f} deg (rms) or {summary.law_limit_deg(2):.1f} deg (95 %)"
         )
         if summary.efficiency is not None:
             text += ", as any method must that uses the dots (efficiency "

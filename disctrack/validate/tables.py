@@ -35,8 +35,8 @@ def markdown(summary: Summary) -> str:
     bad = complaints(summary)
     parts.append("Not as it should be:\n\n" + "\n".join(f"- {line}" for line in bad) if bad else "No check has failed.")
     parts.append(
-        f"{summary.recordings} recordings, each with its own cameras and its own rendered chessboards, calibrated from "
-        "these (corner residuals "
+        f"{summary.recordings} recording(s), each with its own cameras and its own rendered chessboards, calibrated "
+        "from these (corner residuals "
         + ", ".join(f"{rms:.4f}" for rms in summary.calibration_rms_px)
         + " px), never with the true cameras unless a column says so. Lengths in um, angles in mdeg; the claim is "
         "5 um and 50 mdeg. Rotation: the rotation vector between measured and true attitude, per axis."
@@ -161,7 +161,11 @@ def as_json(summary: Summary) -> dict[str, Any]:
         tree["efficiency"]["uncertainty"] = summary.efficiency.efficiency_uncertainty
         tree["efficiency"]["quantities"] = list(QUANTITIES)
     head = {"units": "SI, radians", "verdict": verdict(summary), "complaints": list(complaints(summary))}
-    return {**head, "psi_phi_limit_deg": summary.law_limit_deg, **_plain(tree)}
+    return {
+        **head,
+        "psi_phi_limit_deg": {"rms": summary.law_limit_deg(1), "95 %": summary.law_limit_deg(2)},
+        **_plain(tree),
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -12,17 +12,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import Board, StereoCalibration, calibrate_stereo
+from calibration import StereoCalibration
 from calibration.camera import StereoRig
+from disctrack.chessboard_views import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
 from disctrack.readers import open_frames
 from disctrack.readers.blocks import iter_pair_blocks
-from disctrack.readers.files import match_files
 from disctrack.recording import Recording, read_recording
 from disctrack.render import Truth, rig_of, write_recording
 from disctrack.scene import MotionSettings, RollingMotion, Scene
@@ -148,7 +147,7 @@ def run_trial(
     truth = write_recording(folder, base, one_after_the_other(motions, scene.cameras.frame_rate_hz))
     recording = read_recording(folder)
     say("calibrate")
-    calibration = calibrate(recording)
+    calibration, _ = calibrate_recording(recording)
     say("measure")
     edges = np.concatenate([[0], np.cumsum([motion.n_frames for motion in motions])])
     measured = [
@@ -164,24 +163,6 @@ def run_trial(
         for k, (a, b) in enumerate(itertools.pairwise(edges))
     ]
     return Trial(scene, truth, calibration, measured[0], dict(zip(stretches, measured[1:], strict=True)))
-
-
-def calibrate(recording: Recording) -> StereoCalibration:
-    """Calibration from the recording's own chessboard views."""
-    views, table = recording.chessboard, recording.table
-    assert views is not None  # a rendered recording has views
-    folder = recording.folder
-    left, right = (
-        [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) for file in match_files(pattern, folder, camera)]
-        for pattern, camera in zip((views.left, views.right), CAMERAS, strict=True)
-    )
-    return calibrate_stereo(
-        left,
-        right,
-        Board(views.inner_corners, views.square),
-        table_view=None if table is None else table.view,
-        board_thickness=0.0 if table is None else table.board_thickness,
-    )
 
 
 def read_images(recording: Recording, start: int, stop: int) -> Images:
