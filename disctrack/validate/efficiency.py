@@ -12,6 +12,7 @@ from calibration.camera import StereoRig
 from disctrack.frames import euler_jacobian
 from disctrack.render.sensor import digitise
 from disctrack.scene import Scene
+from disctrack.trajectory import MarkerStatus
 from disctrack.validate.bound import camera_maps, inverse_information, pose_bound
 from disctrack.validate.comparison import QUANTITIES, Comparison, compare
 from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, static_poses
@@ -31,17 +32,26 @@ class Efficiency:
     bias: Array  # (n, 7) mean of the copies minus truth; rotation: root mean square of its components
     reported: Array  # (n, 7) sigma that the measurement states
     excess: Array  # (n,) mean of e^T F e / 6 about the mean: variance over the bound's, 1 at best
+    all_dots: NDArray[np.bool_]  # (n,) every dot was used in both cameras in every copy
     copies: int
 
     @property
+    def judged(self) -> NDArray[np.bool_]:
+        """(n,) poses that `efficiency` is taken from: those with all dots, or all where there are none.
+
+        A dot seen nearly edge-on, or in part, is refused though its pixels count in the bound.
+        """
+        return self.all_dots if self.all_dots.any() else np.ones_like(self.all_dots)
+
+    @property
     def efficiency(self) -> float:
-        """Bound over scatter, all six components and all poses together."""
-        return float(1 / np.sqrt(np.mean(self.excess)))
+        """Bound over scatter, all six components of all judged poses together."""
+        return float(1 / np.sqrt(np.mean(self.excess[self.judged])))
 
     @property
     def efficiency_uncertainty(self) -> float:
         """Standard error of `efficiency`."""
-        return float(self.efficiency * np.sqrt(2 / (6 * len(self.excess) * (self.copies - 1))) / 2)
+        return float(self.efficiency * np.sqrt(2 / (6 * self.judged.sum() * (self.copies - 1))) / 2)
 
 
 def measure_efficiency(scene: Scene, rig: StereoRig, n_poses: int, copies: int) -> Efficiency:
@@ -58,7 +68,9 @@ def measure_efficiency(scene: Scene, rig: StereoRig, n_poses: int, copies: int) 
         ]
     )
     tracking = locate(cast(Images, images), rig, disc, scene.cameras.frame_rate_hz, apart=True)
-    comparison = compare(every(tracking.trajectory, 2), np.repeat(poses, copies, axis=0))
+    trajectory = every(tracking.trajectory, 2)
+    comparison = compare(trajectory, np.repeat(poses, copies, axis=0))
+    used = (trajectory.marker_status == MarkerStatus.MEASURED).all(axis=(1, 2)).reshape(len(poses), copies)
     per_pose = [comparison.part(np.arange(len(images)) // copies == k) for k in range(len(poses))]
     kept = [k for k, part in enumerate(per_pose) if part.usable.sum() > 2]
     return Efficiency(
@@ -69,6 +81,7 @@ def measure_efficiency(scene: Scene, rig: StereoRig, n_poses: int, copies: int) 
         bias=np.array([_bias(per_pose[k]) for k in kept]),
         reported=np.array([_reported(per_pose[k]) for k in kept]),
         excess=np.array([_excess(per_pose[k], bounds[k].dots) for k in kept]),
+        all_dots=used[kept].all(axis=1),
         copies=copies,
     )
 

@@ -44,6 +44,8 @@ def error_figure(trials: Sequence[Trial], law: float) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel="nutation θ (deg)", xlim=(0.45, 92))
         axes.set_xticks([0.5, 1, 2, 5, 10, 20, 50], ["0.5", "1", "2", "5", "10", "20", "50"])
         axes.minorticks_off()
+        top = axes.get_ylim()[1]
+        axes.set_ylim(top / 10**4.5, top)  # the smallest errors are luck
         axes.legend(fontsize=8, loc="lower left" if axes is right else "best", ncols=2)
         axes.grid(alpha=0.25)
     figure.suptitle("Errors through the recordings' own calibrations (circles: static, dots: rolling)")
@@ -67,8 +69,6 @@ def _points(
         for k, (colour, name) in enumerate(zip(colours, names, strict=True)):
             axes.plot(np.degrees(comparison.q[:, 4]), size[:, k], marker, color=colour, ms=4 if marker == "o" else 3.5,
                       alpha=0.75, ls="", mew=0, label=name if marker == "o" else None)  # fmt: skip
-        # the smallest errors are luck
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], np.median(size) / 100))
 
 
 def _claim(axes: Axes, value: float, label: str) -> None:
@@ -86,13 +86,14 @@ def bound_figure(e: Efficiency) -> Figure:
         ("ψ", "mdeg", _DEG * 1e3, [3], "#5f4b8b"),
     )
     for panel, (title, unit, scale, columns, colour) in zip(axes, panels, strict=True):
-        curves = (
-            (e.bound_image, ":", GREY, "bound, whole image"),
-            (e.bound, "-", CLAIM_COLOUR, "bound, dots"),
-            (e.reported, "--", colour, "reported σ"),
+        marks = (
+            (e.bound_image, "_", GREY, "bound, whole image"),
+            (e.bound, "_", CLAIM_COLOUR, "bound, dots"),
+            (e.reported, "x", colour, "reported σ"),
         )
-        for values, style, ink, label in curves:
-            panel.plot(theta, scale * _rms(values, columns), style, color=ink, label=label)
+        for values, mark, ink, label in marks:  # no lines: every pose has its own psi, phi and place
+            panel.plot(theta, scale * _rms(values, columns), mark, color=ink, label=label, ms=9 if mark == "_" else 5,
+                       mew=1.8 if mark == "_" else 1.2)  # fmt: skip
         scatter = scale * _rms(e.scatter, columns)
         # n copies and k columns tell a standard deviation to 1 / sqrt(2 k (n - 1)) of itself
         error = scatter / np.sqrt(2 * max(len(columns), 3 if columns == [6] else 1) * (e.copies - 1))
@@ -113,8 +114,9 @@ def bound_figure(e: Efficiency) -> Figure:
 
 def stress_ticks(level: Array) -> list[float]:
     """Round numbers over the range of the levels."""
-    candidates = [m * 10.0**e for e in range(-2, 4) for m in (1, 2, 5)]
-    return [x for x in candidates if 0.8 * level.min() <= x <= 1.25 * level.max()]
+    candidates = [m * 10.0**e for e in range(-2, 4) for m in (1, 1.5, 2, 3, 5, 7)]
+    inside = [x for x in candidates if 0.8 * level.min() <= x <= 1.25 * level.max()]
+    return inside if len(inside) <= 5 else inside[:: -(-len(inside) // 5)]
 
 
 def _rms(values: Array, columns: Sequence[int]) -> Array:

@@ -118,7 +118,7 @@ DISTURBANCES = (
     Disturbance("motion blur: exposure while rolling", "ms", (0.5, 1.5, 4.0, 12.0), _exposure, moving=True),
     Disturbance("light gradient", "of the light per m", (2.0, 6.0, 12.0, 24.0), _gradient),
     Disturbance("glare: spot of 0.1 image widths", "grey values at its middle", (20.0, 60.0, 120.0, 230.0), _glare),
-    Disturbance("dots that have come off", "of 6", (1.0, 2.0, 3.0, 4.0), _same, hidden=True),
+    Disturbance("dots that have come off", "of 6, the innermost stays", (1.0, 2.0, 3.0, 4.0), _same, hidden=True),
     Disturbance("a rod before each camera: its width", "px", (10.0, 30.0, 80.0, 160.0), _rod),
 )  # fmt: skip
 
@@ -158,8 +158,7 @@ def apply_stress(
         rng = np.random.default_rng([scene.seed, 10])
         visible = None
         if disturbance.hidden:
-            off = rng.permuted(np.tile(np.arange(disc.n_markers), (len(q), 1)), axis=1) < int(level)
-            visible = ~np.repeat(off[:, None], 2, axis=1)
+            visible = ~np.repeat(_dots_off(disc, len(q), int(level), rng)[:, None], 2, axis=1)
         images = render_disc(q, true, disc, disturbance.scene(scene, level), rng, qdot=rates, visible=visible)
         return judge(level, images, own, disc, scene, q)
 
@@ -178,6 +177,16 @@ def apply_stress(
         levels[middle] = at(middle)
     ordered = tuple(levels[level] for level in sorted(levels))
     return Stress(disturbance.name, disturbance.unit, ordered, bracket(list(ordered)))
+
+
+def _dots_off(disc: Disc, n: int, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """(n, m) which dots have come off, at random, but for the innermost: without it the others repeat every 60 deg."""
+    keeps = int(np.argmin(np.linalg.norm(disc.marker_centres_body[:, :2], axis=1)))
+    others = np.delete(np.arange(disc.n_markers), keeps)
+    order = rng.permuted(np.tile(others, (n, 1)), axis=1)
+    off = np.zeros((n, disc.n_markers), bool)
+    np.put_along_axis(off, order[:, :count], True, axis=1)
+    return off
 
 
 def bracket(levels: list[Level]) -> tuple[float, float]:

@@ -107,7 +107,8 @@ def _efficiency_table(e: Efficiency) -> str:
                 _figure(e.excess[k]) if first else "",
             ])  # fmt: skip
     note = (
-        f"{e.copies} noisy copies of each pose, true cameras. Efficiency (bound over scatter, all components) "
+        f"{e.copies} noisy copies of each pose, true cameras. Efficiency (bound over scatter, all components, the "
+        f"{int(e.judged.sum())} of {len(e.q)} poses in which every dot was used) "
         f"{e.efficiency:.3f} +- {e.efficiency_uncertainty:.3f}. The bound takes light, blur and the dots' size as "
         "known; the method fits them for each dot.\n"
     )
