@@ -11,6 +11,7 @@ import numpy as np
 from disctrack.validate.comparison import QUANTITIES, Consistency
 from disctrack.validate.efficiency import Efficiency
 from disctrack.validate.summary import CONSISTENT, Row, Summary, complaints, verdict
+from disctrack.validate.trial import EXPOSURE
 
 _UM, _MDEG = 1e6, 180e3 / np.pi
 _LENGTHS = ("x", "y", "z", "position")
@@ -43,6 +44,12 @@ def markdown(summary: Summary) -> str:
     )
     for kind, rows in summary.rows.items():
         parts += [f"## {kind[0].upper()}{kind[1:]}, face seen by both cameras", accuracy_table(rows)]
+    if len(summary.rows) > 1:
+        parts.append(
+            f"Exposure while rolling: {1e3 * EXPOSURE:g} ms. An image shows the mean attitude of the exposure, "
+            "not the attitude at its middle: theta appears smaller by sin(theta) (psidot exposure)^2 / 24, which no "
+            "covariance of the noise contains."
+        )
     parts += ["## As a function of nutation (static poses, both cameras)", _strata_table(summary)]
     parts += ["## Who sees the face (static poses)", _sight_table(summary)]
     if summary.efficiency is not None:
