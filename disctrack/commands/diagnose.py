@@ -1,0 +1,30 @@
+"""`disctrack diagnose`: which effect does the model lack?"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack diagnose`."""
+    parser.add_argument("trajectory", type=Path, help="trajectory file; the group diagnosis is added to it")
+    models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
+    parser.add_argument("--model", default="paper", help=models)
+    parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: NAME_diagnosis beside it)")
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier diagnosis")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Diagnose; returns the exit code."""
+    from disctrack import summary
+    from disctrack.cli import DONE
+    from disctrack.commands import _outputs as outputs
+    from disctrack.diagnosis import run_diagnose
+
+    path = arguments.trajectory
+    folder = arguments.output or path.with_name(f"{path.stem}_diagnosis")
+    outcome = run_diagnose(path, folder, model=arguments.model, overwrite=arguments.overwrite)
+    files = [outputs.relative(file) for file in (path, *outcome.files)]
+    print("\n".join([*outcome.summary, *summary.file_lines(files)]))
+    return DONE

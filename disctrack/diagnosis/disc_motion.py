@@ -1,0 +1,73 @@
+"""Effects of the motion, from the rolling model's catalogue, as candidates of the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from disctrack.diagnosis.system import Candidate, Quantity
+from disctrack.rolling import CATALOGUE, Effect, Model, Parameter
+
+# Parameters of one effect that act so differently that each part is a question of its own.
+_PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
+STATE_SCALES = {
+    "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,
+}  # fmt: skip
+_STATE_UNITS = dict(zip(STATE_SCALES, ("m", "m", "rad", "rad", "rad", "rad/s", "rad/s", "rad/s"), strict=True))
+
+
+def state_quantities() -> tuple[Quantity, ...]:
+    """The eight numbers of the initial state."""
+    return tuple(
+        Quantity(f"state.{name}", _STATE_UNITS[name], scale, meaning="at the first instant")
+        for name, scale in STATE_SCALES.items()
+    )
+
+
+def effect_quantity(effect: type[Effect], parameter: Parameter) -> Quantity:
+    """A parameter of an effect as the engine wants it."""
+    null = parameter.nominal if parameter.is_shape else parameter.null
+    return Quantity(
+        f"{effect.name}.{parameter.name}",
+        parameter.unit,
+        0.01 * abs(parameter.nominal),
+        null=null,
+        lower=parameter.lower,
+        upper=parameter.upper,
+        meaning=parameter.meaning,
+        typical=abs(parameter.nominal),
+    )
+
+
+def model_quantities(model: Model) -> tuple[Quantity, ...]:
+    """Parameters of the effects that the model declares: they are fitted, in their bounds."""
+    return tuple(
+        effect_quantity(type(effect), p) for effect in model.effects for p in effect.parameters if not p.is_shape
+    )
+
+
+def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple[Candidate, ...]:
+    """Every effect of the catalogue that may be proposed and that the model does not have yet.
+
+    names : only these effects, if given
+    """
+    present = {effect.name for effect in model.effects}
+    found = []
+    for effect in list(CATALOGUE.values()):
+        wanted = names is None or effect.name in names
+        # a law by formula that somebody registered is not part of the catalogue that every session has
+        if (
+            not (wanted and effect.candidate)
+            or effect.name in present
+            or (names is None and hasattr(effect, "formulas"))
+        ):
+            continue
+        amounts = [p for p in effect.parameters if not p.is_shape and np.isfinite(p.null)]
+        if not amounts:
+            continue
+        parts = _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)})
+        for name, members in parts.items():
+            quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
+            found.append(Candidate(name, effect.name, "motion", effect.title, effect.source, quantities))
+    return tuple(found)

@@ -1,0 +1,180 @@
+"""A diagnosis as JSON, as a group of the trajectory file, and as lines for people."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.fit import Fit
+from disctrack.diagnosis.search import Diagnosis, Found, Tried
+from disctrack.diagnosis.words import effect_text
+from disctrack.frames import POSE_COMPONENTS
+from disctrack.labelled import Variable
+from disctrack.storage import write_group
+
+GROUP = "diagnosis"
+
+
+def _number(x: float | None) -> float | None:
+    """JSON knows no infinities."""
+    return None if x is None or not np.isfinite(x) else float(x)
+
+
+def _parameters(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": q.name.partition(".")[2],
+            "value": _number(fit.values[q.name]),
+            "sigma": _number(fit.sigma(q.name)),
+            "unit": q.unit,
+            "meaning": q.meaning,
+        }
+        for q in quantities
+    ]
+
+
+def _effect(found: Found, diagnosis: Diagnosis) -> dict[str, Any]:
+    c = found.candidate
+    return {
+        "name": c.effect,
+        "candidate": c.name,
+        "kind": c.kind,
+        "title": c.title,
+        "source": c.source,
+        "parameters": _parameters(c.quantities, diagnosis.after),
+        "class": [
+            {
+                "name": r.candidate.name,
+                "angle_deg": _number(np.degrees(r.angle)),
+                "delta_chi_square": _number(r.loss),
+                "parameters": _parameters(r.candidate.quantities, r.fit),
+            }
+            for r in found.cannot_be_told_from
+        ],
+        "score": _number(found.gain),
+        "threshold": _number(found.threshold),
+        "significance_sigma": _number(np.sqrt(max(found.gain, 0.0))),
+        "held_out_gain": _number(found.held_out_gain),
+    }
+
+
+def _errors(errors: Errors | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    w = errors.whiteness
+    return {
+        "reduced_chi_square": _number(errors.reduced_chi_square),
+        "reduced_chi_square_pose": _number(errors.reduced_chi_square_pose),
+        "rms_px": _number(errors.rms_px),
+        "held_out": {
+            "ratio_to_noise_floor": _number(errors.ratio_to_floor),
+            "free_run": [
+                {
+                    "horizon_s": a.horizon,
+                    "theta_deg": _number(a.theta_deg),
+                    "psi_deg": _number(a.psi_deg),
+                    "position_mm": _number(a.position_mm),
+                    "noise_theta_deg": _number(a.noise_theta_deg),
+                    "noise_psi_deg": _number(a.noise_psi_deg),
+                    "noise_position_mm": _number(a.noise_position_mm),
+                }
+                for a in errors.ahead
+            ],
+        },
+        "whiteness": {
+            "ljung_box": dict(zip(POSE_COMPONENTS, w.ljung_box.tolist(), strict=True)),
+            "p_value": w.p_value,
+            "peak_frequency_hz": dict(zip(POSE_COMPONENTS, w.peak_frequency.tolist(), strict=True)),
+            "peak_p_value": dict(zip(POSE_COMPONENTS, w.peak_p_value.tolist(), strict=True)),
+            "peak_near": dict(zip(POSE_COMPONENTS, w.peak_near, strict=True)),
+        },
+    }
+
+
+def _tried(tried: Tried) -> dict[str, Any]:
+    return {
+        "name": tried.candidate.name,
+        "kind": tried.candidate.kind,
+        "score": _number(tried.score),
+        "refit_gain": _number(tried.gain),
+        "held_out_gain": _number(tried.held_out_gain),
+        "reason": tried.reason,
+    }
+
+
+def _declared(fit: Fit) -> dict[str, Any]:
+    laws = [q for q in fit.quantities if q.name.partition(".")[0] not in ("state", "rig") and "dot_" not in q.name]
+    return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
+
+
+def as_json(
+    diagnosis: Diagnosis,
+    text: str,
+    model: str,
+    before: Errors | None,
+    after: Errors | None,
+    energy: dict[str, float],
+) -> dict[str, Any]:
+    """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
+    return {
+        "verdict": diagnosis.verdict,
+        "sentence": text,
+        "reason": diagnosis.reason,
+        "model": model,
+        "effects": [_effect(f, diagnosis) for f in diagnosis.found],
+        "before": (_errors(before) or {}) | {"parameters": _declared(diagnosis.before)},
+        "after": (_errors(after) or {}) | {"parameters": _declared(diagnosis.after)},
+        "noise_variance_over_stated": _number(diagnosis.noise),
+        "energy_J": energy,
+        "tried": [_tried(t) for t in diagnosis.tried],
+        "settings": vars(diagnosis.settings),
+    }
+
+
+def write_diagnosis(path: Path, system: DiscSystem, diagnosis: Diagnosis, document: dict[str, Any]) -> None:
+    """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
+    n = len(system.trajectory)
+    variables = {}
+    for name, fit in (("before", diagnosis.before), ("after", diagnosis.after)):
+        residual = np.full((n, 6), np.nan)
+        if diagnosis.held_out_before is not None:
+            whitened = system.pose_residual(fit.values)
+            residual[system.rows] = np.where((system.weights >= 6)[:, None], whitened, np.nan)
+        what = f"whitened pose residual {name} the missing effects were added; variance 1 if only noise is left"
+        variables[f"residual_{name}"] = Variable(residual, ("time", "pose_component"), "1", what)
+        predicted = np.full((n, 6), np.nan)
+        if diagnosis.held_out_before is not None:
+            predicted[system.rows] = system.poses(fit.values)
+        variables[f"q_{name}"] = Variable(
+            predicted, ("time", "coordinate"), "m and rad", f"x, y, z, psi, theta, phi of the model {name}"
+        )
+    axes = {
+        "coordinate": Variable(np.array(["x", "y", "z", "psi", "theta", "phi"]), ("coordinate",), "1", "coordinate")
+    }
+    attributes = {"verdict": diagnosis.verdict, "sentence": document["sentence"], "diagnosis": json.dumps(document)}
+    write_group(path, GROUP, variables, axes=axes, attributes=attributes)
+
+
+def lines(diagnosis: Diagnosis, text: str, before: Errors | None, after: Errors | None) -> list[str]:
+    """Some lines for the terminal."""
+    found = [f"{'verdict':<13} {diagnosis.verdict}", f"{'':<13} {text}"]
+    for f in diagnosis.found:
+        found.append(f"{'effect':<13} {effect_text(f, diagnosis)} (gain {f.gain:.4g}, held out {f.held_out_gain:.4g})")
+    if before is None or after is None:
+        return found
+    found.append(
+        f"{'chi-square':<13} {before.reduced_chi_square:.4g} -> {after.reduced_chi_square:.4g} per degree of freedom; "
+        f"{before.rms_px:.4f} -> {after.rms_px:.4f} px rms"
+    )
+    found.append(f"{'free run':<13} {before.ratio_to_floor:.4g} -> {after.ratio_to_floor:.4g} times the noise floor")
+    for a, b in zip(before.ahead, after.ahead, strict=True):
+        found.append(
+            f"{'':<13} {a.horizon:g} s ahead: theta {a.theta_deg:.3g} -> {b.theta_deg:.3g} deg, psi {a.psi_deg:.3g} -> "
+            f"{b.psi_deg:.3g} deg, position {a.position_mm:.3g} -> {b.position_mm:.3g} mm"
+        )
+    return found

@@ -1,0 +1,59 @@
+"""A diagnosis in plain words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.search import Diagnosis, Found
+
+_PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
+_PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
+
+
+def quantity_text(value: float, sigma: float, unit: str) -> str:
+    """Value and sigma with as many digits as the sigma deserves: "60.0(2) um" is written 60.0 +- 0.2 um."""
+    factor, prefix = 1.0, ""
+    if unit in _PREFIXED_UNITS and value:
+        for size, name in _PREFIXES:
+            factor, prefix = size, name
+            if abs(value) < 1000 * size:
+                break
+    value, sigma = value / factor, sigma / factor
+    unit = "" if unit == "1" else f" {prefix}{unit}"
+    if not sigma > 0:
+        return f"{value:.4g}{unit}"
+    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
+    if digits > 6 or abs(value) >= 1e6:
+        return f"({value:.5g} +- {sigma:.2g}){unit}"
+    return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
+
+
+def effect_text(found: Found, diagnosis: Diagnosis) -> str:
+    """One effect with its size and what it cannot be told from."""
+    fit = diagnosis.after
+    sizes = ", ".join(
+        f"{q.name.partition('.')[2]} = {quantity_text(fit.values[q.name], fit.sigma(q.name), q.unit)}"
+        for q in found.candidate.quantities
+    )
+    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}"
+    if found.cannot_be_told_from:
+        rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)
+        text += f"; this recording cannot tell it from {rivals}"
+    return text
+
+
+def sentence(diagnosis: Diagnosis, after: Errors | None) -> str:
+    """The answer in one or a few sentences."""
+    if after is None:
+        return f"No answer: {diagnosis.reason}."
+    level = f"{after.rms_px:.4f} px rms ({after.reduced_chi_square:.3f} of the expected variance)"
+    if diagnosis.verdict == "nothing missing":
+        return f"Nothing is missing at the level of {level}."
+    effects = "; and ".join(effect_text(f, diagnosis) for f in diagnosis.found)
+    if diagnosis.verdict == "found":
+        return f"Missing in the model: {effects}. With it, what is left is noise: {level}."
+    if effects:
+        nearest = f"the nearest description is {effects}, which leaves {level}"
+        return f"Something is missing that the catalogue does not name; {nearest}."
+    return f"Something is missing that no effect of the catalogue describes: {level} are left."

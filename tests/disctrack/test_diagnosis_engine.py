@@ -1,0 +1,171 @@
+"""The engine on a system that is no disc: a damped oscillator with a known answer."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis import Candidate, Quantity, diagnose
+from disctrack.diagnosis.fit import compress, fit, solve_bounded, triangle
+from disctrack.diagnosis.held_out import held_out, training_rows
+from disctrack.diagnosis.score import Linearisation, angle, score_all
+from disctrack.diagnosis.whiteness import ljung_box, whiteness
+
+SIGMA = 0.01
+
+
+class Oscillator:
+    """x'' = -w0^2 x - 2 d x' + f: started at (a, b); what it may lack: damping, a drift, a hum at 3 Hz, its twin."""
+
+    def __init__(self, observed, time):
+        self.time, self.observed = time, observed
+        self.weights = np.where(np.isfinite(observed), 1.0, 0.0)
+        self.base = (Quantity("a", "m", 0.1), Quantity("b", "m", 0.1), Quantity("w0", "rad/s", 0.1, null=7.0))
+        one = lambda name, **more: (Quantity(name, "1", 0.1, **more),)  # noqa: E731
+        self.candidates = (
+            Candidate("damping", "damping", "motion", "linear damping", "", one("d", lower=0.0)),
+            Candidate("drift", "drift", "measurement", "drift", "", one("drift")),
+            Candidate("hum", "hum", "measurement", "hum", "", (*one("hum_c"), *one("hum_s"))),
+            Candidate("twin", "twin", "measurement", "minus the drift", "", one("twin")),
+            Candidate("nothing", "nothing", "motion", "moves nothing", "", one("nothing")),
+        )
+
+    def predicted(self, values: Mapping[str, float]):
+        get = lambda n: values.get(n, 0.0)  # noqa: E731
+        t = self.time
+        envelope = np.exp(-get("d") * t)
+        x = envelope * (get("a") * np.cos(get("w0") * t) + get("b") * np.sin(get("w0") * t))
+        hum = get("hum_c") * np.cos(6 * np.pi * t) + get("hum_s") * np.sin(6 * np.pi * t)
+        return x + (get("drift") - get("twin")) * t + hum
+
+    def linearise(self, values, names):
+        known = self.weights > 0
+        r = np.where(known, np.where(known, self.observed, 0.0) - self.predicted(values), 0.0) / SIGMA
+        columns = []
+        for name in names:
+            up, down = ({**values, name: values.get(name, 0.0) + s * 1e-6} for s in (1, -1))
+            columns.append((self.predicted(up) - self.predicted(down)) / 2e-6 / SIGMA * known)
+        J = np.stack(columns, axis=-1) if columns else np.zeros((len(r), 0))
+        return r[:, None], J[:, None]
+
+
+def oscillator(rng, hidden=None, n=400):
+    time = np.linspace(0, 4, n)
+    truth = {"a": 1.0, "b": 0.3, "w0": 6.5, **(hidden or {})}
+    clean = Oscillator(np.zeros(n), time).predicted(truth)
+    return Oscillator(clean + SIGMA * rng.standard_normal(n), time)
+
+
+START = {"a": 0.9, "b": 0.4, "w0": 6.4}
+
+
+def test_triangle_keeps_all_inner_products(rng):
+    A = rng.standard_normal((5000, 7)) * 10.0 ** np.arange(-3, 4)
+    R = triangle(A)
+    assert R.shape == (7, 7)
+    assert_allclose(R.T @ R, A.T @ A, rtol=1e-11, atol=1e-10)
+
+
+def test_compressed_problem_has_the_same_solution(rng):
+    A, b = rng.standard_normal((500, 4)), rng.standard_normal(500)
+    right, matrix = compress(b[:, None], A[:, None])
+    assert_allclose(solve_bounded(right, matrix, np.full(4, -np.inf), np.full(4, np.inf)), np.linalg.lstsq(A, b)[0])
+    bounded = solve_bounded(right, matrix, np.zeros(4), np.full(4, np.inf))
+    assert (bounded >= 0).all()
+
+
+def test_fit_scatters_as_its_covariance_says(rng):
+    systems = [oscillator(rng) for _ in range(60)]
+    fits = [fit(s, s.base, START) for s in systems]
+    assert all(f.converged for f in fits)
+    pull = np.array([(f.values["w0"] - 6.5) / f.sigma("w0") for f in fits])
+    assert abs(pull.mean()) < 4 / np.sqrt(60)
+    assert 0.7 < pull.std() < 1.35  # chi-square of 60 at one in a thousand
+
+
+def test_score_of_a_linear_effect_equals_its_refit(rng):
+    system = oscillator(rng, {"drift": 0.004})
+    base = fit(system, system.base, START)
+    (best, *_) = score_all(Linearisation(system, base, system.candidates), system.candidates)
+    assert best.candidate.name in ("drift", "twin")
+    refit = fit(system, (*system.base, *system.candidates[1].quantities), base.values)
+    # the drift is linear, the rest almost: second order in a step of some sigmas
+    assert best.gain == pytest.approx(base.cost - refit.cost, rel=1e-2)
+    assert abs(best.values[0]) == pytest.approx(abs(refit.values["drift"]), rel=1e-2)
+    assert best.sigma[0] == pytest.approx(refit.sigma("drift"), rel=1e-2)
+
+
+def test_twins_enclose_no_angle_and_strangers_a_right_one(rng):
+    system = oscillator(rng)
+    linear = Linearisation(system, fit(system, system.base, START), system.candidates)
+    drift = linear.columns(["drift"])[:, 0]
+    assert angle(linear, drift, ["twin"]) < 1e-6
+    assert angle(linear, drift, ["hum_c", "hum_s"]) > np.radians(80)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "names"),
+    [({"d": 0.02}, {"damping"}), ({"drift": 0.01}, {"drift", "twin"}), ({"hum_c": 0.005, "hum_s": -0.004}, {"hum"})],
+)
+def test_a_hidden_effect_is_named_with_all_that_cannot_be_told_from_it(rng, hidden, names):
+    answer = diagnose(oscillator(rng, hidden), START)
+    assert answer.verdict == "found"
+    (found,) = answer.found
+    assert {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)} == names
+    reasons = {t.candidate.name: t.reason for t in answer.tried}
+    assert "no trace" in reasons["nothing"]
+
+
+def test_two_hidden_effects_are_both_named(rng):
+    answer = diagnose(oscillator(rng, {"d": 0.02, "hum_c": 0.01}), START)
+    assert {f.candidate.name for f in answer.found} == {"damping", "hum"}
+
+
+def test_noise_alone_raises_an_alarm_at_most_once_in_twenty(rng):
+    alarms = sum(bool(diagnose(oscillator(rng), START).found) for _ in range(60))
+    assert alarms <= 3  # the threshold promises one in a hundred
+
+
+def test_a_shuffled_residual_gives_no_finding(rng):
+    system = oscillator(rng, {"d": 0.02})
+    base = fit(system, system.base, START)
+    residual = system.observed - system.predicted(base.values)
+    shuffled = Oscillator(system.predicted(base.values) + rng.permutation(residual), system.time)
+    answer = diagnose(shuffled, START)
+    assert not answer.found
+
+
+def test_a_negative_damping_is_not_allowed_to_explain_growth(rng):
+    answer = diagnose(oscillator(rng, {"d": -0.02}), START)
+    assert all(f.candidate.name != "damping" for f in answer.found)
+    assert answer.verdict == "unexplained"
+
+
+def test_an_effect_outside_the_catalogue_is_left_unexplained(rng):
+    system = oscillator(rng)
+    system.observed = system.observed + 0.05 * np.sign(np.sin(11.0 * system.time))
+    answer = diagnose(system, START)
+    assert answer.verdict == "unexplained"
+    assert not answer.found
+
+
+def test_held_out_error_of_the_true_model_is_at_its_floor(rng):
+    system = oscillator(rng)
+    answer = held_out(system, system.base, START, training_rows(system))
+    # 140 test samples: the ratio scatters by 6 %
+    assert answer.ratio_to_floor == pytest.approx(1.0, abs=0.25)
+    worse = oscillator(rng, {"d": 0.05})
+    assert held_out(worse, worse.base, START, training_rows(worse)).ratio_to_floor > 2
+
+
+def test_ljung_box_accepts_noise_and_refuses_a_slow_wave(rng):
+    noise = rng.standard_normal((500, 3))
+    assert whiteness(noise, 1000.0, {}).p_value > 1e-3
+    wave = noise + np.sin(2 * np.pi * 27.0 * np.arange(500) / 1000.0)[:, None]
+    answer = whiteness(wave, 1000.0, {"precession": 27.0})
+    assert answer.p_value < 1e-6
+    assert answer.peak_near == ("precession",) * 3
+    assert (answer.peak_p_value < 1e-6).all()
+    # chi-square of 20 degrees: mean 20, standard deviation 6.3, over 300 channels
+    assert ljung_box(rng.standard_normal((400, 300))).mean() == pytest.approx(20, abs=1.5)
