@@ -67,11 +67,13 @@ def diagnose_trajectory(trajectory: Trajectory, model: str = PAPER, settings: Se
 def run_diagnose(
     path: Path, output: Path | None = None, *, model: str = PAPER, overwrite: bool = False
 ) -> DiagnoseOutcome:
-    """Diagnose a trajectory file; write diagnosis.json, model.toml, and the group `diagnosis` into the file.
+    """Diagnose a trajectory file; write diagnosis.json, diagnosis.html with figures, model.toml, and the file's group.
 
     output : folder; without it `<name>_diagnosis` beside the file
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
+    from disctrack.diagnosis.report import write_report  # matplotlib is wanted here only
+
     path = Path(path)
     folder = Path(output) if output is not None else path.with_name(f"{path.stem}_diagnosis")
     report = folder / "diagnosis.json"
@@ -88,5 +90,6 @@ def run_diagnose(
     toml = folder / "model.toml"
     text = model_toml(result.system, result.diagnosis.after.values, provenance.recording)
     write_whole(toml, text.encode())
+    pages = write_report(folder, result, provenance.recording)
     said = lines(result.diagnosis, result.sentence, result.before, result.after)
-    return DiagnoseOutcome(result, (report, toml), tuple(said))
+    return DiagnoseOutcome(result, (report, toml, *pages), tuple(said))

@@ -1,0 +1,135 @@
+"""The report of a diagnosis: one HTML page that needs nothing else, and its figures."""
+
+from __future__ import annotations
+
+import base64
+import io
+from html import escape
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from disctrack.diagnosis.diagnose import DiscDiagnosis
+from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.figures import all_figures
+from disctrack.diagnosis.words import effect_text, quantity_text
+from disctrack.figures import Drawn
+from disctrack.whole_files import whole_file, write_whole
+
+_DPI = 150
+_STYLE = """body{font:16px/1.5 system-ui,sans-serif;color:#1d2733;background:#fff;margin:0}
+main{max-width:60rem;margin:0 auto;padding:1.5rem}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
+.lead{font-size:1.1rem;border-left:4px solid #1f6f8b;padding-left:.8rem}table{border-collapse:collapse;width:100%}
+th,td{text-align:left;padding:.25rem .6rem;border-bottom:1px solid #e3e8ed;font-variant-numeric:tabular-nums}
+img{max-width:100%}figcaption{color:#6b7885;font-size:.9rem}figure{margin:1rem 0}.wide{overflow-x:auto}"""
+
+
+def write_report(folder: Path, result: DiscDiagnosis, recording: str) -> tuple[Path, ...]:
+    """Write diagnosis.html and figures/*.png; returns the files. Raises OutputError."""
+    files, pictures = [], []
+    with rc_context({"font.size": 10}):
+        for drawn in all_figures(result):
+            FigureCanvasAgg(drawn.figure)
+            path = folder / "figures" / f"{drawn.name}.png"
+            buffer = io.BytesIO()
+            drawn.figure.savefig(buffer, format="png", dpi=_DPI)
+            with whole_file(path) as part:
+                part.write_bytes(buffer.getvalue())
+            files.append(path)
+            pictures.append(_figure(drawn, buffer.getvalue()))
+    page = folder / "diagnosis.html"
+    write_whole(page, _page(result, recording, pictures).encode())
+    return (page, *files)
+
+
+def _figure(drawn: Drawn, png: bytes) -> str:
+    source = base64.b64encode(png).decode()
+    return (
+        f'<figure><img alt="{escape(drawn.title)}" src="data:image/png;base64,{source}">'
+        f"<figcaption>{escape(drawn.caption)}</figcaption></figure>"
+    )
+
+
+def _page(result: DiscDiagnosis, recording: str, pictures: list[str]) -> str:
+    title = escape(f"{recording}: what does the model lack?")
+    parts = [
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
+        f"<body><main><h1>{title}</h1><p class=lead>{escape(result.sentence)}</p>",
+        f"<p>Verdict: <b>{escape(result.diagnosis.verdict)}</b>. Model: {escape(result.model)}. "
+        f"{escape(result.diagnosis.reason[:1].upper() + result.diagnosis.reason[1:])}.</p>",
+        _effects(result),
+        _before_after(result),
+        *pictures,
+        _tried(result),
+    ]
+    return "\n".join(part for part in parts if part) + "\n</main></body></html>\n"
+
+
+def _effects(result: DiscDiagnosis) -> str:
+    items = "".join(
+        f"<li>{escape(effect_text(f, result.diagnosis))}. Without it chi-square rises by {f.gain:.5g} (noise alone: "
+        f"{f.threshold:.3g}); the held-out data become exp({f.held_out_gain / 2:.4g}) times as probable. "
+        f"{escape(_class_text(f))}</li>"
+        for f in result.diagnosis.found
+    )
+    return f"<h2>Missing effects</h2><ul>{items}</ul>" if items else ""
+
+
+def _class_text(found: object) -> str:
+    rivals = getattr(found, "cannot_be_told_from", ())
+    angles = ", ".join(f"{r.candidate.name} {57.2958 * r.angle:.2g} deg" for r in rivals)
+    return f"Angle between the predicted residuals: {angles}." if angles else ""
+
+
+def _before_after(result: DiscDiagnosis) -> str:
+    before, after = result.before, result.after
+    if before is None or after is None:
+        return ""
+    rows = [
+        ("reduced chi-square of the dots", f"{before.reduced_chi_square:.4g}", f"{after.reduced_chi_square:.4g}"),
+        ("reduced chi-square of the poses", *(f"{e.reduced_chi_square_pose:.4g}" for e in (before, after))),
+        ("rms of the dots [px]", f"{before.rms_px:.4f}", f"{after.rms_px:.4f}"),
+        ("free run over its noise floor", f"{before.ratio_to_floor:.4g}", f"{after.ratio_to_floor:.4g}"),
+        ("Ljung-Box, probability in noise", *(f"{e.whiteness.p_value:.2g}" for e in (before, after))),
+        *_ahead(before, after),
+        *_laws(result),
+    ]
+    body = "".join(f"<tr><td>{escape(a)}<td>{escape(b)}<td>{escape(c)}</tr>" for a, b, c in rows)
+    return f"<h2>Before and after</h2><div class=wide><table><tr><th><th>before<th>after</tr>{body}</table></div>"
+
+
+def _ahead(before: Errors, after: Errors) -> list[tuple[str, str, str]]:
+    rows = []
+    for b, a in zip(before.ahead, after.ahead, strict=True):
+        text = f"free run {b.horizon:g} s ahead: "
+        rows += [
+            (text + f"nutation [deg], noise {b.noise_theta_deg:.2g}", f"{b.theta_deg:.3g}", f"{a.theta_deg:.3g}"),
+            (text + f"precession [deg], noise {b.noise_psi_deg:.2g}", f"{b.psi_deg:.3g}", f"{a.psi_deg:.3g}"),
+            (text + f"position [mm], noise {b.noise_position_mm:.2g}", f"{b.position_mm:.3g}", f"{a.position_mm:.3g}"),
+        ]
+    return rows
+
+
+def _laws(result: DiscDiagnosis) -> list[tuple[str, str, str]]:
+    """Parameters that the model had already, before and after."""
+    first, last = result.diagnosis.before, result.diagnosis.after
+    rows = []
+    for q in first.quantities:
+        if q.name in result.system.model.values:
+            texts = [quantity_text(f.values[q.name], f.sigma(q.name), q.unit) for f in (first, last)]
+            rows.append((q.name, *texts))
+    for name, joule in result.energy.items():
+        rows.append((f"energy {name} [mJ]", "", f"{1e3 * joule:.5g}"))
+    return rows
+
+
+def _tried(result: DiscDiagnosis) -> str:
+    rows = "".join(
+        f"<tr><td>{escape(t.candidate.name)}<td>{t.score:.4g}<td>{'' if t.gain is None else format(t.gain, '.4g')}"
+        f"<td>{'' if t.held_out_gain is None else format(t.held_out_gain, '.4g')}<td>{escape(t.reason)}</tr>"
+        for t in result.diagnosis.tried
+    )
+    head = "<tr><th>candidate<th>score<th>gain, refitted<th>gain, held out<th>outcome</tr>"
+    return f"<h2>What was tried</h2><div class=wide><table>{head}{rows}</table></div>" if rows else ""

@@ -1,0 +1,82 @@
+"""disctrack diagnose from file to file: the group, diagnosis.json, the page, and a model that can be used again."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from disctrack.cli import main
+from disctrack.scene import load_scene
+from disctrack.scene_motion import simulate_scene
+from disctrack.storage import Provenance, read_group, read_trajectory, write_trajectory
+from tests.oracles.measured_disc import measured
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory):
+    """A disc with its centre of mass 0.1 mm off, measured and diagnosed by the command."""
+    folder = tmp_path_factory.mktemp("diagnosed")
+    path = folder / "trajectory.h5"
+    trajectory = measured({"centre_of_mass.c_1": 1e-4}, seed=31, n=300)
+    write_trajectory(path, trajectory, Provenance("unbalanced", {}, {}))
+    assert main(["diagnose", str(path)]) == 0
+    return path, folder / "trajectory_diagnosis"
+
+
+def test_json_holds_verdict_effects_before_after_and_what_was_tried(diagnosed):
+    document = json.loads((diagnosed[1] / "diagnosis.json").read_text())
+    assert document["verdict"] == "found"
+    (effect,) = document["effects"]
+    assert effect["name"] == "centre_of_mass"
+    assert {"parameters", "class", "score", "held_out_gain"} <= set(effect)
+    c_1 = effect["parameters"][0]
+    assert (c_1["name"], c_1["unit"]) == ("c_1", "m")
+    assert abs(c_1["value"] - 1e-4) < 4 * c_1["sigma"]
+    for when in ("before", "after"):
+        assert {"reduced_chi_square", "rms_px", "held_out"} <= set(document[when])
+    assert document["after"]["reduced_chi_square"] < 1.1 < document["before"]["reduced_chi_square"]
+    names = {t["name"] for t in document["tried"]}
+    assert {"kz", "table_tilt", "time_offset", "frame_rate", "ellipse_centre"} <= names
+    assert all(t["reason"] for t in document["tried"])
+
+
+def test_group_holds_the_residuals_and_the_document(diagnosed):
+    arrays, attributes = read_group(diagnosed[0], "diagnosis")
+    assert attributes["verdict"] == "found"
+    assert json.loads(attributes["diagnosis"])["verdict"] == "found"
+    # 1800 numbers of variance 1: the mean square scatters by 3 %
+    assert np.nanmean(arrays["residual_after"] ** 2) == pytest.approx(1.0, abs=0.15)
+    assert np.nanmean(arrays["residual_before"] ** 2) > 2
+    assert len(read_trajectory(diagnosed[0])) == 300  # the rest of the file is as it was
+
+
+def test_page_shows_the_figures_and_says_the_sentence(diagnosed):
+    page = (diagnosed[1] / "diagnosis.html").read_text()
+    assert "Missing in the model" in page
+    assert page.count("<figure>") == len(list((diagnosed[1] / "figures").iterdir())) >= 4
+
+
+def test_enlarged_model_simulates_the_measured_motion(diagnosed):
+    scene = load_scene(diagnosed[1] / "model.toml")
+    motion = simulate_scene(scene)
+    measured_q = read_trajectory(diagnosed[0]).q
+    predicted = np.array([np.interp(np.arange(300) / 1000.0, motion.time, motion.q[:, i]) for i in range(3)]).T
+    # noise 0.5 um a frame, the rig's error some um in common
+    assert np.abs(predicted - measured_q[:, :3]).max() < 2e-5
+    tree = tomllib.loads((diagnosed[1] / "model.toml").read_text())
+    assert "centre_of_mass" in tree["motion"]["rolling"]["effects"]
+
+
+def test_against_the_enlarged_model_nothing_is_missing(diagnosed, tmp_path):
+    model = str(diagnosed[1] / "model.toml")
+    assert main(["diagnose", str(diagnosed[0]), "--model", model, "-o", str(tmp_path / "again")]) == 0
+    document = json.loads((tmp_path / "again" / "diagnosis.json").read_text())
+    assert document["verdict"] == "nothing missing"
+
+
+def test_errors_are_one_line(diagnosed, tmp_path, capsys):
+    assert main(["diagnose", str(diagnosed[0])]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["diagnose", str(diagnosed[0]), "-o", str(tmp_path / "x"), "--model", "no-such-model"]) == 1
+    assert "no such model" in capsys.readouterr().err
