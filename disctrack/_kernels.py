@@ -494,14 +494,21 @@ def locate_dots(
 
 
 @_compiled
-def judge_dot(result, radius, typical_sigma, limits):
-    """Refuse a converged fit that does not look like the dot: limits = misfit, clipped, radius, blur."""
+def judge_dot(result, radius, typical_sigma, noise, limits):
+    """Refuse a converged fit that does not look like the dot: limits = misfit, share, clipped, radius, blur.
+
+    A misfit counts when it is large beside the noise and beside the contrast: the template's own small errors must not
+    condemn the dots of a sensor that hardly has any noise.
+    """
     misfit = math.sqrt(max(result[CHI_SQUARE], 0.0))
-    if misfit > limits[0] or result[CLIPPED] > limits[1]:
+    step = abs(result[FIT_CONTRAST] * result[FIT_LEVEL])
+    middle = result[FIT_LEVEL] * (1.0 - 0.5 * result[FIT_CONTRAST])
+    share = misfit * math.sqrt(max(noise[0] + noise[1] * middle, 0.0)) / max(step, 1e-12)
+    if (misfit > limits[0] and share > limits[1]) or result[CLIPPED] > limits[2]:
         return OCCLUDED
-    if abs(result[FIT_RADIUS] / radius - 1.0) > limits[2]:
+    if abs(result[FIT_RADIUS] / radius - 1.0) > limits[3]:
         return OCCLUDED
-    if result[FIT_SIGMA] > limits[3] * typical_sigma + 1.0:
+    if result[FIT_SIGMA] > limits[4] * typical_sigma + 1.0:
         return BLURRED
     return MEASURED
 
@@ -626,7 +633,7 @@ def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, 
                     scratch, results[c], status[c])  # fmt: skip
         for i in range(centres.shape[0]):
             if status[c, i] == MEASURED:
-                status[c, i] = judge_dot(results[c, i], radius, sigma[c], limits)
+                status[c, i] = judge_dot(results[c, i], radius, sigma[c], noise[c], limits)
 
 
 @_compiled
@@ -655,7 +662,7 @@ def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, r
                  R_last, t_last, R_before, t_before, results, status, R_out, t_out, max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the two before by constant velocity and turn.
 
-    images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 2), limits (4,)
+    images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 2), limits (5,)
     for `judge_dot`. R_last ... t_before hold the last two poses and are updated. Filled: results (n, 2, m, 12), status
     (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was
     lost at that frame.

@@ -53,13 +53,14 @@ class TemplateLimits:
     """When a converged fit is refused."""
 
     misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
+    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
     clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
     radius: float = 0.20  # relative departure of the fitted radius
     blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
 
     def array(self) -> Array:
-        """(4,) for the compiled kernels."""
-        return np.array([self.misfit, self.clipped, self.radius, self.blur])
+        """(5,) for the compiled kernels."""
+        return np.array([self.misfit, self.share, self.clipped, self.radius, self.blur])
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def locate_on_disc(
     )
     limits = limits or TemplateLimits()
     for i in np.flatnonzero(status == MarkerStatus.MEASURED):
-        status[i] = kernels.judge_dot(results[i], 0.5 * disc.marker_diameter, blur_px, limits.array())
+        status[i] = kernels.judge_dot(results[i], 0.5 * disc.marker_diameter, blur_px, noise.parameters, limits.array())
     return dot_centres(results, status)
 
 
@@ -173,7 +174,7 @@ def locate_on_plane(
             results[i],
         )  # fmt: skip
         if status[i] == MarkerStatus.MEASURED:
-            status[i] = kernels.judge_dot(results[i], radius, blur_px, limits.array())
+            status[i] = kernels.judge_dot(results[i], radius, blur_px, noise.parameters, limits.array())
             u = H[i] @ (x + p[0], y + p[1], 1.0)
             results[i, kernels.U], results[i, kernels.V] = u[:2] / u[2]
     return dot_centres(results, status)

@@ -60,6 +60,7 @@ class PairBlock(Protocol):
 MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
 MIN_GOOD_DOT_IMAGES = 6
+MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 MIN_PAIRS_PER_WORKER = 200  # a stretch must outweigh its own search for the disc
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
@@ -246,7 +247,7 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
         1.0,
         zeros(2),
         zeros((2, 2)),
-        zeros(4),
+        zeros(5),
         *(np.eye(3), zeros(3), np.eye(3), zeros(3)),
         zeros((0, 2, 1, kernels.N_RESULT)),
         zeros((0, 2, 1), np.uint8),
@@ -424,7 +425,7 @@ def _assemble(
         as_built=as_built,
         variance_factor=factor,
         acquisitions=sum(f.acquisitions for f in followers),
-        warnings=_warnings(first, factor, trajectory.frame_status),
+        warnings=_warnings(first, factor, trajectory),
     )
 
 
@@ -486,9 +487,17 @@ def _trajectory(
     )
 
 
-def _warnings(follower: _Follower, variance_factor: float, status: NDArray[np.uint8]) -> tuple[str, ...]:
+def _table_gap(trajectory: Trajectory) -> Array:
+    """Height of the disc's lowest point above the table [m] in the frames that have a pose; empty without a table."""
+    if not trajectory.rig.world_is_table:
+        return np.empty(0)
+    z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
+    return z - trajectory.disc.radius * np.sin(theta) - trajectory.disc.half_thickness * np.abs(np.cos(theta))
+
+
+def _warnings(follower: _Follower, variance_factor: float, trajectory: Trajectory) -> tuple[str, ...]:
     warnings = []
-    one, both = (int(np.sum(status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
+    one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
     if one > both:
         warnings.append(
             f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
@@ -504,5 +513,12 @@ def _warnings(follower: _Follower, variance_factor: float, status: NDArray[np.ui
         warnings.append(
             f"the dots miss their fitted places by {np.sqrt(variance_factor):.1f} times what the image noise explains: "
             "the calibration is off, or a camera moved or lags since, or the dots are not round"
+        )
+    gap = _table_gap(trajectory)
+    if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:
+        warnings.append(
+            f"the disc's lowest point lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
+            f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit this recording, the "
+            "cameras moved together, or the disc is in the air"
         )
     return tuple(warnings)

@@ -167,3 +167,26 @@ def test_dots_that_carry_no_pose_are_refused(rendered_pairs, keep):
     poor = replace(rendered_pairs.disc, marker_centres_body=centres[keep])
     with pytest.raises(TrackingError, match="at least three dots that are not on one line"):
         track(blocks_of(np.zeros((2, 2, 512, 512), np.uint8)), range(2), rendered_pairs.rig, poor, 1000.0)
+
+
+def test_a_table_that_is_not_where_the_rig_says_is_announced(rolling, rendered_pairs):
+    images, _ = rolling
+    good = track(blocks_of(images[:12]), range(12), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    assert not any("from the table" in warning for warning in good.warnings)
+    thicker = replace(
+        rendered_pairs.rig, t_left_world=rendered_pairs.rig.t_left_world + 1e-4 * rendered_pairs.rig.R_left_world[:, 2]
+    )
+    off = track(blocks_of(images[:12]), range(12), thicker, rendered_pairs.disc, 1000.0)
+    assert any("-100 um from the table" in warning for warning in off.warnings)
+
+
+def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rendered_pairs):
+    from disctrack.render import expected_disc
+
+    q = rendered_pairs.q[[4, 5, 6]]
+    images = np.round(16 * expected_disc(q, rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene)).astype(
+        np.uint16
+    )
+    result = track(blocks_of(images), range(3), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    assert (result.trajectory.marker_status == MarkerStatus.MEASURED).all()
+    assert np.abs(result.trajectory.q[:, :3] - q[:, :3]).max() < 0.3e-6
