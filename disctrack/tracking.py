@@ -518,7 +518,7 @@ def _warnings(follower: _Follower, variance_factor: float, trajectory: Trajector
     if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:
         warnings.append(
             f"the disc's lowest point lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
-            f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit this recording, the "
-            "cameras moved together, or the disc is in the air"
+            f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
+            "this recording, the cameras moved together, or the disc is in the air"
         )
     return tuple(warnings)
