@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from disctrack.diagnosis.disc_errors import Errors, energy_balance, errors
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.enlarged import PAPER, declared_model, model_toml
+from disctrack.diagnosis.fit import Fit, fit
+from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
+from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn
 from disctrack.diagnosis.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.words import sentence
@@ -17,6 +22,18 @@ from disctrack.errors import AnalysisError, OutputError
 from disctrack.storage import read_provenance, read_trajectory
 from disctrack.trajectory import Trajectory
 from disctrack.whole_files import write_whole
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A law outside the catalogue, fitted like an effect."""
+
+    law: LearnedLaw
+    fit: Fit
+    held_out: HeldOut
+    gain: float  # decrease of chi-square in units of the noise found
+    held_out_gain: float
+    power: float  # mean over the recording [W]; negative where it takes energy from the disc
 
 
 @dataclass(frozen=True)
@@ -30,11 +47,23 @@ class DiscDiagnosis:
     before: Errors | None  # None where the base fit did not converge
     after: Errors | None
     energy: dict[str, float]  # [J]
+    moment: MissingMoment | None = None  # that the model fails to supply, where it was asked for
+    learned: Learned | None = None
+
+    @property
+    def after_fit(self) -> Fit:
+        """Fit of the enlarged model."""
+        return self.learned.fit if self.learned else self.diagnosis.after
+
+    @property
+    def after_held_out(self) -> HeldOut | None:
+        """Its free run."""
+        return self.learned.held_out if self.learned else self.diagnosis.held_out_after
 
     @property
     def document(self) -> dict[str, Any]:
         """What diagnosis.json says."""
-        return as_json(self.diagnosis, self.sentence, self.model, self.before, self.after, self.energy)
+        return as_json(self)
 
 
 @dataclass(frozen=True)
@@ -55,13 +84,46 @@ def diagnose_trajectory(trajectory: Trajectory, model: str = PAPER, settings: Se
     declared = declared_model(trajectory, model)
     system = DiscSystem(trajectory, declared.model)
     diagnosis = diagnose(system, system.start(declared.faults), settings)
-    before = after = None
-    energy: dict[str, float] = {}
-    if diagnosis.held_out_before is not None and diagnosis.held_out_after is not None:
-        before = errors(system, diagnosis.before, diagnosis.held_out_before)
-        after = errors(system, diagnosis.after, diagnosis.held_out_after)
-        energy = energy_balance(system, diagnosis.after.values)
-    return DiscDiagnosis(system, diagnosis, declared.name, sentence(diagnosis, after), before, after, energy)
+    held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
+    if held_before is None or held_after is None:
+        text = sentence(diagnosis, diagnosis.after, None, None)
+        return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {})
+    moment, learned = _beyond_the_catalogue(system, diagnosis)
+    if learned is not None:
+        reason = (
+            f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
+        )
+        diagnosis = replace(diagnosis, verdict="unexplained", found=(), reason=reason)
+    fit_ = learned.fit if learned else diagnosis.after
+    before = errors(system, diagnosis.before, held_before)
+    after = errors(system, fit_, learned.held_out if learned else held_after)
+    text = sentence(diagnosis, fit_, after, learned.law if learned else None)
+    energy = energy_balance(system, fit_.values)
+    return DiscDiagnosis(system, diagnosis, declared.name, text, before, after, energy, moment, learned)
+
+
+def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[MissingMoment | None, Learned | None]:
+    """The missing moment, and its law if that describes the data better, for its length, than the catalogue does."""
+    if diagnosis.verdict == "nothing missing" or (diagnosis.verdict == "found" and len(diagnosis.found) < 2):
+        return None, None
+    base = diagnosis.before
+    moment, law = learn(system, base, diagnosis.noise)
+    if law is None or diagnosis.held_out_before is None:
+        return moment, None
+    start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    fitted = fit(system, (*base.quantities, *law.candidate.quantities), start)
+    price = float(np.log(np.sum(system.weights)))
+    lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
+    saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])
+    rows = training_rows(system, diagnosis.settings.train_fraction)
+    held = held_out(system, fitted.quantities, fitted.values, rows)
+    held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise
+    if not (fitted.converged and saved > 0 and held_gain > 0):
+        return moment, None
+    gain = (base.cost - fitted.cost) / diagnosis.noise
+    work = energy_balance(system, fitted.values)[f"by {law.candidate.name}"]
+    power = -work / float(system.time[-1] - system.time[0])
+    return moment, Learned(law, fitted, held, gain, float(held_gain), power)
 
 
 def run_diagnose(
@@ -85,11 +147,11 @@ def run_diagnose(
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
     document = {"recording": provenance.recording, **result.document}
-    write_diagnosis(path, result.system, result.diagnosis, document)
+    write_diagnosis(path, result, document)
     write_whole(report, (json.dumps(document, indent=1) + "\n").encode())
     toml = folder / "model.toml"
-    text = model_toml(result.system, result.diagnosis.after.values, provenance.recording)
+    text = model_toml(result.system, result.after_fit.values, provenance.recording)
     write_whole(toml, text.encode())
     pages = write_report(folder, result, provenance.recording)
-    said = lines(result.diagnosis, result.sentence, result.before, result.after)
+    said = lines(result)
     return DiagnoseOutcome(result, (report, toml, *pages), tuple(said))

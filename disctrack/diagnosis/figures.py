@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from disctrack.diagnosis.diagnose import DiscDiagnosis
 from disctrack.diagnosis.held_out import HeldOut
+from disctrack.diagnosis.learned import MissingMoment, learned_moment
 from disctrack.figures import AMBER, BLUE, GRID, INK, MUTED, RED, Drawn
 from disctrack.frames import nodal_axes_world
 
@@ -19,10 +20,13 @@ N_TRIED = 14
 
 def all_figures(result: DiscDiagnosis) -> tuple[Drawn, ...]:
     """Every figure of a diagnosis whose base fit converged; none otherwise."""
-    held = result.diagnosis.held_out_before, result.diagnosis.held_out_after
+    held = result.diagnosis.held_out_before, result.after_held_out
     if held[0] is None or held[1] is None:
         return (candidates(result),) if result.diagnosis.tried else ()
-    return (superposed(result), residuals(result), free_run(result, held[0], held[1]), candidates(result))
+    found = [superposed(result), residuals(result), free_run(result, held[0], held[1]), candidates(result)]
+    if result.moment is not None:
+        found.append(moment(result, result.moment))
+    return tuple(found)
 
 
 def _dress(axes: Axes) -> None:
@@ -36,7 +40,7 @@ def superposed(result: DiscDiagnosis) -> Drawn:
     """Nutation, precession rate and path: measurement, model before, model after."""
     system, diagnosis = result.system, result.diagnosis
     q = system.trajectory.q[system.rows]
-    before, after = system.poses(diagnosis.before.values), system.poses(diagnosis.after.values)
+    before, after = system.poses(diagnosis.before.values), system.poses(result.after_fit.values)
     figure = Figure(figsize=(9.5, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     for axes in (left, right):
@@ -64,7 +68,9 @@ def residuals(result: DiscDiagnosis) -> Drawn:
     figure = Figure(figsize=(9.5, 6.2), layout="constrained")
     grid = figure.subplots(4, 2, sharex=True)
     rows = [("x", 1e6, "um"), ("y", 1e6, "um"), ("z", 1e6, "um"), ("theta", 1e3 * np.degrees(1), "mdeg")]
-    for column, (fit, name, colour) in enumerate(((diagnosis.before, "before", RED), (diagnosis.after, "after", BLUE))):
+    for column, (fit, name, colour) in enumerate(
+        ((diagnosis.before, "before", RED), (result.after_fit, "after", BLUE))
+    ):
         delta, sigma = system.pose_difference(fit.values)
         e1 = nodal_axes_world(*system.poses(fit.values)[:, 3:5].T)[0]
         theta = np.sum(e1 * delta[:, 3:], axis=1), np.sqrt(np.sum((e1 * sigma[:, 3:]) ** 2, axis=1))
@@ -127,3 +133,24 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     axes.set_xlabel("decrease of chi-square when it is added to the model (red: what noise can do)")
     caption = "The candidates that gain most. Blue: chosen; amber: cannot be told from it."
     return Drawn("04_candidates", "What was tried", caption, figure)
+
+
+def moment(result: DiscDiagnosis, missing: MissingMoment) -> Drawn:
+    """Moment that the model fails to supply, with its two-sigma band, and the law learned from it."""
+    figure = Figure(figsize=(9.5, 5.4), layout="constrained")
+    grid = figure.subplots(3, 1, sharex=True)
+    law = None
+    if result.learned is not None:
+        law = learned_moment(result.system, result.learned.fit, result.learned.law)
+    for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
+        _dress(axes)
+        value, sigma = 1e6 * missing.moment[:, i], 1e6 * missing.sigma[:, i]
+        axes.fill_between(missing.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
+        axes.plot(missing.time, value, lw=1.1, color=RED, label="missing")
+        if law is not None:
+            axes.plot(result.system.time, 1e6 * law[:, i], lw=1.0, color=BLUE, label="law")
+        axes.set_ylabel(f"along {name} [uN m]")
+    grid[0].legend(frameon=False, fontsize=9)
+    grid[-1].set_xlabel("time [s]")
+    caption = "Contact moment that the model before fails to supply, with two standard deviations, and the law for it."
+    return Drawn("05_missing_moment", "The missing moment", caption, figure)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from disctrack.diagnosis.disc_errors import Errors
-from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.fit import Fit
 from disctrack.diagnosis.search import Diagnosis, Found, Tried
-from disctrack.diagnosis.words import effect_text
-from disctrack.frames import POSE_COMPONENTS
+from disctrack.frames import COORDINATES, POSE_COMPONENTS
 from disctrack.labelled import Variable
 from disctrack.storage import write_group
+
+if TYPE_CHECKING:
+    from disctrack.diagnosis.diagnose import DiscDiagnosis, Learned
 
 GROUP = "diagnosis"
 
@@ -112,61 +113,88 @@ def _declared(fit: Fit) -> dict[str, Any]:
     return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
 
 
-def as_json(
-    diagnosis: Diagnosis,
-    text: str,
-    model: str,
-    before: Errors | None,
-    after: Errors | None,
-    energy: dict[str, float],
-) -> dict[str, Any]:
+def _learned(learned: Learned) -> dict[str, Any]:
+    law = learned.law
+    return {
+        "name": law.candidate.effect,
+        "candidate": law.candidate.name,
+        "kind": "learned",
+        "title": law.candidate.title,
+        "source": law.candidate.source,
+        "formulas": law.formulas,
+        "share_of_resamples": list(law.share),
+        "phase_locked": law.locked,
+        "mean_power_W": _number(learned.power),
+        "parameters": _parameters(law.candidate.quantities, learned.fit),
+        "class": [],
+        "score": _number(learned.gain),
+        "held_out_gain": _number(learned.held_out_gain),
+    }
+
+
+def as_json(result: DiscDiagnosis) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
+    diagnosis = result.diagnosis
+    effects = [_effect(f, diagnosis) for f in diagnosis.found]
     return {
         "verdict": diagnosis.verdict,
-        "sentence": text,
+        "sentence": result.sentence,
         "reason": diagnosis.reason,
-        "model": model,
-        "effects": [_effect(f, diagnosis) for f in diagnosis.found],
-        "before": (_errors(before) or {}) | {"parameters": _declared(diagnosis.before)},
-        "after": (_errors(after) or {}) | {"parameters": _declared(diagnosis.after)},
+        "model": result.model,
+        "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
+        "before": (_errors(result.before) or {}) | {"parameters": _declared(diagnosis.before)},
+        "after": (_errors(result.after) or {}) | {"parameters": _declared(result.after_fit)},
         "noise_variance_over_stated": _number(diagnosis.noise),
-        "energy_J": energy,
+        "energy_J": result.energy,
         "tried": [_tried(t) for t in diagnosis.tried],
         "settings": vars(diagnosis.settings),
     }
 
 
-def write_diagnosis(path: Path, system: DiscSystem, diagnosis: Diagnosis, document: dict[str, Any]) -> None:
+def write_diagnosis(path: Path, result: DiscDiagnosis, document: dict[str, Any]) -> None:
     """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
+    system = result.system
     n = len(system.trajectory)
     variables = {}
-    for name, fit in (("before", diagnosis.before), ("after", diagnosis.after)):
-        residual = np.full((n, 6), np.nan)
-        if diagnosis.held_out_before is not None:
+    for name, fit in (("before", result.diagnosis.before), ("after", result.after_fit)):
+        residual, predicted = np.full((2, n, 6), np.nan)
+        if result.before is not None:
             whitened = system.pose_residual(fit.values)
             residual[system.rows] = np.where((system.weights >= 6)[:, None], whitened, np.nan)
+            predicted[system.rows] = system.poses(fit.values)
         what = f"whitened pose residual {name} the missing effects were added; variance 1 if only noise is left"
         variables[f"residual_{name}"] = Variable(residual, ("time", "pose_component"), "1", what)
-        predicted = np.full((n, 6), np.nan)
-        if diagnosis.held_out_before is not None:
-            predicted[system.rows] = system.poses(fit.values)
-        variables[f"q_{name}"] = Variable(
-            predicted, ("time", "coordinate"), "m and rad", f"x, y, z, psi, theta, phi of the model {name}"
+        what = f"x, y, z, psi, theta, phi of the model {name}"
+        variables[f"q_{name}"] = Variable(predicted, ("time", "coordinate"), "m and rad", what)
+    axes = {"coordinate": Variable(np.array(COORDINATES), ("coordinate",), "1", "coordinate")}
+    if result.moment is not None:
+        axes["probe_time"] = Variable(result.moment.time, ("probe_time",), "s", "middle of a probe of the moment")
+        axes["contact_axis"] = Variable(
+            np.array(["n0", "m0", "k"]), ("contact_axis",), "1", "axis of the contact frame"
         )
-    axes = {
-        "coordinate": Variable(np.array(["x", "y", "z", "psi", "theta", "phi"]), ("coordinate",), "1", "coordinate")
+        dims = ("probe_time", "contact_axis")
+        what = "contact moment that the model before fails to supply"
+        variables["missing_moment"] = Variable(result.moment.moment, dims, "N m", what)
+        variables["missing_moment_sigma"] = Variable(result.moment.sigma, dims, "N m", f"standard deviation: {what}")
+    attributes = {
+        "verdict": result.diagnosis.verdict,
+        "sentence": result.sentence,
+        "diagnosis": json.dumps(document),
     }
-    attributes = {"verdict": diagnosis.verdict, "sentence": document["sentence"], "diagnosis": json.dumps(document)}
     write_group(path, GROUP, variables, axes=axes, attributes=attributes)
 
 
-def lines(diagnosis: Diagnosis, text: str, before: Errors | None, after: Errors | None) -> list[str]:
+def lines(result: DiscDiagnosis) -> list[str]:
     """Some lines for the terminal."""
-    found = [f"{'verdict':<13} {diagnosis.verdict}", f"{'':<13} {text}"]
-    for f in diagnosis.found:
-        found.append(f"{'effect':<13} {effect_text(f, diagnosis)} (gain {f.gain:.4g}, held out {f.held_out_gain:.4g})")
+    before, after = result.before, result.after
+    found = [f"{'verdict':<13} {result.diagnosis.verdict}", f"{'':<13} {result.sentence}"]
     if before is None or after is None:
         return found
+    found += [
+        f"{'significance':<13} {f.candidate.name}: chi-square rises by {f.gain:.4g} without it (noise alone: "
+        f"{f.threshold:.3g}); gain on held-out data {f.held_out_gain:.4g}"
+        for f in result.diagnosis.found
+    ]
     found.append(
         f"{'chi-square':<13} {before.reduced_chi_square:.4g} -> {after.reduced_chi_square:.4g} per degree of freedom; "
         f"{before.rms_px:.4f} -> {after.rms_px:.4f} px rms"

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from disctrack.diagnosis.diagnose import DiscDiagnosis
 from disctrack.diagnosis.disc_errors import Errors
 from disctrack.diagnosis.figures import all_figures
-from disctrack.diagnosis.words import effect_text, quantity_text
+from disctrack.diagnosis.words import effect_text, law_text, quantity_text
 from disctrack.figures import Drawn
 from disctrack.whole_files import whole_file, write_whole
 
@@ -74,6 +74,12 @@ def _effects(result: DiscDiagnosis) -> str:
         f"{escape(_class_text(f))}</li>"
         for f in result.diagnosis.found
     )
+    if result.learned is not None:
+        learned = result.learned
+        items += (
+            f"<li>{escape(law_text(learned.law, learned.fit))}; mean power {1e3 * learned.power:.3g} mW, chosen in "
+            f"{100 * min(learned.law.share):.0f} % of the resamples; chi-square falls by {learned.gain:.5g}.</li>"
+        )
     return f"<h2>Missing effects</h2><ul>{items}</ul>" if items else ""
 
 
@@ -114,12 +120,12 @@ def _ahead(before: Errors, after: Errors) -> list[tuple[str, str, str]]:
 
 def _laws(result: DiscDiagnosis) -> list[tuple[str, str, str]]:
     """Parameters that the model had already, before and after."""
-    first, last = result.diagnosis.before, result.diagnosis.after
+    first, last = result.diagnosis.before, result.after_fit
     rows = []
     for q in first.quantities:
         if q.name in result.system.model.values:
-            texts = [quantity_text(f.values[q.name], f.sigma(q.name), q.unit) for f in (first, last)]
-            rows.append((q.name, *texts))
+            start, end = (quantity_text(f.values[q.name], f.sigma(q.name), q.unit) for f in (first, last))
+            rows.append((q.name, start, end))
     for name, joule in result.energy.items():
         rows.append((f"energy {name} [mJ]", "", f"{1e3 * joule:.5g}"))
     return rows

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.fit import Fit
+from disctrack.diagnosis.learned import LearnedLaw
 from disctrack.diagnosis.search import Diagnosis, Found
 
 _PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
@@ -43,11 +45,24 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
     return text
 
 
-def sentence(diagnosis: Diagnosis, after: Errors | None) -> str:
-    """The answer in one or a few sentences."""
+def law_text(law: LearnedLaw, fit: Fit) -> str:
+    """A learned law with its numbers."""
+    numbers = ", ".join(
+        f"{q.name.partition('.')[2]} = {fit.values[q.name]:.4g} +- {fit.sigma(q.name):.2g}"
+        for q in law.candidate.quantities
+    )
+    formulas = "; ".join(f"{component} = {formula}" for component, formula in law.formulas.items())
+    return f"{formulas} with {numbers} (SI)" + (", locked to the disc's angles" if law.locked else "")
+
+
+def sentence(diagnosis: Diagnosis, fit: Fit, after: Errors | None, law: LearnedLaw | None) -> str:
+    """The answer in one or a few sentences; `fit` is that of the enlarged model."""
     if after is None:
         return f"No answer: {diagnosis.reason}."
     level = f"{after.rms_px:.4f} px rms ({after.reduced_chi_square:.3f} of the expected variance)"
+    if law is not None:
+        described = f"{law_text(law, fit)} describes it and leaves {level}"
+        return f"A moment is missing that the catalogue does not name: {described}."
     if diagnosis.verdict == "nothing missing":
         return f"Nothing is missing at the level of {level}."
     effects = "; and ".join(effect_text(f, diagnosis) for f in diagnosis.found)

@@ -1,0 +1,77 @@
+"""What is in no catalogue is read from the residual: as a moment over time, and as a law."""
+
+import numpy as np
+import pytest
+
+from disctrack.diagnosis import DiscSystem, diagnose_trajectory
+from disctrack.diagnosis.enlarged import declared_model
+from disctrack.diagnosis.fit import fit
+from disctrack.diagnosis.learned import learn, learned_moment, missing_moment, probe
+from disctrack.rolling.effects import effect_from_formulas
+from tests.oracles.measured_disc import measured
+
+
+def hide(name: str, component: str, formula: str) -> str:
+    """Register an effect that no candidate list proposes."""
+    effect_from_formulas(name, {component: formula})
+    return f"{name}.k"
+
+
+@pytest.mark.parametrize(
+    ("name", "component", "formula", "size", "locked"),
+    [
+        ("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z", 1e-6, False),
+        ("hidden_hum", "M_m", "k * sin(50.0 * time)", 2e-5, False),
+        ("hidden_magnet", "M_n", "-k * cos(psi + phi)", 4e-5, True),
+    ],
+)
+def test_an_effect_in_no_catalogue_is_described_by_a_learned_law(name, component, formula, size, locked):
+    trajectory = measured({hide(name, component, formula): size}, seed=5, n=450, omega3=2.0)
+    result = diagnose_trajectory(trajectory)
+    assert result.diagnosis.verdict == "unexplained"
+    assert result.learned is not None
+    assert set(result.learned.law.formulas) == {component}
+    assert result.learned.law.locked == locked
+    # 10 000 numbers: 1 +- 0.014, and the hum's frequency is known to a tenth of a line only
+    assert result.after.reduced_chi_square < 1.05
+    assert result.after.ratio_to_floor < 1.2 < result.before.ratio_to_floor
+    first = result.document["effects"][0]
+    assert first["kind"] == "learned"
+    assert first["phase_locked"] == locked
+
+
+def test_missing_moment_is_the_hidden_one():
+    """The true course of the moment lies within the band: pulls of order one, and the band is narrow."""
+    trajectory = measured({hide("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z"): 1e-6}, seed=7, n=400)
+    system = DiscSystem(trajectory, declared_model(trajectory).model)
+    base = fit(system, system.base, system.start())
+    moment = missing_moment(probe(system, base))
+    _, law = learn(system, base, 1.0)
+    truth = learned_moment(
+        system,
+        fit(
+            system,
+            (*base.quantities, *law.candidate.quantities),
+            base.values | dict(zip(law.candidate.names, law.candidate.start, strict=True)),
+        ),
+        law,
+    )
+    expected = np.interp(moment.time, system.time, truth[:, 2])
+    inner = slice(3, -3)  # at the ends the initial state absorbs a moment
+    error = moment.moment[inner, 2] - expected[inner]
+    size = np.abs(expected).max()
+    # the fitted k_m and initial state take a part of any moment with them: the shape is left, to a tenth
+    assert np.sqrt(np.mean((error - error.mean()) ** 2)) < 0.1 * size
+
+
+def test_in_noise_no_law_is_learned():
+    trajectory = measured(seed=8, n=300)
+    system = DiscSystem(trajectory, declared_model(trajectory).model)
+    base = fit(system, system.base, system.start())
+    assert learn(system, base, 1.0)[1] is None
+
+
+def test_two_effects_of_the_catalogue_beat_a_learned_law():
+    result = diagnose_trajectory(measured({"table_tilt.tilt_x": 0.002, "kz.k_z": 2e-5}, seed=6))
+    assert result.diagnosis.verdict == "found"
+    assert result.learned is None
