@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn
 from disctrack.diagnosis.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.separation import Separation, separations
 from disctrack.diagnosis.words import sentence
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.storage import read_provenance, read_trajectory
@@ -49,6 +50,7 @@ class DiscDiagnosis:
     energy: dict[str, float]  # [J]
     moment: MissingMoment | None = None  # that the model fails to supply, where it was asked for
     learned: Learned | None = None
+    separated_by: dict[str, dict[str, Separation | None]] = field(default_factory=dict)  # effect -> rival -> recording
 
     @property
     def after_fit(self) -> Fit:
@@ -99,7 +101,12 @@ def diagnose_trajectory(trajectory: Trajectory, model: str = PAPER, settings: Se
     after = errors(system, fit_, learned.held_out if learned else held_after)
     text = sentence(diagnosis, fit_, after, learned.law if learned else None)
     energy = energy_balance(system, fit_.values)
-    return DiscDiagnosis(system, diagnosis, declared.name, text, before, after, energy, moment, learned)
+    apart = {
+        f.candidate.name: separations(system, fit_, f.candidate, [r.candidate for r in f.cannot_be_told_from])
+        for f in diagnosis.found
+        if f.cannot_be_told_from
+    }
+    return DiscDiagnosis(system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart)
 
 
 def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[MissingMoment | None, Learned | None]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from disctrack.diagnosis.disc_errors import Errors
 from disctrack.diagnosis.fit import Fit
-from disctrack.diagnosis.search import Diagnosis, Found, Tried
+from disctrack.diagnosis.search import Found, Tried
+from disctrack.diagnosis.separation import Separation
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
 from disctrack.labelled import Variable
 from disctrack.storage import write_group
@@ -39,7 +40,22 @@ def _parameters(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
     ]
 
 
-def _effect(found: Found, diagnosis: Diagnosis) -> dict[str, Any]:
+def _separation(separation: Separation | None) -> dict[str, Any] | None:
+    """The recording that would separate two effects; None where none of those looked at can be made."""
+    if separation is None:
+        return None
+    return {
+        "theta_deg": separation.theta_deg,
+        "omega3_rad_s": separation.omega3,
+        "duration_s": separation.duration,
+        "angle_deg": _number(np.degrees(separation.angle)),
+        "sigmas": _number(separation.sigmas),
+    }
+
+
+def _effect(found: Found, result: DiscDiagnosis) -> dict[str, Any]:
+    diagnosis = result.diagnosis
+    apart = result.separated_by.get(found.candidate.name, {})
     c = found.candidate
     return {
         "name": c.effect,
@@ -54,6 +70,7 @@ def _effect(found: Found, diagnosis: Diagnosis) -> dict[str, Any]:
                 "angle_deg": _number(np.degrees(r.angle)),
                 "delta_chi_square": _number(r.loss),
                 "parameters": _parameters(r.candidate.quantities, r.fit),
+                "separated_by": _separation(apart.get(r.candidate.name)),
             }
             for r in found.cannot_be_told_from
         ],
@@ -135,7 +152,7 @@ def _learned(learned: Learned) -> dict[str, Any]:
 def as_json(result: DiscDiagnosis) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     diagnosis = result.diagnosis
-    effects = [_effect(f, diagnosis) for f in diagnosis.found]
+    effects = [_effect(f, result) for f in diagnosis.found]
     return {
         "verdict": diagnosis.verdict,
         "sentence": result.sentence,

@@ -7,12 +7,14 @@ import io
 from html import escape
 from pathlib import Path
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from disctrack.diagnosis.diagnose import DiscDiagnosis
 from disctrack.diagnosis.disc_errors import Errors
 from disctrack.diagnosis.figures import all_figures
+from disctrack.diagnosis.search import Found
 from disctrack.diagnosis.words import effect_text, law_text, quantity_text
 from disctrack.figures import Drawn
 from disctrack.whole_files import whole_file, write_whole
@@ -71,7 +73,7 @@ def _effects(result: DiscDiagnosis) -> str:
     items = "".join(
         f"<li>{escape(effect_text(f, result.diagnosis))}. Without it chi-square rises by {f.gain:.5g} (noise alone: "
         f"{f.threshold:.3g}); the held-out data become exp({f.held_out_gain / 2:.4g}) times as probable. "
-        f"{escape(_class_text(f))}</li>"
+        f"{escape(_class_text(f, result))}</li>"
         for f in result.diagnosis.found
     )
     if result.learned is not None:
@@ -83,10 +85,22 @@ def _effects(result: DiscDiagnosis) -> str:
     return f"<h2>Missing effects</h2><ul>{items}</ul>" if items else ""
 
 
-def _class_text(found: object) -> str:
-    rivals = getattr(found, "cannot_be_told_from", ())
-    angles = ", ".join(f"{r.candidate.name} {57.2958 * r.angle:.2g} deg" for r in rivals)
-    return f"Angle between the predicted residuals: {angles}." if angles else ""
+DISTINCT = 5.0  # sigmas from which on a recording tells two effects apart
+
+
+def _class_text(found: Found, result: DiscDiagnosis) -> str:
+    """Angles to the rivals, and the recordings that would separate them."""
+    texts = []
+    for rival in found.cannot_be_told_from:
+        plan = result.separated_by.get(found.candidate.name, {}).get(rival.candidate.name)
+        name = rival.candidate.name
+        text = f"From {name} its predicted residual differs by an angle of {np.degrees(rival.angle):.2g} deg; "
+        if plan is None or plan.sigmas < DISTINCT:
+            text += "no recording looked at (3 to 30 deg, spin 0.5 and 5 rad/s, up to 1 s) separates them."
+        else:
+            text += f"to separate them, {plan.text}."
+        texts.append(text)
+    return " ".join(texts)
 
 
 def _before_after(result: DiscDiagnosis) -> str:

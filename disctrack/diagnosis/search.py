@@ -29,7 +29,7 @@ UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are na
 class Settings:
     """How hard to look, and how sure to be."""
 
-    false_alarm: float = 0.01  # probability that noise alone brings a claim, over all candidates
+    false_alarm: float = 0.005  # probability that noise alone brings a claim, over all candidates
     max_effects: int = 3
     shortlist: int = 8  # candidates that are refitted in full in each round
     judged: int = 3  # of them, that also have to stand a free run

@@ -1,0 +1,63 @@
+"""From pixels to the missing effect: rendered, calibrated, tracked and diagnosed through the commands alone."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from disctrack.cli import main
+from disctrack.render.recording import write_recording
+from disctrack.scene import CameraSettings, MotionSettings, RollingMotion, Scene
+
+
+def render_hidden(folder, effects, seed, n_frames=90, **start):
+    """A recording whose truth lies elsewhere: recording.toml knows nothing of the effects."""
+    rolling = RollingMotion(effects={"km": {"k_m": 0.381e-7}} | effects, **start)
+    scene = Scene(
+        name="hidden",
+        seed=seed,
+        cameras=CameraSettings(n_frames=n_frames),
+        motion=MotionSettings(kind="rolling", rolling=rolling),
+    )
+    scene = replace(scene, board=replace(scene.board, n_views=14))
+    write_recording(folder / "recording", scene, truth_path=folder / "elsewhere" / "truth.h5")
+    return folder / "recording"
+
+
+def diagnosis_of(recording):
+    out = recording.parent / "out"
+    assert main(["run", str(recording), "-o", str(out), "--no-figures", "--no-video"]) == 0
+    assert main(["diagnose", str(out / "trajectory.h5"), "-o", str(out / "diagnosis")]) == 0
+    return json.loads((out / "diagnosis" / "diagnosis.json").read_text())
+
+
+def test_pivoting_friction_hidden_in_images_is_found_and_sized(tmp_path):
+    recording = render_hidden(
+        tmp_path, {"kz": {"k_z": 6e-5}}, seed=21, theta_deg=15.0, omega3_rad_s=1.5, nutation_deg=0.5
+    )
+    document = diagnosis_of(recording)
+    assert document["verdict"] == "found"
+    effect = document["effects"][0]
+    names = {effect["name"], *(c["name"] for c in effect["class"])}
+    assert "kz" in names
+    if effect["name"] == "kz":
+        k_z = effect["parameters"][0]
+        # three sigmas, and what the images' own errors add at 1/800 px
+        assert abs(k_z["value"] - 6e-5) < 3 * k_z["sigma"] + 0.01 * 6e-5
+    assert document["after"]["reduced_chi_square"] < 1.1 < document["before"]["reduced_chi_square"]
+
+
+@pytest.mark.slow
+def test_nothing_is_found_in_images_of_the_model_itself(tmp_path):
+    recording = render_hidden(tmp_path, {}, seed=22, n_frames=200, theta_deg=12.0, nutation_deg=0.5)
+    document = diagnosis_of(recording)
+    assert document["verdict"] == "nothing missing"
+    assert document["effects"] == []
+
+
+@pytest.mark.slow
+def test_a_tilted_table_and_an_unbalanced_disc_are_found_together_in_images(tmp_path):
+    effects = {"table_tilt": {"tilt_x": 0.002, "tilt_y": 0.0}, "centre_of_mass": {"c_1": 5e-5, "c_2": 0.0, "c_3": 0.0}}
+    recording = render_hidden(tmp_path, effects, seed=23, n_frames=300, theta_deg=15.0, omega3_rad_s=2.0)
+    document = diagnosis_of(recording)
+    assert {e["name"] for e in document["effects"]} == {"table_tilt", "centre_of_mass"}
