@@ -68,6 +68,7 @@ def test_analysing_again_replaces_the_groups(tmp_path, late, analysed):
     assert_allclose(arrays["velocity_x"], analysed.motion.velocity[:, 0], atol=0)
 
 
+@pytest.mark.slow
 def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_gives(true_motion, as_tracked):
     """A patch stops the precession at 0.5 degrees within 20 ms, then the disc lies still for 0.2 s."""
     truth = true_motion(theta_deg=9, duration=3.0)[-600:]

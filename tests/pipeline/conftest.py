@@ -1,4 +1,4 @@
-"""A short real recording and a rig that was calibrated once, for tests that go through the command line."""
+"""A short recording and a rig that was calibrated once, for tests that go through the command line."""
 
 import os
 import shutil
@@ -12,26 +12,14 @@ SHORT = 24  # frames: enough for the noise to be measured
 
 
 @pytest.fixture(scope="session")
-def source_recording(request) -> Path:
-    """The reference recording, or the clip that comes with the sources."""
-    for name in ("shared_data", "sample_clip"):
-        try:
-            folder = request.getfixturevalue(name)
-        except pytest.skip.Exception:
-            continue
-        return folder / "rec_a" if name == "shared_data" else folder
-    pytest.skip("neither ../shared/data nor sample_data/clip is there")
-
-
-@pytest.fixture(scope="session")
-def short_recording(source_recording, tmp_path_factory) -> Path:
+def short_recording(sample_clip, tmp_path_factory) -> Path:
     """The first frames of it, with all calibration views; not to be changed by a test."""
     folder = tmp_path_factory.mktemp("recordings") / "short"
-    shutil.copytree(source_recording / "calibration", folder / "calibration")
-    shutil.copy(source_recording / "recording.toml", folder)
+    shutil.copytree(sample_clip / "calibration", folder / "calibration")
+    shutil.copy(sample_clip / "recording.toml", folder)
     for camera in ("left", "right"):
         (folder / camera).mkdir()
-        for file in sorted((source_recording / camera).iterdir())[:SHORT]:
+        for file in sorted((sample_clip / camera).iterdir())[:SHORT]:
             shutil.copy(file, folder / camera)
     return folder
 
