@@ -249,7 +249,8 @@ def test_a_run_that_is_stopped_leaves_nothing_half_and_the_next_completes(record
     time.sleep(delay)
     process.send_signal(kind)  # harmless where the run was done before
     _, errors = process.communicate(timeout=60)
-    if process.returncode != 0 and kind == signal.SIGINT and delay > 0.5:  # the interpreter itself may still be starting before
+    # before 0.5 s the interpreter itself may still be starting
+    if process.returncode != 0 and kind == signal.SIGINT and delay > 0.5:
         assert "interrupted" in errors
         assert "Traceback" not in errors
     results = recording / "results"
