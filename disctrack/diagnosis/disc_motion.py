@@ -11,6 +11,7 @@ from disctrack.rolling import CATALOGUE, Effect, Model, Parameter
 
 # Parameters of one effect that act so differently that each part is a question of its own.
 _PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
+SLIP = "slip.inverse_mu"
 STATE_SCALES = {
     "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,
 }  # fmt: skip
@@ -64,10 +65,18 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
         ):
             continue
         amounts = [p for p in effect.parameters if not p.is_shape and np.isfinite(p.null)]
-        if not amounts:
+        if not amounts and effect.name != "slip":
             continue
-        parts = _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)})
+        parts = _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)} if amounts else {})
         for name, members in parts.items():
             quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
             found.append(Candidate(name, effect.name, "motion", effect.title, effect.source, quantities))
+        if effect.name == "slip":
+            found.append(slip_candidate(effect))
     return tuple(found)
+
+
+def slip_candidate(effect: type[Effect]) -> Candidate:
+    """Slip by 1/mu, which is zero where the disc never slips; without a derivative until it slips somewhere."""
+    inverse = Quantity(SLIP, "1", 0.1, lower=0.0, upper=1e3, typical=10.0, meaning="1 / coefficient of friction")
+    return Candidate(effect.name, effect.name, "motion", effect.title, effect.source, (inverse,), threshold=True)

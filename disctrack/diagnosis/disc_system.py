@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from disctrack.diagnosis.disc_motion import STATE_SCALES, model_quantities, motion_candidates, state_quantities
+from disctrack.diagnosis.disc_motion import SLIP, STATE_SCALES, model_quantities, motion_candidates, state_quantities
 from disctrack.diagnosis.disc_optics import ellipse_centre_shift, measurement_candidates, predict
 from disctrack.diagnosis.fit import triangle
 from disctrack.diagnosis.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.pose import whitening
-from disctrack.rolling import CATALOGUE, Model, State, sensitivities
+from disctrack.rolling import CATALOGUE, Model, State, sensitivities, simulate
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -27,6 +27,7 @@ MIN_THETA = np.radians(0.7)  # below, the disc of Ma et al. touches its paper, a
 MIN_FRAMES = 40
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
+SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 _CLOCK = ("time_offset.delay", "frame_rate.change")
 _IMAGE = ("exposure_blur.T2", "ellipse_centre.share")
 
@@ -114,8 +115,18 @@ class DiscSystem:
 
     def model_with(self, values: Values) -> Model:
         """The model with every effect that has an amount in `values`."""
-        effects = {name: v for name, v in values.items() if name.partition(".")[0] in CATALOGUE}
+        effects = {name: v for name, v in values.items() if _is_effect(name)}
+        if values.get(SLIP, 0.0) > 0:
+            effects["slip.mu"] = 1.0 / values[SLIP]
         return self.model.with_values(effects)
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time."""
+        rate = 1.0 + values.get("frame_rate.change", 0.0)
+        state = State(**{c: float(values[f"state.{c}"]) for c in STATE_SCALES})
+        motion = simulate(self.model_with(values), state, times=self.start_time + (self.time - self.start_time) / rate)
+        needed = float(np.max(motion.friction_needed))
+        return [(1.0 / (share * needed),) for share in SLIP_STARTS]
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
@@ -200,12 +211,18 @@ class DiscSystem:
         present = set(model.values)
         parameters = [n for n in names if n in present or _is_effect(n)]
         parameters = [n for n in parameters if np.isfinite(values.get(n, 0.0))]
+        slips = SLIP in names and values.get(SLIP, 0.0) > 0
+        if slips:
+            parameters.append("slip.mu")
         state = State(**{c: float(values[f"state.{c}"]) for c in STATE_SCALES})
         found = sensitivities(model, state, times, parameters, components, theta_end=THETA_END, rtol=RTOL)
         axes = euler_rate_axes_world(found.q[:, 3], found.q[:, 4])
         by_motion = found.dq.copy()
         by_motion[:, 3:] = axes @ found.dq[:, 3:]
         all_names = (*(f"state.{c}" for c in components), *parameters)
+        if slips:
+            by_motion[..., -1] *= -1.0 / values[SLIP] ** 2
+            all_names = (*all_names[:-1], SLIP)
         if "frame_rate.change" in names:
             speed = found.qdot.copy()
             speed[:, 3:] = (axes @ speed[:, 3:, None])[..., 0]

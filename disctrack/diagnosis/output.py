@@ -12,6 +12,7 @@ from disctrack.diagnosis.disc_errors import Errors
 from disctrack.diagnosis.fit import Fit
 from disctrack.diagnosis.search import Found, Tried
 from disctrack.diagnosis.separation import Separation
+from disctrack.diagnosis.words import shown
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
 from disctrack.labelled import Variable
 from disctrack.storage import write_group
@@ -28,16 +29,12 @@ def _number(x: float | None) -> float | None:
 
 
 def _parameters(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": q.name.partition(".")[2],
-            "value": _number(fit.values[q.name]),
-            "sigma": _number(fit.sigma(q.name)),
-            "unit": q.unit,
-            "meaning": q.meaning,
-        }
-        for q in quantities
-    ]
+    found = []
+    for q in quantities:
+        name, value, sigma = shown(q, fit)
+        amount = {"name": name, "value": _number(value), "sigma": _number(sigma)}
+        found.append(amount | {"unit": q.unit, "meaning": q.meaning})
+    return found
 
 
 def _separation(separation: Separation | None) -> dict[str, Any] | None:

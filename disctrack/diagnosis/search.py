@@ -185,6 +185,16 @@ class _Search:
                 values.setdefault(name, value)
         return fit(self.system, self._quantities(candidates), values)
 
+    def _best_fit(self, current: Trial, extra: Sequence[Candidate]) -> Fit:
+        """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
+        together = [*current.candidates, *extra]
+        starts: list[dict[str, float]] = [{}]
+        for c in extra:
+            if c.threshold:
+                starts = [dict(zip(c.names, s, strict=True)) for s in self.system.starts(c, current.fit.values)]
+        fits = [self._fit(together, current.fit.values | start) for start in starts]
+        return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else current.fit
+
     def _judged(self, current: Trial, trial: Trial) -> Trial:
         """With the free run over held-out data."""
         assert current.held_out is not None
@@ -198,7 +208,7 @@ class _Search:
         """The best admissible enlargement, or None."""
         trials = []
         for extra in self._shortlist(current, linear, scores):
-            refitted = self._fit([*current.candidates, *extra], current.fit.values)
+            refitted = self._best_fit(current, extra)
             trial = Trial((*current.candidates, *extra), refitted, self._cost(current.fit) - self._cost(refitted))
             trials.append((extra, trial))
             if len(extra) == 1:
@@ -232,7 +242,8 @@ class _Search:
             if s.gain / self.noise > 0.5 * self.threshold(len(s.candidate.names)) and (i < 4 or s.gain > 0.3 * best)
         ]
         shortlist: list[tuple[Candidate, ...]] = [(s.candidate,) for s in worth]
-        shortlist += [(c,) for c in self.system.candidates if c.start and c.name not in taken]
+        if not self._at_noise(current.fit):
+            shortlist += [(c,) for c in self.system.candidates if c.threshold and c.name not in taken]
         room = len(taken) + 2 <= self.settings.max_effects
         if room and worth and not self._at_noise(current.fit, best):
             shortlist += self._pairs(linear, [s.candidate for s in ranked[:14] if s.visible])
@@ -377,7 +388,9 @@ class _Search:
         for f in found:
             if any(c.name == r.candidate.name for r in f.cannot_be_told_from):
                 return f"cannot be told from {f.candidate.name}"
-        if not score.visible:
+        if c.threshold and trial is None:
+            return "nothing is left that it could explain; beyond its threshold it does nothing"
+        if not score.visible and trial is None:
             return "leaves no trace in this recording that other fitted quantities do not absorb"
         threshold = self.threshold(len(c.names))
         gain = trial.gain if trial else score.gain / self.noise

@@ -42,7 +42,8 @@ class Candidate:
     title: str
     source: str
     quantities: tuple[Quantity, ...]
-    start: tuple[float, ...] = ()  # where a refit begins, if it cannot begin at null
+    start: tuple[float, ...] = ()  # where a refit begins, if not at null
+    threshold: bool = False  # acts only beyond some value: at null it has no derivative, and the system gives starts
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -76,6 +77,9 @@ class System(Protocol):
     def weights(self) -> Array:
         """(n,) how many numbers of each row are data."""
 
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """Values from which refits of a candidate with a threshold begin, given a fit without it."""
+
 
 class Subset:
     """The first samples of a system, or any others: the rest counts as missing."""
@@ -103,6 +107,10 @@ class Subset:
     def weights(self) -> Array:
         """(n,) zero outside the subset."""
         return np.where(self._rows, self._system.weights, 0)
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """As the whole system's."""
+        return self._system.starts(candidate, values)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the whole system's, zeros outside the subset, even where there is no prediction."""

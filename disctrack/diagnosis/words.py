@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.disc_motion import SLIP
 from disctrack.diagnosis.fit import Fit
 from disctrack.diagnosis.learned import LearnedLaw
 from disctrack.diagnosis.search import Diagnosis, Found
+from disctrack.diagnosis.system import Quantity
 
 _PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
 _PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
@@ -31,13 +33,19 @@ def quantity_text(value: float, sigma: float, unit: str) -> str:
     return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
 
 
+def shown(q: Quantity, fit: Fit) -> tuple[str, float, float]:
+    """Name, value and sigma of a fitted quantity as people know it: slip is fitted by 1/mu and shown by mu."""
+    name, value, sigma = q.name.partition(".")[2], fit.values[q.name], fit.sigma(q.name)
+    if q.name == SLIP and value > 0:
+        return "mu", 1.0 / value, sigma / value**2
+    return name, value, sigma
+
+
 def effect_text(found: Found, diagnosis: Diagnosis) -> str:
     """One effect with its size and what it cannot be told from."""
     fit = diagnosis.after
-    sizes = ", ".join(
-        f"{q.name.partition('.')[2]} = {quantity_text(fit.values[q.name], fit.sigma(q.name), q.unit)}"
-        for q in found.candidate.quantities
-    )
+    amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities]
+    sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
     text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}"
     if found.cannot_be_told_from:
         rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)

@@ -136,6 +136,7 @@ def test_settings_are_kept_with_the_answer():
     assert diagnose_trajectory(measured(seed=13, n=120), settings=settings).diagnosis.settings == settings
 
 
+@pytest.mark.slow
 def test_the_recording_proposed_to_separate_two_effects_separates_them():
     """Viscous contour friction at 14 deg looks like the air; the proposed recording, once made, tells them apart."""
     hidden = {"contour_viscous.c": 1e-5}
@@ -156,3 +157,14 @@ def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     (found,) = result.diagnosis.found
     (plan,) = result.separated_by[found.candidate.name].values()
     assert plan.sigmas < 0.01  # all laws at hand are quadratic in the rates: time can be stretched
+
+
+def test_slip_is_found_by_the_friction_at_which_it_sets_in():
+    """Slip has no derivative where the disc does not slip yet: it is fitted from where it would begin."""
+    result = diagnose_trajectory(measured({"slip.mu": 0.1}, seed=100, n=300, theta_deg=20.0))
+    assert [f.candidate.name for f in result.diagnosis.found] == ["slip"]
+    mu = result.document["effects"][0]["parameters"][0]
+    assert mu["name"] == "mu"
+    # switches between rolling and slip are instants of the noise too: a thousandth, far above sigma
+    assert abs(mu["value"] - 0.1) < 1e-4
+    assert result.after.reduced_chi_square < 1.1
