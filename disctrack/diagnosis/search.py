@@ -242,10 +242,12 @@ class _Search:
             if s.gain / self.noise > 0.5 * self.threshold(len(s.candidate.names)) and (i < 4 or s.gain > 0.3 * best)
         ]
         shortlist: list[tuple[Candidate, ...]] = [(s.candidate,) for s in worth]
-        if not self._at_noise(current.fit):
-            shortlist += [(c,) for c in self.system.candidates if c.threshold and c.name not in taken]
+        if self._at_noise(current.fit, best):
+            return shortlist
+        # beyond thresholds the prediction has kinks and a refit is long: only where nothing else will do
+        shortlist += [(c,) for c in self.system.candidates if c.threshold and c.name not in taken]
         room = len(taken) + 2 <= self.settings.max_effects
-        if room and worth and not self._at_noise(current.fit, best):
+        if room and worth:
             shortlist += self._pairs(linear, [s.candidate for s in ranked[:14] if s.visible])
         return shortlist
 

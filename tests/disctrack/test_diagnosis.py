@@ -159,6 +159,7 @@ def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     assert plan.sigmas < 0.01  # all laws at hand are quadratic in the rates: time can be stretched
 
 
+@pytest.mark.slow
 def test_slip_is_found_by_the_friction_at_which_it_sets_in():
     """Slip has no derivative where the disc does not slip yet: it is fitted from where it would begin."""
     result = diagnose_trajectory(measured({"slip.mu": 0.1}, seed=100, n=300, theta_deg=20.0))
