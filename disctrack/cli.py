@@ -13,6 +13,10 @@ from collections.abc import Sequence
 
 from disctrack import __version__
 
+# The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
+# save. It must stand before numpy is loaded; a user's own setting is kept.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # In the order of the measurement: name -> (module, what it does).
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("disctrack.commands.run", "calibrate and track a recording: folder in, trajectory and pictures out"),
