@@ -26,14 +26,15 @@ _REMEDIES = {
 def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
     """Path to write to; when the block ends without an error it becomes `path` in one step, otherwise it is removed.
 
-    A killed process leaves `<name>.<host>-<process>.part`, which the next one on this host clears away.
+    A killed process leaves `<name>.<host>-<process>.part`, which the next one that writes
+    into the folder from this host clears away.
     suffix : end of the temporary name, for writers that derive the format from it
     Raises OutputError if the disk is full, read-only or not ours.
     """
     part = path.with_name(f"{path.name}.{_host()}-{os.getpid()}.part{suffix}")
     try:
         make_folder(path.parent)
-        _clear_abandoned(path)
+        _clear_abandoned(path.parent)
         yield part
         with part.open("rb+") as stream:
             os.fsync(stream.fileno())
@@ -70,10 +71,10 @@ def _host() -> str:
     return re.sub(r"[^A-Za-z0-9_]", "_", socket.gethostname())
 
 
-def _clear_abandoned(path: Path) -> None:
-    """Remove what processes of this host that no longer live have left half-written under this name."""
-    for part in path.parent.glob("*.part*"):
-        found = re.fullmatch(rf"{re.escape(path.name)}\.{_host()}-(\d+)\.part.*", part.name)
+def _clear_abandoned(folder: Path) -> None:
+    """Remove what processes of this host that no longer live have left half-written in the folder."""
+    for part in folder.glob("*.part*"):
+        found = re.fullmatch(rf".+\.{_host()}-(\d+)\.part.*", part.name)
         if found and not _alive(int(found[1])):
             with contextlib.suppress(OSError):
                 part.unlink()
