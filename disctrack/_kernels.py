@@ -73,6 +73,21 @@ def project_point_jacobian(camera, X, Y, Z, J):
 
 
 @_compiled
+def _substitute(L, x, n):
+    """Replace x by the solution of L L^T x = x for a Cholesky factor L (lower triangle)."""
+    for i in range(n):
+        s = x[i]
+        for k in range(i):
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for k in range(i + 1, n):
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
+
+
+@_compiled
 def solve_in_place(M, x, n):
     """Solve the symmetric positive definite M[:n, :n] x = x by Cholesky; False where M is not positive definite."""
     for i in range(n):
@@ -86,16 +101,7 @@ def solve_in_place(M, x, n):
                 M[i, i] = math.sqrt(s)
             else:
                 M[i, j] = s / M[j, j]
-    for i in range(n):
-        s = x[i]
-        for k in range(i):
-            s -= M[i, k] * x[k]
-        x[i] = s / M[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= M[k, i] * x[k]
-        x[i] = s / M[i, i]
+    _substitute(M, x, n)
     return True
 
 
@@ -329,15 +335,8 @@ def _inverse_corner(L, n, out):
     x = np.empty(n)
     for column in range(2):
         for i in range(n):
-            s = 1.0 if i == column else 0.0
-            for k in range(i):
-                s -= L[i, k] * x[k]
-            x[i] = s / L[i, i]
-        for i in range(n - 1, -1, -1):
-            s = x[i]
-            for k in range(i + 1, n):
-                s -= L[k, i] * x[k]
-            x[i] = s / L[i, i]
+            x[i] = 1.0 if i == column else 0.0
+        _substitute(L, x, n)
         out[0, column], out[1, column] = x[0], x[1]
 
 

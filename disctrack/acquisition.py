@@ -289,6 +289,4 @@ def _table_gap(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
     """(n,) distance between the disc's lowest point and the table [m], at most 5 mm; 0 without a table."""
     if not rig.world_is_table:
         return np.zeros(len(R))
-    theta = euler_from_rotation(R)[:, 1]
-    lowest = t[:, 2] - disc.radius * np.sin(theta) - disc.half_thickness * np.abs(np.cos(theta))
-    return np.minimum(np.abs(lowest), 5e-3)
+    return np.minimum(np.abs(t[:, 2] - disc.resting_height(euler_from_rotation(R)[:, 1])), 5e-3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,10 @@ class Disc:
     def moment_axial(self) -> float:
         """J3 = m r^2 / 2  [kg m^2]."""
         return self.mass * self.radius**2 / 2
+
+    def resting_height(self, theta: ArrayLike) -> Array:
+        """Height of the centre [m] when the rim touches the table, r sin theta + h |cos theta|; theta (...) [rad]."""
+        return self.radius * np.sin(theta) + self.half_thickness * np.abs(np.cos(theta))
 
     @property
     def n_markers(self) -> int:

@@ -492,7 +492,7 @@ def _table_gap(trajectory: Trajectory) -> Array:
     if not trajectory.rig.world_is_table:
         return np.empty(0)
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
-    return z - trajectory.disc.radius * np.sin(theta) - trajectory.disc.half_thickness * np.abs(np.cos(theta))
+    return z - trajectory.disc.resting_height(theta)
 
 
 def _warnings(follower: _Follower, variance_factor: float, trajectory: Trajectory) -> tuple[str, ...]:
