@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +11,16 @@ from numpy.typing import NDArray
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
+IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
+HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
+
+# Suffixes of a format, the module that reads it, and its function (files, camera) -> FrameReader.
+FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
+    (IMAGE_SUFFIXES, "images", "open_images"),
+    (VIDEO_SUFFIXES, "video", "open_video"),
+)
+SUFFIXES = frozenset[str]().union(*(suffixes for suffixes, _, _ in FORMATS))
 
 
 @runtime_checkable
@@ -23,7 +33,8 @@ class FrameReader(Protocol):
 
     image_size: tuple[int, int]  # width, height [px]
     bit_depth: int  # bits that carry grey values: 8, 10, 12 or 16
-    timestamps: NDArray[np.float64] | None  # (n,) [s] where the file has them
+    timestamps: NDArray[np.float64] | None  # (n,) [s] by the camera's clock, where the file has them
+    frame_rate: float | None  # [Hz] where the file states the camera's own, not that of a player
     notes: tuple[str, ...]  # what the user should know about how the frames were read, one sentence each
     random_access: bool  # False where frames are read fastest in order, by one thread
 
@@ -51,10 +62,7 @@ def open_frames(pattern: str, folder: Path, camera: str) -> FrameReader:
     from disctrack.readers.files import match_files
 
     files = match_files(pattern, folder, camera)
-    if files[0].suffix.lower() in VIDEO_SUFFIXES:
-        from disctrack.readers.video import open_video
-
-        return open_video(files, camera)
-    from disctrack.readers.images import open_image_sequence
-
-    return open_image_sequence(files, camera)
+    suffix = files[0].suffix.lower()
+    module, function = next((module, function) for suffixes, module, function in FORMATS if suffix in suffixes)
+    reader: FrameReader = getattr(import_module(f"disctrack.readers.{module}"), function)(files, camera)
+    return reader

@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.readers import VIDEO_SUFFIXES
-
-IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
+from disctrack.readers import SUFFIXES
 
 
 def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
@@ -21,7 +19,7 @@ def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
     Raises RecordingError if there is none, naming what lies there instead.
     """
     found = glob.glob(os.path.join(glob.escape(str(folder)), pattern), recursive=True)
-    files = [Path(name) for name in found if Path(name).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES]
+    files = [Path(name) for name in found if Path(name).suffix.lower() in SUFFIXES]
     if not files:
         raise RecordingError(
             f"{folder / pattern}: no image matched for the {camera} camera. {_what_is_there(pattern, folder)}"
@@ -37,7 +35,7 @@ def _what_is_there(pattern: str, folder: Path) -> str:
     if not names:
         return f"The folder {place} is empty."
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    return f"The folder holds {shown}; images are {', '.join(sorted(IMAGE_SUFFIXES))}. Correct the pattern."
+    return f"The folder holds {shown}; frames are {', '.join(sorted(SUFFIXES))}. Correct the pattern."
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -13,13 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame
+from disctrack.readers import Frame, FrameReader
 from disctrack.readers._png import PngHeader, decode_plain_grey
 from disctrack.readers.files import with_gaps
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # A header may claim any size; no camera of this kind has more pixels, and decoding one must not exhaust the memory.
 _MOST_PIXELS = 1 << 27
+
+
+def open_images(files: Sequence[Path], camera: str) -> FrameReader:
+    """One file per frame, or TIFF files of many pages each. Raises RecordingError if no frame can be read."""
+    return open_image_sequence(files, camera)
 
 
 def open_image_sequence(files: Sequence[Path], camera: str) -> ImageSequence:
@@ -56,6 +61,7 @@ class ImageSequence:
     """One file per frame; see FrameReader. Files are opened when a frame is read, and never written."""
 
     timestamps: NDArray[np.float64] | None = None
+    frame_rate: float | None = None
     random_access = True
 
     def __init__(

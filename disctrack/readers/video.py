@@ -30,6 +30,7 @@ class VideoFile:
     """
 
     timestamps: NDArray[np.float64] | None = None  # a player's clock, not the camera's
+    frame_rate: float | None = None
     random_access = False
 
     def __init__(self, file: Path, camera: str) -> None:

@@ -1,0 +1,140 @@
+"""Speed of every reader beside the plain way of reading the same file.
+
+    python tests/benchmarks/bench_readers.py [--frames N] [--size 512] [--repeats N] [--threads N] [FORMAT ...]
+
+Writes frames with a sensor's noise in every format, reads them through `open_frames` and through what one writes
+without it (cv2.imread, cv2.VideoCapture, a copy out of np.memmap, h5py), and prints frames/s, GB/s of grey values and
+the ratio. Every figure is the best of the repeats, files in the system's cache. Not a test: nothing fails here but a
+frame that does not come back as it was written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.readers import FrameReader, open_frames
+
+Frames = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Format:
+    """One way of keeping frames, written by a library that shares nothing with the reader."""
+
+    name: str
+    bits: int
+    write: Callable[[Path, Frames], str]  # into a folder; returns the pattern that recording.toml would name
+    plain_name: str
+    plain: Callable[[Path, str, Frames], None]  # reads all frames of folder and pattern into the array
+    needs: str = ""  # a module that must be installed
+
+
+FORMATS: list[Format] = []
+
+
+def frames_with_noise(n: int, size: int, bits: int) -> Frames:
+    """(n, size, size) a dark scene with light spots and a sensor's noise, as a camera sees the disc."""
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[:size, :size] / size
+    scene = 40 + 160 * (np.hypot(x - 0.5, y - 0.5) < 0.35) * (1 - 0.8 * (np.hypot(x - 0.4, y - 0.6) < 0.06))
+    grey = scene + rng.standard_normal((min(n, 16), size, size)) * np.sqrt(1 + scene / 50)
+    grey = np.clip(np.rint(grey * (2**bits - 1) / 255), 0, 2**bits - 1)
+    return grey.astype(np.uint8 if bits == 8 else np.uint16)[np.arange(n) % len(grey)]
+
+
+def seconds(action: Callable[[], object], repeats: int) -> float:
+    """Shortest time of some repeats."""
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def read_in_order(reader: FrameReader, out: Frames) -> None:
+    for index in range(len(reader)):
+        reader.read(index, out[index])
+
+
+def read_by_threads(reader: FrameReader, out: Frames, threads: int) -> None:
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(lambda first: [reader.read(i, out[i]) for i in range(first, min(first + 8, len(out)))],
+                          range(0, len(out), 8)):  # fmt: skip
+            pass
+
+
+def measure(kind: Format, arguments: argparse.Namespace, place: Path) -> str:
+    frames = frames_with_noise(arguments.frames, arguments.size, kind.bits)
+    folder = place / kind.name.replace(" ", "_").replace("/", "_")
+    folder.mkdir()
+    pattern = kind.write(folder, frames)
+    out = np.empty_like(frames)
+    reader = open_frames(pattern, folder, "left")
+    threads = arguments.threads if reader.random_access else 1
+    ours = seconds(lambda: read_in_order(reader, out), arguments.repeats)
+    assert np.array_equal(out, frames), f"{kind.name}: frames differ from what was written"
+    side_by_side = seconds(lambda: read_by_threads(reader, out, threads), arguments.repeats)
+    plain = seconds(lambda: kind.plain(folder, pattern, out), arguments.repeats)
+    n, gigabytes = len(frames), frames.nbytes / 1e9
+    return (
+        f"{kind.name:<26} {n / ours:8.0f} {gigabytes / ours:7.2f} {n / side_by_side:10.0f} {n / plain:8.0f} "
+        f"{plain / ours:7.2f}  {kind.plain_name}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("formats", nargs="*", help="parts of the names of formats (default: all)")
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=2)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    wanted = [f for f in FORMATS if not arguments.formats or any(part in f.name for part in arguments.formats)]
+    print(f"{arguments.frames} frames of {arguments.size} x {arguments.size}")
+    print(f"{'':<26} {'1 thread':>16} {f'{arguments.threads} threads':>10} {'plain':>8} {'plain/':>7}")
+    print(f"{'format':<26} {'frames/s':>8} {'GB/s':>7} {'frames/s':>10} {'frames/s':>8} {'ours':>7}  plain way")
+    for kind in wanted:
+        if kind.needs and importlib.util.find_spec(kind.needs) is None:
+            print(f"{kind.name:<26} {kind.needs} is not installed")
+            continue
+        with tempfile.TemporaryDirectory() as place:
+            print(measure(kind, arguments, Path(place)), flush=True)
+
+
+# -- image sequences ---------------------------------------------------------------------------------------------------
+
+
+def image_writer(suffix: str) -> Callable[[Path, Frames], str]:
+    def write(folder: Path, frames: Frames) -> str:
+        for i, frame in enumerate(frames):
+            cv2.imwrite(str(folder / f"{i:06d}.{suffix}"), frame)
+        return f"*.{suffix}"
+
+    return write
+
+
+def plain_images(folder: Path, pattern: str, out: Frames) -> None:
+    for i, file in enumerate(sorted(folder.glob(pattern))):
+        out[i] = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+
+
+for suffix, bits in (("png", 8), ("png", 16), ("bmp", 8), ("tif", 8), ("tif", 16)):
+    FORMATS.append(Format(f"{suffix.upper()} files {bits} bit", bits, image_writer(suffix), "cv2.imread", plain_images))
+
+
+if __name__ == "__main__":
+    main()
