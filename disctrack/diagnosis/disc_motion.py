@@ -8,6 +8,7 @@ import numpy as np
 
 from disctrack.diagnosis.system import Candidate, Quantity
 from disctrack.rolling import CATALOGUE, Effect, Model, Parameter
+from disctrack.rolling.effects import FORMULAS
 
 # Parameters of one effect that act so differently that each part is a question of its own.
 _PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
@@ -55,14 +56,9 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
     """
     present = {effect.name for effect in model.effects}
     found = []
-    for effect in list(CATALOGUE.values()):
+    for effect in (*CATALOGUE.values(), *(FORMULAS[n] for n in names or () if n in FORMULAS)):
         wanted = names is None or effect.name in names
-        # a law by formula that somebody registered is not part of the catalogue that every session has
-        if (
-            not (wanted and effect.candidate)
-            or effect.name in present
-            or (names is None and hasattr(effect, "formulas"))
-        ):
+        if not (wanted and effect.candidate) or effect.name in present:
             continue
         amounts = [p for p in effect.parameters if not p.is_shape and np.isfinite(p.null)]
         if not amounts and effect.name != "slip":

@@ -16,7 +16,8 @@ from disctrack.diagnosis.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.pose import whitening
-from disctrack.rolling import CATALOGUE, Model, State, sensitivities, simulate
+from disctrack.rolling import Model, State, sensitivities, simulate
+from disctrack.rolling.effects import find_effect
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -290,7 +291,8 @@ class DiscSystem:
 
 def _is_effect(name: str) -> bool:
     effect, _, parameter = name.partition(".")
-    return effect in CATALOGUE and any(p.name == parameter for p in CATALOGUE[effect].parameters)
+    known = find_effect(effect)
+    return known is not None and any(p.name == parameter for p in known.parameters)
 
 
 def _scaled(covariance: Array) -> tuple[Array, Array]:

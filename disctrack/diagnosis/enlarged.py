@@ -13,6 +13,7 @@ from disctrack.diagnosis.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
+from disctrack.rolling.effects import find_effect
 from disctrack.scene import CameraFault, Faults, Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
 
@@ -80,7 +81,7 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
         nutation_deg=0.0,
         state=state,
         effects={e.name: dict(e.values) for e in model.effects},
-        formulas={e.name: dict(e.formulas) for e in model.effects if hasattr(e, "formulas")},
+        formulas={e.name: dict(e.formulas) for e in model.effects if e.formulas},
     )
     scene = replace(scene, motion=replace(scene.motion, kind="rolling", rolling=rolling))
     return "\n".join([*_header(name, values), scene_toml(scene)])
@@ -102,7 +103,9 @@ def _expressible(key: str) -> bool:
         kind in (f"{c}_turned", f"{c}_shifted", f"{c}_focal", f"{c}_distortion", f"{c}_principal_point")
         for c in CAMERAS
     )
-    known = kind in CATALOGUE or kind in ("state", "rig", "frame_rate", "time_offset", "pattern_offset") or lens
+    known = (
+        find_effect(kind) is not None or kind in ("state", "rig", "frame_rate", "time_offset", "pattern_offset") or lens
+    )
     return bool(parameter) and (known or kind.startswith(("dot_", "misprint_")))
 
 

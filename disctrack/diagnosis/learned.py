@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.fit import Fit, prior_rows, triangle
 from disctrack.diagnosis.system import Candidate, Quantity
-from disctrack.rolling import CATALOGUE
-from disctrack.rolling.effects import effect_from_formulas
+from disctrack.rolling.effects import FORMULAS, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
 
 Array = NDArray[np.float64]
@@ -279,7 +278,7 @@ def _law(
         formulas[f"M_{axis}"] = f"{formulas[f'M_{axis}']} + {piece}" if f"M_{axis}" in formulas else piece
     number = 0
     unique = name
-    while unique in CATALOGUE and getattr(CATALOGUE[unique], "formulas", None) != formulas:
+    while unique in FORMULAS and FORMULAS[unique].formulas != formulas:
         number += 1
         unique = f"{name}_{number}"
     effect = effect_from_formulas(unique, formulas, source="regression on the residual of this recording")

@@ -113,7 +113,7 @@ def effects_toml(effects: Sequence[Effect], section: str = "motion.rolling.effec
     """TOML text of the effects, ready to stand in a scene; units and meaning as comments."""
     lines = []
     for effect in effects:
-        formulas = getattr(effect, "formulas", None)
+        formulas = effect.formulas
         if formulas:
             lines += [f"[{section.rpartition('.')[0]}.formulas.{effect.name}]"]
             lines += [f"{component} = {formula!r}" for component, formula in formulas.items()]

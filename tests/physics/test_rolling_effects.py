@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Effect, Model, ModelError, Parameter, State, steady_precession
-from disctrack.rolling.effects import catalogue_table, effect_from_formulas
+from disctrack.rolling.effects import FORMULAS, catalogue_table, effect_class, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None]
@@ -185,10 +185,10 @@ def test_load_dependent_moments_are_solved_with_the_acceleration_not_lagged():
 
 @pytest.fixture
 def formula_effects():
-    before = set(CATALOGUE)
+    before = set(FORMULAS)
     yield
-    for name in set(CATALOGUE) - before:
-        del CATALOGUE[name]
+    for name in set(FORMULAS) - before:
+        del FORMULAS[name]
 
 
 @pytest.mark.usefixtures("formula_effects")
@@ -202,6 +202,8 @@ def test_an_effect_written_as_a_formula_is_the_effect_written_as_a_class():
     two = effect_from_formulas("formula_two", {"M_z": "-c*omega_z", "X_n": "-(c + d)*v_n*exp(-theta**2)"})
     assert [p.name for p in two.parameters] == ["c", "d"]
     assert effect_from_formulas("formula_two", two.formulas) is two
+    assert effect_class("formula_two") is two
+    assert "formula_two" not in CATALOGUE  # nor, therefore, among the candidates for the next recording
 
 
 @pytest.mark.usefixtures("formula_effects")

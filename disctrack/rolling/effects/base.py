@@ -25,6 +25,8 @@ import numpy as np
 from disctrack.errors import DiscTrackError
 
 CATALOGUE: dict[str, type[Effect]] = {}
+# Apart from the catalogue: what one recording taught, or a user tried, is no candidate for the next one.
+FORMULAS: dict[str, type[Effect]] = {}
 
 
 class ModelError(DiscTrackError):
@@ -70,14 +72,15 @@ class Effect:
     airborne: ClassVar[bool] = False  # acts also without contact
     candidate: ClassVar[bool] = True  # may be proposed as an explanation; False for tools
     law: ClassVar[Any] = None  # static method law(p, s, w), or None
+    formulas: ClassVar[dict[str, str] | None] = None  # of an effect written as formulas (effects.learned)
     adjust: ClassVar[Any] = None  # static method adjust(body, p), or None
 
     def __init_subclass__(cls) -> None:
-        if cls.name in CATALOGUE and CATALOGUE[cls.name].__qualname__ != cls.__qualname__:
+        if cls.formulas is None and cls.name in CATALOGUE and CATALOGUE[cls.name].__qualname__ != cls.__qualname__:
             raise ModelError(
                 f"two effects are called '{cls.name}': {CATALOGUE[cls.name].__qualname__}, {cls.__qualname__}"
             )
-        CATALOGUE[cls.name] = cls
+        (CATALOGUE if cls.formulas is None else FORMULAS)[cls.name] = cls
 
     def __init__(self, **values: float) -> None:
         """Values by parameter name, in the parameter's unit; those not given take their nominal value."""
@@ -118,11 +121,17 @@ class Effect:
         return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self._values.items())})"
 
 
+def find_effect(name: str) -> type[Effect] | None:
+    """Class of the effect of this name, in the catalogue or by formulas; None if there is none."""
+    return CATALOGUE.get(name) or FORMULAS.get(name)
+
+
 def effect_class(name: str) -> type[Effect]:
     """Class of the effect of this name; raises ModelError naming what there is."""
-    if name not in CATALOGUE:
+    found = find_effect(name)
+    if found is None:
         raise ModelError(f"there is no effect '{name}'; the catalogue has {', '.join(sorted(CATALOGUE))}")
-    return CATALOGUE[name]
+    return found
 
 
 def catalogue() -> Iterator[type[Effect]]:

@@ -2,7 +2,7 @@
 
     effect_from_formulas("braking", {"load_z": "-c * sign(omega_z, 0.01) * sin_theta**2"})
 
-makes and registers an effect "braking" with the parameter c. A formula uses the names of records.KINEMATICS, numbers of
+makes an effect "braking" with the parameter c. A formula uses the names of records.KINEMATICS, numbers of
 the effect (every other name) and sqrt, exp, log, sin, cos, magnitude(x) = |x|, sign(x, width). It gives one of the
 components that a law may set (records.WRENCH): M_n, M_m, M_z [N m]; load_n, load_m, load_z, moments per normal force
 [m]; X_n, X_m, X_z [N].
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import CATALOGUE, Effect, ModelError, Parameter, magnitude, sign
+from disctrack.rolling.effects.base import CATALOGUE, FORMULAS, Effect, ModelError, Parameter, magnitude, sign
 from disctrack.rolling.records import KINEMATICS, WRENCH
 
 _COMPONENTS = WRENCH[:9]
@@ -37,16 +37,16 @@ def effect_from_formulas(
     source: str = "learned from a residual",
     passive: bool = False,
 ) -> type[Effect]:
-    """Effect class whose law adds these formulas to the wrench; registered under `name`.
+    """Effect class whose law adds these formulas to the wrench; known by `name`, but no part of the catalogue.
 
     formulas : component of the wrench -> formula.   parameters : those not given have unit "SI", nominal 1, no bounds.
     Asking again for the same formulas returns the same class. Raises ModelError for a formula that cannot be read and
     for a name that is taken.
     """
     formulas = dict(formulas)
-    if name in CATALOGUE:
-        if getattr(CATALOGUE[name], "formulas", None) == formulas:
-            return CATALOGUE[name]
+    if name in FORMULAS and FORMULAS[name].formulas == formulas:
+        return FORMULAS[name]
+    if name in CATALOGUE or name in FORMULAS:
         raise ModelError(f"there is an effect '{name}' already, with another law: choose another name")
     lines, free = [], []
     for component, formula in formulas.items():
