@@ -77,10 +77,13 @@ class DiagnoseOutcome:
     summary: tuple[str, ...]
 
 
-def diagnose_trajectory(trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None) -> DiscDiagnosis:
+def diagnose_trajectory(
+    trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None, *, separate: bool = True
+) -> DiscDiagnosis:
     """What does the model lack? Fit, trace, refit, judge.
 
-    model : "paper", "none", or a TOML file (`enlarged.declared_model`)
+    model    : "paper", "none", or a TOML file (`enlarged.declared_model`)
+    separate : also look for recordings that would tell apart what this one does not
     Raises AnalysisError, SceneError, ModelError.
     """
     declared = declared_model(trajectory, model)
@@ -104,7 +107,7 @@ def diagnose_trajectory(trajectory: Trajectory, model: str = PAPER, settings: Se
     apart = {
         f.candidate.name: separations(system, fit_, f.candidate, [r.candidate for r in f.cannot_be_told_from])
         for f in diagnosis.found
-        if f.cannot_be_told_from
+        if f.cannot_be_told_from and separate
     }
     return DiscDiagnosis(system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart)
 

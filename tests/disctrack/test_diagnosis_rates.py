@@ -1,0 +1,57 @@
+"""What the rates of the diagnosis rest on: what is planted is what the diagnosis means by the name of the effect."""
+
+import numpy as np
+import pytest
+
+from disctrack.diagnosis import DiscSystem
+from disctrack.diagnosis.enlarged import declared_model
+from disctrack.diagnosis.fit import fit
+from disctrack.validate.diagnosis_rates import draw, trajectory_of, trial
+from disctrack.validate.hidden_effects import HIDDEN_EFFECTS, hidden_effect
+
+# whose planting takes another way than the prediction: through the renderer's faults, instants, frames, areas
+MEASUREMENT = {e.name for e in HIDDEN_EFFECTS if e.visible and not e.plant(e.size, np.random.default_rng(1)).effects}
+
+
+def candidate_of(system, truth):
+    return next(c for c in system.candidates if set(truth) <= set(c.names))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        e.name if e.name in MEASUREMENT else pytest.param(e.name, marks=pytest.mark.slow)
+        for e in HIDDEN_EFFECTS
+        if e.visible
+    ],
+)
+def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
+    """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
+    effect = hidden_effect(name)
+    planted = effect.plant(effect.size, np.random.default_rng(7))
+    recording = draw(5, planted)
+    trajectory = trajectory_of(recording, planted, n=150)
+    system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
+    candidate = candidate_of(system, planted.truth)
+    base = tuple(q for q in system.base if q.name not in candidate.names)
+    found = fit(system, (*base, *candidate.quantities), system.start())
+    assert found.converged
+    # 3600 numbers: 1 +- 0.024
+    assert found.reduced_chi_square < 1.1
+    for key, value in planted.truth.items():
+        assert abs(found.values[key] - value) < 4 * found.sigma(key), key
+
+
+def test_a_trial_tells_what_became_of_the_hidden_effect():
+    verdict = trial([hidden_effect("time_offset")], [1e-4], seed=3)
+    assert verdict.named
+    assert verdict.within
+    assert verdict.at_noise
+    assert verdict.extra == 0
+    assert verdict.free_run_before > 1.2
+
+
+def test_a_trial_without_an_effect_finds_nothing():
+    verdict = trial([], [], seed=4)
+    assert verdict.verdict == "nothing missing"
+    assert verdict.found == ()
