@@ -18,6 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--circle", type=_seconds, default=0.6, help="last seconds for the circle through the contact (default: 0.6)"
     )
+    parser.add_argument(
+        "--rerun", action="store_true", help="also write motion.rrd for the 3-D viewer rerun (needs disctrack[viewer])"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an older report")
 
 
@@ -41,4 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
         overwrite=arguments.overwrite,
     )
     print("\n".join(outcome.lines()))
+    if arguments.rerun:
+        from disctrack.viewer import write_rerun
+
+        recording = outcome.report.with_name("motion.rrd")
+        write_rerun(recording, outcome.analysis)
+        print(f"              {recording}")
     return DONE
