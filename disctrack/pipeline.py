@@ -16,6 +16,7 @@ from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, iter_pair_blocks
+from disctrack.readers.camera_header import check_headers, header_of
 from disctrack.recording import Recording
 from disctrack.storage import Provenance
 from disctrack.tracking import TrackingSettings, prepare, track
@@ -32,6 +33,7 @@ class ImagePairs:
     right: FrameReader
     start: int
     stop: int
+    warnings: tuple[str, ...] = ()  # where the cameras' headers leave doubt that the frames are simultaneous
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -40,6 +42,12 @@ class ImagePairs:
     def notes(self) -> tuple[str, ...]:
         """What the user should know about how the frames are read."""
         return (*self.left.notes, *self.right.notes)
+
+    def camera_headers(self) -> dict[str, Any]:
+        """Under "camera_headers" what the cameras wrote about themselves (exposure, trigger, ...), if anything."""
+        found = {name: header_of(reader) for name, reader in zip(CAMERAS, (self.left, self.right), strict=True)}
+        told = {name: header.as_dict() for name, header in found.items() if header is not None}
+        return {"camera_headers": told} if told else {}
 
     def inputs(self) -> dict[str, str]:
         """SHA-256 of each camera's frames; what was read already is not read again."""
@@ -62,19 +70,21 @@ class Measurement:
 def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:
     """Open both cameras. frames: first and one past the last frame to measure, None for the recording's ends.
 
-    Raises RecordingError if images are missing, do not belong together, or the range holds no frame.
+    Raises RecordingError if images are missing, do not belong together, or the range holds no frame; or if a camera's
+    own header contradicts the other's, or the declared frame rate.
     """
     left, right = (
         open_frames(pattern, recording.folder, camera)
         for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
     )
+    warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
     check_pair(left, right)
     start, stop, _ = slice(*frames).indices(len(left))
     if stop <= start:
         raise RecordingError(
             f"{recording.folder}: --frames {frames[0]}:{frames[1]} holds no frame; the recording has {len(left)}."
         )
-    return ImagePairs(left, right, start, stop)
+    return ImagePairs(left, right, start, stop, warnings)
 
 
 def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
@@ -125,13 +135,14 @@ def measure(
     seconds = time.perf_counter() - began
     findings = {
         "notes": list(pairs.notes),
-        "warnings": list(tracking.warnings),
+        "warnings": [*pairs.warnings, *tracking.warnings],
         "unreadable": [image.reason for image in unreadable],
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
+        **pairs.camera_headers(),
     }
     trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start)
     return Measurement(trajectory, tuple(unreadable), findings, seconds)
@@ -169,6 +180,7 @@ def trajectory_provenance(
             "recording": dict(recording.declared),
             "frames": [pairs.start, pairs.stop],
             "tracking": dataclasses.asdict(settings or TrackingSettings()),
+            **pairs.camera_headers(),
         },
     )
 

@@ -13,12 +13,14 @@ Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
+MRAW_SUFFIXES = frozenset({".cih", ".cihx", ".mraw"})  # Photron
 HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
 
 # Suffixes of a format, the module that reads it, and its function (files, camera) -> FrameReader.
 FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
     (IMAGE_SUFFIXES, "images", "open_images"),
     (VIDEO_SUFFIXES, "video", "open_video"),
+    (MRAW_SUFFIXES, "mraw", "open_mraw"),
 )
 SUFFIXES = frozenset[str]().union(*(suffixes for suffixes, _, _ in FORMATS))
 
@@ -32,7 +34,7 @@ class FrameReader(Protocol):
     """
 
     image_size: tuple[int, int]  # width, height [px]
-    bit_depth: int  # bits that carry grey values: 8, 10, 12 or 16
+    bit_depth: int  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16)
     timestamps: NDArray[np.float64] | None  # (n,) [s] by the camera's clock, where the file has them
     frame_rate: float | None  # [Hz] where the file states the camera's own, not that of a player
     notes: tuple[str, ...]  # what the user should know about how the frames were read, one sentence each

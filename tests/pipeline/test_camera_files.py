@@ -1,0 +1,88 @@
+"""The measurement from the cameras' own files is the one from PNG files of the same grey values."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from disctrack.cli import main
+from disctrack.storage import read_findings, read_trajectory
+from tests.oracles.camera_files import write_mraw
+
+QUICK = ["--no-figures", "--no-video"]
+
+
+def grey_values(folder: Path) -> np.ndarray:
+    return np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted(folder.iterdir())])
+
+
+def use_files(recording: Path, left: str, right: str) -> None:
+    """Let the recording name these instead of its PNG files, which are removed."""
+    file = recording / "recording.toml"
+    text = file.read_text()
+    for name, pattern in (("left", left), ("right", right)):
+        assert f'{name} = "{name}/*.png"' in text
+        text = text.replace(f'{name} = "{name}/*.png"', f'{name} = "{pattern}"')
+        shutil.rmtree(recording / name)
+    file.write_text(text)
+
+
+@pytest.fixture(scope="module")
+def from_png(short_recording, rig_file, tmp_path_factory):
+    """Trajectory from the PNG files, with the same rig."""
+    path = tmp_path_factory.mktemp("png") / "trajectory.h5"
+    assert main(["track", str(short_recording), "--rig", str(rig_file), "-o", str(path), *QUICK]) == 0
+    return read_trajectory(path)
+
+
+def test_poses_from_mraw_of_8_bit_are_those_from_png_to_the_last_bit(recording, from_png, capsys):
+    for name in ("left", "right"):
+        images = grey_values(recording / name)
+        write_mraw(recording / "raw" / name, images, 8, kind="cihx", Record_Rate="1000", Shutter_Type2="50000")
+    use_files(recording, "raw/left.cihx", "raw/right.cihx")
+    assert main(["run", str(recording), *QUICK]) == 0
+    output = capsys.readouterr().out
+    assert "exposure 50 us, trigger Start" in output
+    found = recording / "results" / "trajectory.h5"
+    assert_array_equal(read_trajectory(found).q, from_png.q)
+    headers = read_findings(found)["camera_headers"]
+    assert headers["right"]["exposure"] == pytest.approx(5e-5)
+    assert headers["left"]["saturation"] == 255
+    assert main(["run", str(recording), *QUICK]) == 0
+    assert "reused" in capsys.readouterr().out
+
+
+def test_poses_do_not_depend_on_the_unit_of_grey(recording, from_png):
+    """12 bits packed, each value 16 times that of the PNG; rounding to 1/16 of a PNG's grey value leaves no trace."""
+    for name in ("left", "right"):
+        write_mraw(recording / name, grey_values(recording / name).astype(np.uint16) << 4, 12, Record_Rate="1000")
+    use_files(recording, "left.cih", "right.mraw")
+    assert main(["run", str(recording), *QUICK]) == 0
+    found = read_trajectory(recording / "results" / "trajectory.h5")
+    # the noise measured in each image has a floor for its rounding, 1/12 of the square of a unit: hence not to the bit
+    assert_allclose(found.q, from_png.q, atol=0.05 * from_png.coordinate_sigma.min())
+
+
+def test_headers_that_contradict_the_recording_stop_it_before_any_work(recording, capsys):
+    for name in ("left", "right"):
+        write_mraw(recording / "raw" / name, grey_values(recording / name), 8, Record_Rate="2000")
+    use_files(recording, "raw/left.cih", "raw/right.cih")
+    assert main(["run", str(recording), *QUICK]) == 1
+    message = capsys.readouterr().err
+    assert "frame_rate_hz is 1000" in message
+    assert "recorded with 2000 Hz" in message
+    assert not (recording / "results" / "trajectory.h5").exists()
+
+
+def test_doubts_about_the_headers_are_told_and_kept(recording, capsys):
+    for name, exposure in (("left", "50000"), ("right", "90000")):
+        write_mraw(
+            recording / "raw" / name, grey_values(recording / name), 8, Record_Rate="1000", Shutter_Type2=exposure
+        )
+    use_files(recording, "raw/left.cih", "raw/right.cih")
+    assert main(["run", str(recording), *QUICK]) == 0
+    assert "the cameras exposed for different times" in capsys.readouterr().out
+    assert "left 50 us" in "".join(read_findings(recording / "results" / "trajectory.h5")["warnings"])
