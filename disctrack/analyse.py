@@ -12,6 +12,7 @@ from disctrack.contact import Contact, analyse_contact
 from disctrack.derivatives import GROUP_NAMES, STATE, Motion, differentiate
 from disctrack.energy import Energy, analyse_energy
 from disctrack.errors import AnalysisError, OutputError
+from disctrack.frames import euler_jacobian
 from disctrack.labelled import Variable
 from disctrack.propagation import RATES, Series, propagate, rates
 from disctrack.scaling import (
@@ -260,8 +261,14 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
                 f"{name}_{axis}", unit, f"{text}, {axis}", values[:, i], sigma[:, first + i], common[:, first + i]
             )
             variables |= _series_variables((item,))
+    J = euler_jacobian(motion.euler[:, 0], motion.euler[:, 1])
+    turn = J @ S[:, 3:6]
+    angle_variance = np.einsum("nij,njk,nik->ni", J, motion.covariance[:, 3:6, 3:6], J)
+    angle_common = np.einsum("nsa,ab,nsb->ns", turn, motion.rig_covariance, turn, optimize=True)
     for i, name in enumerate(("psi", "theta", "phi")):
-        variables[name] = Variable(motion.euler[:, i], ("time",), "rad", f"smoothed {name}, unwrapped")
+        noise, shared = (np.sqrt(np.maximum(v[:, i], 0.0)) for v in (angle_variance, angle_common))
+        item = Series(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared)
+        variables |= _series_variables((item,))
     return variables | {
         "covariance": Variable(
             motion.covariance, ("time", "state", "state_2"), "products of m, rad, s", "covariance, noise of the poses"

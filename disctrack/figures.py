@@ -60,11 +60,12 @@ def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
 def _axes(width: float = 7.2, height: float = 3.6) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.add_subplot()
-    _dress(axes)
+    dress(axes)
     return figure, axes
 
 
-def _dress(axes: Axes) -> None:
+def dress(axes: Axes) -> None:
+    """Grid, colours and spines of every plot."""
     axes.grid(True, color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -89,7 +90,7 @@ def _inset(axes: Axes, time: Array, value: Array, bounds: tuple[float, float, fl
         return
     last = known[time[known] >= time[known[-1]] - INSET_DURATION]
     inset = axes.inset_axes(bounds)
-    _dress(inset)
+    dress(inset)
     inset.plot(time[last], value[last], color=BLUE, linewidth=1.0)
     inset.tick_params(labelsize=7)
     inset.set_title(f"last {INSET_DURATION:g} s", fontsize=8, color=MUTED)
@@ -260,7 +261,7 @@ def axial_rates(analysis: Analysis) -> Drawn | None:
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     for axes, series, name in ((upper, w3, "ω₃ (rad/s)"), (lower, wz, "ω_z (rad/s)")):
-        _dress(axes)
+        dress(axes)
         _band(axes, time, series, 1.0, BLUE, name)
         axes.axhline(0, color=MUTED, linewidth=0.7)
         axes.set_ylabel(name)
@@ -314,8 +315,8 @@ def energy_parts(analysis: Analysis) -> Drawn | None:
         return None
     figure = Figure(figsize=(7.2, 5.0), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    _dress(upper)
-    _dress(lower)
+    dress(upper)
+    dress(lower)
     parts = (
         ("translation", AMBER, "translation"),
         ("rotation_1", GREEN, "rotation about e₁"),
@@ -342,7 +343,7 @@ def contact_forces(analysis: Analysis) -> Drawn | None:
     figure = Figure(figsize=(7.2, 5.0), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for axes in (upper, lower):
-        _dress(axes)
+        dress(axes)
     for name, colour, label in (("force_z", INK, "F_z"), ("force_n", BLUE, "F_n"), ("force_m", RED, "F_m")):
         _band(upper, time, analysis.series(name), 1.0, colour, label)
     upper.set_ylabel("force (N)")
@@ -460,7 +461,7 @@ def pose_quality(analysis: Analysis) -> Drawn:
     figure = Figure(figsize=(7.2, 5.4), layout="constrained")
     upper, middle, lower = figure.subplots(3, 1, sharex=True)
     for axes in (upper, middle, lower):
-        _dress(axes)
+        dress(axes)
     time = trajectory.time
     for camera, (name, colour) in enumerate((("left", BLUE), ("right", RED))):
         upper.plot(time, trajectory.reprojection_rms_px[:, camera], ".", color=colour, markersize=2, label=name)

@@ -5,7 +5,7 @@ Every axis is a dimension scale at the root of the file; a variable of any group
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,15 +73,17 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
 MOST_COMPRESSION = 1100
 
 
-def read_variables(group: h5py.Group, text: bool = True) -> dict[str, NDArray]:
-    """Every dataset of a group (not of its subgroups) as an array; text as str, or left out.
+def read_variables(group: h5py.Group, text: bool = True, names: Collection[str] | None = None) -> dict[str, NDArray]:
+    """Every dataset of a group (not of its subgroups), or those of `names`, as an array; text as str, or left out.
 
     Raises ValueError if a dataset claims to be larger than the file could hold.
     """
     return {
         name: _read(item)
         for name, item in group.items()
-        if isinstance(item, h5py.Dataset) and (text or not h5py.check_string_dtype(item.dtype))
+        if (names is None or name in names)
+        and isinstance(item, h5py.Dataset)
+        and (text or not h5py.check_string_dtype(item.dtype))
     }
 
 

@@ -17,7 +17,7 @@ FILE_NAME = "recording.toml"
 
 # Every key that a recording.toml may hold, in the order of the reference example.
 KEYS: dict[str, tuple[str, ...]] = {
-    "": ("name",),
+    "": ("name", "case", "surface"),
     "cameras": ("frame_rate_hz", "left", "right"),
     "disc": ("radius_mm", "thickness_mm", "mass_g"),
     "markers": ("diameter_mm", "centres_mm"),
@@ -78,6 +78,9 @@ def read_recording(path: str | Path) -> Recording:
     cameras, disc, markers = (_Section(file, declared, name) for name in ("cameras", "disc", "markers"))
     calibration = _Section(file, declared, "calibration")
     chessboard, rig_file = _calibration_source(calibration)
+    for label in ("case", "surface"):  # what repeats are grouped by; kept with the results in `declared`
+        if label in declared:
+            _Section(file, declared, "").get(label, _text)
     return Recording(
         folder=file.parent,
         name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,

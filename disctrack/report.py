@@ -38,6 +38,14 @@ SECTIONS = (
 def write_report(folder: Path, analysis: Analysis, provenance: Provenance) -> tuple[Path, tuple[Path, ...]]:
     """Write report.html and figures/*.png, *.pdf; returns the report and the figures. Raises OutputError."""
     figures = all_figures(analysis)
+    written, pictures = draw(folder, figures)
+    path = folder / "report.html"
+    write_whole(path, html_report(analysis, provenance, figures, pictures).encode())
+    return path, tuple(written)
+
+
+def draw(folder: Path, figures: Sequence[Drawn]) -> tuple[list[Path], dict[str, str]]:
+    """Write figures/*.png, *.pdf; returns them, and a data URI per figure's name for a page. Raises OutputError."""
     written: list[Path] = []
     pictures: dict[str, str] = {}
     with rc_context({"font.size": 10, "svg.fonttype": "path", "svg.hashsalt": "disctrack", "mathtext.fontset": "cm"}):
@@ -47,9 +55,7 @@ def write_report(folder: Path, analysis: Analysis, provenance: Provenance) -> tu
             drawn.figure.set_layout_engine("none")  # laid out once, for all formats
             written += _save(folder / "figures", drawn)
             pictures[drawn.name] = _inline(drawn)
-    path = folder / "report.html"
-    write_whole(path, html_report(analysis, provenance, figures, pictures).encode())
-    return path, tuple(written)
+    return written, pictures
 
 
 def _save(folder: Path, drawn: Drawn) -> list[Path]:
@@ -83,7 +89,7 @@ def html_report(analysis: Analysis, provenance: Provenance, figures: Sequence[Dr
         mine = [drawn for drawn in figures if drawn.name.startswith(numbers)]
         tables = _tables(title, analysis)
         if mine or tables:
-            parts.append(f"<section><h2>{escape(title)}</h2>{tables}{_gallery(mine, pictures)}</section>")
+            parts.append(f"<section><h2>{escape(title)}</h2>{tables}{gallery(mine, pictures)}</section>")
     parts.append(_method(analysis, provenance))
     return "\n".join(parts) + "\n</main></body></html>\n"
 
@@ -92,7 +98,7 @@ def _head(provenance: Provenance) -> str:
     title = escape(f"{provenance.recording}: from the trajectory to the physics")
     return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head>'
         f"<body><main><h1>{title}</h1>"
     )
 
@@ -147,7 +153,8 @@ def _warnings(warnings: Iterable[str]) -> str:
     return f"<div class=warn><b>Before you use the numbers</b><ul>{items}</ul></div>" if items else ""
 
 
-def _gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> str:
+def gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> str:
+    """Figures with their captions; `pictures` holds a data URI per figure's name."""
     items = "".join(
         f'<figure><img src="{pictures[drawn.name]}" alt="{escape(drawn.title)}">'
         f"<figcaption><b>{escape(drawn.title)}.</b> {escape(drawn.caption)}</figcaption></figure>"
@@ -166,7 +173,8 @@ def _tables(section: str, analysis: Analysis) -> str:
     return ""
 
 
-def _table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table with caption; cells are text."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return (
@@ -178,7 +186,7 @@ def _table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -
 def _status_table(analysis: Analysis) -> str:
     status = analysis.trajectory.frame_status
     rows = [(str(int(np.sum(status == state))), state.sentence) for state in FrameStatus if np.any(status == state)]
-    return _table("Frames by what became of them.", ("frames", "outcome"), rows)
+    return html_table("Frames by what became of them.", ("frames", "outcome"), rows)
 
 
 def _instants_table(analysis: Analysis) -> str:
@@ -204,7 +212,7 @@ def _instants_table(analysis: Analysis) -> str:
         cells = (_measured(series, frame) for frame in frames)
         rows.append((series.long_name, _on_page(series.unit)[0], *cells))
     times = [f"at {analysis.motion.time[frame]:.3f} s" for frame in frames]
-    return _table(
+    return html_table(
         "Some quantities at three instants: value ± σ from noise ± σ from calibration.",
         ("quantity", "unit", *times),
         rows,
@@ -259,7 +267,7 @@ def _exponents_table(analysis: Analysis) -> str:
         "itself bends shows in the dependence on the window."
     )
     header = ("exponent of", "value", "95 % confidence", *(name.split(",")[0] for name, _ in MODEL_EXPONENTS))
-    return f"<p>{escape(said)}</p>" + _table(
+    return f"<p>{escape(said)}</p>" + html_table(
         "Exponents in (t_f - t) and the models that they agree with.", header, rows
     )
 
@@ -273,7 +281,7 @@ def _windows_table(fits: Sequence[PowerLaws]) -> str:
             rows.append((f"{fit.window[0]:.3f} to {fit.window[1]:.3f}", *(_plus_minus(e) for e in exponents), t_f))
     if not rows:
         return ""
-    return _table(
+    return html_table(
         "As the paper's tables 2 and 3, this recording, for several windows (value ± σ).",
         ("t_f - t (s)", "n_E", "n_θ", "n_ψ̇", "t_f (s)"),
         dict.fromkeys(rows),  # windows longer than the recording repeat each other
@@ -293,7 +301,7 @@ def _published_tables() -> str:
         sentences = "; ".join(a.sentence for a in agreement(table))
         parts.append(
             f"<details><summary>Published exponents on {surface}</summary>"
-            + _table(f"Ma et al. 2014, disc on {surface}.", ("case", "trial", "n_E", "n_θ", "n_ψ̇", "t_f (s)"), rows)
+            + html_table(f"Ma et al. 2014, disc on {surface}.", ("case", "trial", "n_E", "n_θ", "n_ψ̇", "t_f (s)"), rows)
             + f"<p>{escape(sentences)}.</p></details>"
         )
     return "".join(parts)
@@ -314,12 +322,12 @@ def _method(analysis: Analysis, provenance: Provenance) -> str:
     ]
     return (
         "<section><h2>How the numbers were made</h2>"
-        + _table("Method and provenance.", ("what", "how"), rows)
+        + html_table("Method and provenance.", ("what", "how"), rows)
         + "</section>"
     )
 
 
-_STYLE = """
+STYLE = """
 :root{color:#1d2733;background:#f5f7f9;font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 body{margin:0}main{max-width:1180px;margin:0 auto;padding:2rem 1.5rem 4rem}
 h1{font-size:1.7rem;line-height:1.25;margin:.2rem 0 1rem}

@@ -11,7 +11,7 @@ import hashlib
 import io
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -141,13 +141,44 @@ def write_group(
     write_whole(path, buffer.getbuffer())
 
 
-def read_group(path: Path, group: str) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Arrays and attributes of one group. Raises TrajectoryFileError that names the groups there are."""
+def read_group(
+    path: Path, group: str, names: Collection[str] | None = None
+) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Arrays and attributes of one group. Raises TrajectoryFileError that names the groups there are.
+
+    names : the arrays that are wanted, where not all are
+    """
     with _Reading(path) as file:
         if group not in file or not isinstance(file[group], h5py.Group):
             there = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
             raise TrajectoryFileError(f"{path}: no group '{group}'; it holds {there}. Run the stage that writes it.")
-        return read_variables(file[group]), dict(file[group].attrs)
+        return read_variables(file[group], names=names), dict(file[group].attrs)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What was filmed, by which cameras and when, without the measurement itself."""
+
+    time: NDArray[np.float64]  # (n,) [s]
+    disc: Disc
+    rig: StereoRig
+    gravity: float  # [m/s^2]
+    fingerprint: str  # of the trajectory: equal for equal inputs, settings and version
+
+
+def read_setup(path: Path) -> Setup:
+    """Time, disc and rig of a trajectory file. Raises TrajectoryFileError."""
+    with _Reading(path) as file:
+        return Setup(
+            time=read_variables(file, names=("time",))["time"],
+            disc=_read_disc(file["disc"]),
+            rig=_rig(
+                read_variables(file["calibration"], names=_RIG_VARIABLES),
+                bool(file["calibration"].attrs["world_is_table"]),
+            ),
+            gravity=float(file.attrs["gravity_m_s2"]),
+            fingerprint=str(file.attrs["fingerprint"]),
+        )
 
 
 def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> None:
@@ -380,7 +411,6 @@ class _Reading:
 def _trajectory(file: h5py.File) -> Trajectory:
     root, markers = read_variables(file, text=False), read_variables(file["markers"])
     calibration = read_variables(file["calibration"])
-    disc = {key: float(value) for key, value in file["disc"].attrs.items()}
     trajectory = Trajectory(
         time=root["time"],
         frame=root["frame"],
@@ -395,19 +425,36 @@ def _trajectory(file: h5py.File) -> Trajectory:
         markers_covariance_px2=markers["centre_covariance_px2"],
         markers_residual_px=markers["residual_px"],
         marker_status=markers["status"],
-        disc=Disc(
-            disc["radius_m"],
-            disc["half_thickness_m"],
-            disc["mass_kg"],
-            read_variables(file["disc"])["marker_centres_body"],
-            disc["marker_diameter_m"],
-        ),
+        disc=_read_disc(file["disc"]),
         rig=_rig(calibration, bool(file["calibration"].attrs["world_is_table"])),
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
     )
     _check_shapes(trajectory)
     return trajectory
+
+
+def _read_disc(group: h5py.Group) -> Disc:
+    sizes = {key: float(value) for key, value in group.attrs.items()}
+    return Disc(
+        sizes["radius_m"],
+        sizes["half_thickness_m"],
+        sizes["mass_kg"],
+        read_variables(group)["marker_centres_body"],
+        sizes["marker_diameter_m"],
+    )
+
+
+_RIG_VARIABLES = (
+    "camera_matrix",
+    "distortion",
+    "image_size_px",
+    "R_right_left",
+    "t_right_left",
+    "R_left_world",
+    "t_left_world",
+    "covariance",
+)
 
 
 def _rig(values: Mapping[str, NDArray], world_is_table: bool) -> StereoRig:
