@@ -21,6 +21,7 @@ FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
     (IMAGE_SUFFIXES, "images", "open_images"),
     (VIDEO_SUFFIXES, "video", "open_video"),
     (MRAW_SUFFIXES, "mraw", "open_mraw"),
+    (HDF5_SUFFIXES, "hdf5", "open_hdf5"),
 )
 SUFFIXES = frozenset[str]().union(*(suffixes for suffixes, _, _ in FORMATS))
 
@@ -56,15 +57,26 @@ class FrameReader(Protocol):
 
 
 def open_frames(pattern: str, folder: Path, camera: str) -> FrameReader:
-    """Reader of one camera's frames: a file pattern or one video, relative to `folder`.
+    """Reader of one camera's frames: a file pattern, relative to `folder`.
 
-    camera : "left" or "right", for messages
+    pattern : "left/*.png", "left.mkv", "stack.tif", or "frames.h5:/left" for a data set in an HDF5 file
+    camera  : "left" or "right", for messages
     Raises RecordingError if nothing matches, or if no frame can be read.
     """
     from disctrack.readers.files import match_files
 
+    pattern, member = split_member(pattern)
     files = match_files(pattern, folder, camera)
     suffix = files[0].suffix.lower()
     module, function = next((module, function) for suffixes, module, function in FORMATS if suffix in suffixes)
-    reader: FrameReader = getattr(import_module(f"disctrack.readers.{module}"), function)(files, camera)
+    opener = getattr(import_module(f"disctrack.readers.{module}"), function)
+    reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
     return reader
+
+
+def split_member(pattern: str) -> tuple[str, str]:
+    """Pattern of a file and the path inside it: "frames.h5:/left" is ("frames.h5", "/left"); "" for other patterns."""
+    file, colon, member = pattern.rpartition(":")
+    if colon and Path(file).suffix.lower() in HDF5_SUFFIXES:
+        return file, member
+    return pattern, ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -47,7 +47,7 @@ class PairBlock:
 
 
 def check_pair(left: FrameReader, right: FrameReader) -> None:
-    """Raise RecordingError unless both sequences have the same number of frames, size and depth."""
+    """Raise RecordingError unless both sequences have the same number of frames and size, and 8 bit or more."""
     if len(left) != len(right):
         short = CAMERAS[int(len(right) < len(left))]
         last = min(len(left), len(right)) - 1
@@ -55,10 +55,12 @@ def check_pair(left: FrameReader, right: FrameReader) -> None:
             f"left has {len(left)} frames ({left.describe(0)} ...), right has {len(right)} ({right.describe(0)} ...). "
             f"Frame i of both must belong together: bring the missing {short} images, or move the surplus ones away "
             f"(the last pair would be {left.describe(last)} with {right.describe(last)})."
+            + "".join(f" Note: {note}." for reader in (left, right) for note in reader.notes)
         )
     for what, unit in (("image_size", "px"), ("bit_depth", "bit")):
         ours, theirs = (getattr(reader, what) for reader in (left, right))
-        if ours != theirs:
+        alike = ours == theirs if what == "image_size" else (ours > 8) == (theirs > 8)
+        if not alike:
             shown = [f"{v[0]} x {v[1]}" if isinstance(v, tuple) else f"{v}" for v in (ours, theirs)]
             raise RecordingError(
                 f"left images ({left.describe(0)}) have {shown[0]} {unit}, right images ({right.describe(0)}) have "
@@ -94,30 +96,37 @@ def iter_pair_blocks(
     n_ahead = min(2, max(len(starts) - 1, 0))
     ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]
     pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
+    # what is read fastest in order has a thread of its own: two blocks at once would send it back and forth
+    pools = [
+        pool if reader.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for reader in (left, right)
+    ]
     pending: list[list[Future[list[Unreadable]]]] = []
     try:
         for number, first in enumerate(starts):
             for ahead in range(number + len(pending), min(number + n_ahead + 1, len(starts))):
                 begin = starts[ahead]
                 pending.append(
-                    _submit(pool, (left, right), range(begin, min(begin + block, stop)), ring[ahead % len(ring)])
+                    _submit(pools, (left, right), range(begin, min(begin + block, stop)), ring[ahead % len(ring)])
                 )
             unreadable = [image for future in pending.pop(0) for image in future.result()]
             frames = np.arange(first, min(first + block, stop))
             yield PairBlock(frames, ring[number % len(ring)][: len(frames)], tuple(unreadable))
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        for threads_of_one in {pool, *pools}:
+            threads_of_one.shutdown(wait=True, cancel_futures=True)
 
 
 def _submit(
-    pool: ThreadPoolExecutor, readers: tuple[FrameReader, FrameReader], frames: range, images: NDArray
+    pools: Sequence[ThreadPoolExecutor], readers: tuple[FrameReader, FrameReader], frames: range, images: NDArray
 ) -> list[Future[list[Unreadable]]]:
     """Reading of one block as tasks: a few frames each, or a camera's whole block where files are read in order."""
     tasks = []
     for camera, reader in enumerate(readers):
         size = 4 if reader.random_access else len(frames)
         for i in range(0, len(frames), size):
-            tasks.append(pool.submit(_fill, images[i : i + size, camera], reader, camera, frames[i : i + size]))
+            tasks.append(
+                pools[camera].submit(_fill, images[i : i + size, camera], reader, camera, frames[i : i + size])
+            )
     return tasks
 
 

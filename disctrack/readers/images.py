@@ -24,6 +24,11 @@ _MOST_PIXELS = 1 << 27
 
 def open_images(files: Sequence[Path], camera: str) -> FrameReader:
     """One file per frame, or TIFF files of many pages each. Raises RecordingError if no frame can be read."""
+    if files[0].suffix.lower() in (".tif", ".tiff"):
+        from disctrack.readers.tiff import is_stack, open_stack
+
+        if is_stack(files[0]) or is_stack(files[-1]):
+            return open_stack(files, camera)
     return open_image_sequence(files, camera)
 
 

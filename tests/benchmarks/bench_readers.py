@@ -53,14 +53,15 @@ def frames_with_noise(n: int, size: int, bits: int) -> Frames:
     return grey.astype(np.uint8 if bits == 8 else np.uint16)[np.arange(n) % len(grey)]
 
 
-def seconds(action: Callable[[], object], repeats: int) -> float:
-    """Shortest time of some repeats."""
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - began)
-    return min(times)
+def shortest(actions: list[Callable[[], object]], repeats: int) -> list[float]:
+    """Shortest time [s] of each action; they take turns, so that a busy moment of the machine strikes all alike."""
+    times = np.full((repeats, len(actions)), np.inf)
+    for row in times:
+        for k, action in enumerate(actions):
+            began = time.perf_counter()
+            action()
+            row[k] = time.perf_counter() - began
+    return [float(best) for best in times.min(axis=0)]
 
 
 def read_in_order(reader: FrameReader, out: Frames) -> None:
@@ -83,10 +84,16 @@ def measure(kind: Format, arguments: argparse.Namespace, place: Path) -> str:
     out = np.empty_like(frames)
     reader = open_frames(pattern, folder, "left")
     threads = arguments.threads if reader.random_access else 1
-    ours = seconds(lambda: read_in_order(reader, out), arguments.repeats)
+    read_in_order(reader, out)
     assert np.array_equal(out, frames), f"{kind.name}: frames differ from what was written"
-    side_by_side = seconds(lambda: read_by_threads(reader, out, threads), arguments.repeats)
-    plain = seconds(lambda: kind.plain(folder, pattern, out), arguments.repeats)
+    ours, side_by_side, plain = shortest(
+        [
+            lambda: read_in_order(reader, out),
+            lambda: read_by_threads(reader, out, threads),
+            lambda: kind.plain(folder, pattern, out),
+        ],
+        arguments.repeats,
+    )
     n, gigabytes = len(frames), frames.nbytes / 1e9
     return (
         f"{kind.name:<26} {n / ours:8.0f} {gigabytes / ours:7.2f} {n / side_by_side:10.0f} {n / plain:8.0f} "
@@ -134,6 +141,106 @@ def plain_images(folder: Path, pattern: str, out: Frames) -> None:
 
 for suffix, bits in (("png", 8), ("png", 16), ("bmp", 8), ("tif", 8), ("tif", 16)):
     FORMATS.append(Format(f"{suffix.upper()} files {bits} bit", bits, image_writer(suffix), "cv2.imread", plain_images))
+
+
+# -- TIFF stacks -------------------------------------------------------------------------------------------------------
+
+
+def stack_writer(**options: object) -> Callable[[Path, Frames], str]:
+    def write(folder: Path, frames: Frames) -> str:
+        import tifffile
+
+        tifffile.imwrite(folder / "stack.tif", frames, photometric="minisblack", **options)
+        return "stack.tif"
+
+    return write
+
+
+def plain_tiff_map(folder: Path, pattern: str, out: Frames) -> None:
+    import tifffile
+
+    mapped = tifffile.memmap(folder / pattern, mode="r")
+    for i in range(len(out)):
+        out[i] = mapped[i]
+
+
+def plain_tiff_pages(folder: Path, pattern: str, out: Frames) -> None:
+    _, pages = cv2.imreadmulti(str(folder / pattern), flags=cv2.IMREAD_UNCHANGED)
+    for image, page in zip(out, pages, strict=True):
+        image[...] = page
+
+
+FORMATS += [
+    Format("TIFF stack 8 bit", 8, stack_writer(), "copy of tifffile.memmap", plain_tiff_map, "tifffile"),
+    Format("TIFF stack 12 bit", 12, stack_writer(), "copy of tifffile.memmap", plain_tiff_map, "tifffile"),
+    Format("TIFF stack deflate 8 bit", 8, stack_writer(compression="zlib"), "cv2.imreadmulti", plain_tiff_pages,
+           "tifffile"),
+]  # fmt: skip
+
+# -- HDF5 --------------------------------------------------------------------------------------------------------------
+
+
+def hdf5_writer(**options: object) -> Callable[[Path, Frames], str]:
+    def write(folder: Path, frames: Frames) -> str:
+        import h5py
+
+        with h5py.File(folder / "stack.h5", "w") as file:
+            file.create_dataset("frames", data=frames, **options)
+        return "stack.h5:/frames"
+
+    return write
+
+
+def plain_hdf5(folder: Path, pattern: str, out: Frames) -> None:
+    import h5py
+
+    with h5py.File(folder / "stack.h5") as file:
+        for i in range(len(out)):
+            out[i] = file["frames"][i]
+
+
+FORMATS += [
+    Format("HDF5 8 bit", 8, hdf5_writer(), "h5py, frame by frame", plain_hdf5),
+    Format("HDF5 gzip 8 bit", 8, hdf5_writer(chunks=(1, 512, 512), compression="gzip", compression_opts=1),
+           "h5py, frame by frame", plain_hdf5),
+    Format("HDF5 gzip 16 frames 8 bit", 8, hdf5_writer(chunks=(16, 64, 512), compression="gzip", compression_opts=1),
+           "h5py, frame by frame", plain_hdf5),
+]  # fmt: skip
+
+# -- video -------------------------------------------------------------------------------------------------------------
+
+
+def video_writer(name: str, codec: str, pixels: str, **options: str) -> Callable[[Path, Frames], str]:
+    def write(folder: Path, frames: Frames) -> str:
+        import av
+
+        with av.open(str(folder / name), "w") as container:
+            stream = container.add_stream(codec, rate=1000, options=options)
+            stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pixels
+            for frame in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format=pixels)))
+            container.mux(stream.encode())
+        return name
+
+    return write
+
+
+def plain_capture(folder: Path, pattern: str, out: Frames) -> None:
+    capture = cv2.VideoCapture(str(folder / pattern))
+    for image in out:
+        _, colour = capture.read()
+        image[...] = colour[..., 0]
+
+
+FORMATS += [
+    Format(name, bits, video_writer(f"v.{suffix}", codec, pixels), "cv2.VideoCapture, 8 bit", plain_capture, "av")
+    for name, bits, suffix, codec, pixels in (
+        ("raw video AVI 8 bit", 8, "avi", "rawvideo", "gray"),
+        ("raw video MKV 8 bit", 8, "mkv", "rawvideo", "gray"),
+        ("FFV1 MKV 8 bit", 8, "mkv", "ffv1", "gray"),
+        ("FFV1 MKV 12 bit", 12, "mkv", "ffv1", "gray12le"),
+    )
+]
 
 
 if __name__ == "__main__":
