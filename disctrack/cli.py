@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "track": ("disctrack.commands.track", "recording and rig -> trajectory with covariance"),
     "analyse": ("disctrack.commands.analyse", "trajectory -> velocities, contact, energy, scaling laws and a report"),
     "diagnose": ("disctrack.commands.diagnose", "trajectory -> which effect the model lacks, before and after"),
+    "batch": ("disctrack.commands.batch", "many recordings side by side: a report of each, and one summary"),
     "simulate": ("disctrack.commands.simulate", "rolling model: scene -> motion, energies, contact forces"),
     "render": ("disctrack.commands.render", "scene -> recording as the cameras would write it, and its truth"),
     "validate": ("disctrack.commands.validate", "render -> measure -> compare: the verdict on 0.005 mm / 0.05 deg"),

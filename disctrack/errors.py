@@ -5,6 +5,7 @@ from calibration.errors import CalibrationError, DiscTrackError, RigFileError
 __all__ = [
     "AnalysisError",
     "CalibrationError",
+    "ClusterError",
     "DiscTrackError",
     "OutputError",
     "RecordingError",
@@ -17,6 +18,10 @@ __all__ = [
 
 class AnalysisError(DiscTrackError):
     """A trajectory does not hold enough for what was asked of it."""
+
+
+class ClusterError(DiscTrackError):
+    """The machines that were to share the work cannot be used."""
 
 
 class RecordingError(DiscTrackError):

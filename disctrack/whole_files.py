@@ -75,12 +75,13 @@ def _clear_abandoned(folder: Path) -> None:
     """Remove what processes of this host that no longer live have left half-written in the folder."""
     for part in folder.glob("*.part*"):
         found = re.fullmatch(rf".+\.{_host()}-(\d+)\.part.*", part.name)
-        if found and not _alive(int(found[1])):
+        if found and not process_lives(int(found[1])):
             with contextlib.suppress(OSError):
                 part.unlink()
 
 
-def _alive(process: int) -> bool:
+def process_lives(process: int) -> bool:
+    """Whether this host has a process of this number."""
     if os.name == "nt":  # signal 0 would end the process there; another's remains are left alone
         return True
     try:

@@ -1,0 +1,22 @@
+"""Many recordings: found, planned, measured side by side, summed up.
+
+`find` (which folders are recordings) -> `plan` (each rig once, then one job per recording) -> `jobs` (what is ready,
+what waits) -> `processes` or `cluster` (who works; `worker` is the process, `measure` what it does) -> `records` (kept
+beside the results) -> `summary`, `index` (of all). `run_batch` is the whole. Results are judged by content: the hash of
+inputs, settings and version, never by their mere existence.
+"""
+
+from disctrack.batch.find import find_recordings
+from disctrack.batch.plan import BatchOptions, Shard
+from disctrack.batch.run import BatchOutcome, run_batch, summarise_batch
+from disctrack.batch.summary import read_summary
+
+__all__ = [
+    "BatchOptions",
+    "BatchOutcome",
+    "Shard",
+    "find_recordings",
+    "read_summary",
+    "run_batch",
+    "summarise_batch",
+]

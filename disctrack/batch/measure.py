@@ -1,0 +1,222 @@
+"""What one process does with one job: calibrate a rig, or take a recording from its images to its report."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from calibration.camera import StereoRig
+from calibration.rig_file import read_rig
+from disctrack import storage
+from disctrack.analyse import Analysis, analyse, run_analyse, write_analysis
+from disctrack.batch.locks import Busy, locked
+from disctrack.batch.plan import Job
+from disctrack.batch.reasons import reason_of
+from disctrack.batch.records import (
+    FAILED,
+    MEASURED,
+    SKIPPED,
+    Record,
+    is_done,
+    read_record,
+    stages_asked,
+    write_record,
+)
+from disctrack.batch.rows import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
+from disctrack.calibration_stage import calibrate_into, is_rig_of, source_of
+from disctrack.errors import AnalysisError, DiscTrackError, OutputError
+from disctrack.pipeline import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
+from disctrack.recording import Recording, read_recording
+from disctrack.storage import Provenance
+from disctrack.trajectory import Trajectory
+from disctrack.whole_files import write_whole
+
+Progress = Callable[[float], None]  # is told the share of the job that is done
+
+LOCK = ".batch.lock"
+BUSY = "busy"  # another batch is at it
+_TRACKED = 0.5  # share of the progress after tracking
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What became of a job: MEASURED, SKIPPED, FAILED or BUSY, and the record of a recording."""
+
+    status: str
+    record: Record
+
+    def as_dict(self) -> dict[str, Any]:
+        """Of JSON's types."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> Result:
+        """What `as_dict` gave."""
+        return cls(fields["status"], Record(**fields["record"]))
+
+    @classmethod
+    def failed(cls, reason: str, numbers: dict[str, Any] | None = None) -> Result:
+        """A failure with its reason."""
+        return cls(FAILED, Record(FAILED, reason, numbers=numbers or {}))
+
+
+def do(job: Job, progress: Progress = lambda share: None) -> Result:
+    """Do a job. Never raises an Exception: what went wrong is in the result, and in the recording's record."""
+    try:
+        return make_rig(job) if job.kind == "rig" else make_recording(job, progress)
+    except Busy:
+        return Result(BUSY, Record(FAILED))
+    except Exception as error:
+        return Result.failed(reason_of(error))
+
+
+def make_rig(job: Job) -> Result:
+    """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Busy."""
+    path = Path(job.rig)
+    with locked(path.with_name(LOCK)):
+        source = source_of(read_recording(job.folder), job.options.calibration)
+        if is_rig_of(path, source) and not job.options.overwrite:
+            return Result(SKIPPED, Record(MEASURED))
+        earlier = [Path(file) for file in job.adopt] if not job.options.overwrite else []
+        same = next((file for file in earlier if is_rig_of(file, source)), None)
+        if same is not None:
+            write_whole(path, same.read_bytes())
+            return Result(SKIPPED, Record(MEASURED))
+        calibrate_into(path, source, overwrite=True, figures=job.options.report)
+    return Result(MEASURED, Record(MEASURED))
+
+
+def make_recording(job: Job, progress: Progress) -> Result:
+    """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Busy."""
+    results = Path(job.results)
+    with locked(results / LOCK):
+        try:
+            return _make_recording(job, results, progress)
+        except Exception as error:
+            result = Result.failed(reason_of(error))
+            with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
+                write_record(results, result.record)
+            return result
+
+
+def _make_recording(job: Job, results: Path, progress: Progress) -> Result:
+    began = time.perf_counter()
+    asked = stages_asked(job.options)
+    recording = read_recording(job.folder)
+    rig, pairs = read_rig(job.rig), open_pairs(recording)
+    check_rig(rig, pairs, job.rig)
+    path = results / "trajectory.h5"
+    provenance = _reusable(path, recording, rig, pairs) if not job.options.overwrite else None
+    if provenance is not None:
+        record = read_record(results)
+        if record is not None and record.fingerprint == provenance.fingerprint and is_done(results, record, asked):
+            return Result(SKIPPED, record)
+        trajectory, findings = storage.read_trajectory(path), storage.read_findings(path)
+    else:
+        trajectory, findings, provenance = _track(path, recording, rig, pairs, job, progress)
+    progress(_TRACKED)
+    record = _after_tracking(results, path, trajectory, findings, provenance, job, asked)
+    numbers = record.numbers | _origin(recording, provenance)
+    numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
+    record = dataclasses.replace(record, numbers=numbers)
+    write_record(results, record)
+    return Result(MEASURED, record)
+
+
+def _reusable(path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> Provenance | None:
+    """What the trajectory that is there was made from, if making it again would give it again.
+
+    Raises OutputError if the file is no trajectory: it may be something that cannot be made again.
+    """
+    if not path.exists():
+        return None
+    try:
+        storage.read_provenance(path)
+    except DiscTrackError as error:
+        raise OutputError(f"{error} It is kept; move it away, or replace it with --overwrite.") from error
+    provenance = trajectory_provenance(recording, rig, pairs, None)
+    return provenance if storage.is_result_of(path, provenance) else None
+
+
+def _track(
+    path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs, job: Job, progress: Progress
+) -> tuple[Trajectory, dict[str, Any], Provenance]:
+    done = 0
+
+    def advance(n: int) -> None:
+        nonlocal done
+        done += n
+        progress(_TRACKED * done / len(pairs))
+
+    measurement = measure(recording, rig, pairs, threads=job.threads, progress=advance)
+    provenance = trajectory_provenance(recording, rig, pairs, None)
+    storage.write_trajectory(path, measurement.trajectory, provenance, overwrite=True, findings=measurement.findings)
+    return measurement.trajectory, measurement.findings, provenance
+
+
+def _after_tracking(
+    results: Path,
+    path: Path,
+    trajectory: Trajectory,
+    findings: dict[str, Any],
+    provenance: Provenance,
+    job: Job,
+    asked: dict[str, Any],
+) -> Record:
+    """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
+    files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
+    missing = _unreadable(findings)
+    try:
+        analysis, report = _analyse(path, trajectory, job)
+        numbers |= analysed_numbers(analysis)
+        files |= {"report": report.relative_to(results).as_posix()} if report is not None else {}
+    except AnalysisError as error:
+        missing.append(f"not analysed: {reason_of(error)}")
+    numbers |= friction_numbers(trajectory)
+    if job.options.diagnose:
+        try:
+            page, document = _diagnose(path)
+            numbers |= diagnosed_numbers(document)
+            files["diagnosis_report"] = page.relative_to(results).as_posix()
+        except AnalysisError as error:
+            missing.append(f"not diagnosed: {reason_of(error)}")
+    return Record(MEASURED, "; ".join(missing), provenance.fingerprint, asked, files, numbers)
+
+
+def _unreadable(findings: dict[str, Any]) -> list[str]:
+    reasons = findings.get("unreadable", [])
+    return [f"{len(reasons)} images could not be read, the first: {reasons[0]}"] if reasons else []
+
+
+def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Path | None]:
+    window, circle = job.options.window, job.options.circle
+    if job.options.report:
+        outcome = run_analyse(path, window=window, circle_duration=circle, overwrite=True)
+        return outcome.analysis, outcome.report
+    analysis = analyse(trajectory, window, circle)
+    write_analysis(path, analysis)
+    return analysis, None
+
+
+def _diagnose(path: Path) -> tuple[Path, dict[str, Any]]:
+    from disctrack.diagnosis import run_diagnose
+
+    outcome = run_diagnose(path, overwrite=True)
+    pages = {file.name: file for file in outcome.files}
+    return pages["diagnosis.html"], json.loads(pages["diagnosis.json"].read_text(encoding="utf-8"))
+
+
+def _origin(recording: Recording, provenance: Provenance) -> dict[str, str]:
+    inputs = json.dumps(dict(provenance.inputs), sort_keys=True).encode()
+    return {
+        "name": recording.name,
+        "input_sha256": hashlib.sha256(inputs).hexdigest(),
+        "fingerprint": provenance.fingerprint,
+        "version": provenance.version,
+    }

@@ -1,0 +1,157 @@
+"""What is to be done: each rig once, then one job per recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calibration import CalibrationSettings
+from disctrack.batch.find import RESULTS, Found
+from disctrack.batch.reasons import reason_of
+from disctrack.calibration_stage import source_of
+from disctrack.pipeline import open_pairs
+from disctrack.recording import Recording, read_recording
+from disctrack.scaling import WINDOW
+
+FOLDER = "batch_results"  # for what belongs to no single recording
+# Work in units of one tracked pair, from timings; it only sets how the progress bar is divided.
+_START, _NUMBERS, _REPORT, _DIAGNOSIS, _CALIBRATION = 100.0, 200.0, 1500.0, 4000.0, 2500.0
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """What a user chose about every recording."""
+
+    distortion: str = "auto"  # see CalibrationSettings
+    board: str = "auto"
+    window: float = WINDOW  # [s] before t_f, for the exponents
+    circle: float = 0.6  # [s] before the end, for the circle through the contact
+    report: bool = True  # report.html and figures of each recording
+    diagnose: bool = False
+    overwrite: bool = False  # measure anew what is done already
+
+    @property
+    def calibration(self) -> CalibrationSettings:
+        """Settings of every calibration."""
+        return CalibrationSettings(distortion=self.distortion, board=self.board)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Every `of`-th recording, from number `number` (1, 2, ...) on."""
+
+    number: int = 1
+    of: int = 1
+
+    def part(self, recordings: Sequence[Path]) -> tuple[Path, ...]:
+        """Recordings of this shard; all shards together give each once."""
+        return tuple(recordings[self.number - 1 :: self.of])
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work for one process; all of JSON's types, so that it can travel."""
+
+    kind: str  # "rig" or "recording"
+    name: str  # of the recording; for a rig, the first recording that needs it
+    folder: str  # of that recording
+    results: str  # folder for what comes out
+    rig: str  # rig file: what a "rig" makes and a "recording" uses
+    options: BatchOptions
+    needs_rig: bool = False  # wait for the "rig" job of the same file
+    pairs: int = 0
+    threads: int = 1  # that read images
+    adopt: tuple[str, ...] = ()  # rig files of earlier runs that may be the same
+
+    @property
+    def work(self) -> float:
+        """Expected work, in pairs."""
+        if self.kind == "rig":
+            return _CALIBRATION
+        o = self.options
+        return _START + self.pairs + _NUMBERS + _REPORT * o.report + _DIAGNOSIS * o.diagnose
+
+    def as_json(self) -> str:
+        """One line."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Job:
+        """What `as_json` wrote."""
+        fields = json.loads(text)
+        return cls(**fields | {"options": BatchOptions(**fields["options"]), "adopt": tuple(fields["adopt"])})
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Jobs of a batch, and the recordings that fail before they begin."""
+
+    rigs: tuple[Job, ...]
+    recordings: tuple[Job, ...]
+    failures: dict[str, str]  # name of the recording -> reason
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where results go."""
+
+    found: Found
+    output: Path | None  # None: beside each recording
+
+    @property
+    def common(self) -> Path:
+        """Folder of the summary, the index and the rigs."""
+        return self.found.base / FOLDER if self.output is None else self.output
+
+    def results(self, recording: Path) -> Path:
+        """Folder of one recording's results."""
+        return recording / RESULTS if self.output is None else self.output / self.found.name(recording)
+
+
+def make_plan(places: Places, recordings: Sequence[Path], options: BatchOptions) -> Plan:
+    """Read every recording.toml, count the images, and find who shares a rig by the content of the views."""
+    rigs: dict[str, Job] = {}
+    jobs: list[Job] = []
+    failures: dict[str, str] = {}
+    for folder in recordings:
+        name = places.found.name(folder)
+        try:
+            jobs.append(_job(places, folder, name, options, rigs))
+        except Exception as error:  # whatever is wrong with one recording, the others are measured
+            failures[name] = reason_of(error)
+    needed = {job.rig for job in jobs}
+    return Plan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures)
+
+
+def _job(places: Places, folder: Path, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
+    recording = read_recording(folder)
+    n = len(open_pairs(recording))
+    results = places.results(folder)
+    if recording.rig_file is not None:
+        return Job("recording", name, str(folder), str(results), str(recording.rig_file), options, pairs=n)
+    rig = _shared_rig(places, recording, options)
+    earlier = str(results / "rig.h5")
+    job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
+    rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
+    return Job("recording", name, str(folder), str(results), str(rig), options, needs_rig=True, pairs=n)
+
+
+def _shared_rig(places: Places, recording: Recording, options: BatchOptions) -> Path:
+    """The file of the rig, named by the content of all that it depends on."""
+    provenance = source_of(recording, options.calibration).provenance
+    return places.common / "rigs" / provenance.fingerprint[:16] / "rig.h5"
+
+
+def with_threads(jobs: Sequence[Job], cores: int, side_by_side: int) -> tuple[Job, ...]:
+    """Cores that no other recording uses read images ahead."""
+    threads = max(1, cores // max(1, min(side_by_side, len(jobs))))
+    return tuple(dataclasses.replace(job, threads=threads) for job in jobs)
+
+
+def options_as_json(options: BatchOptions) -> dict[str, Any]:
+    """For the summary."""
+    return {k: v for k, v in dataclasses.asdict(options).items() if k != "overwrite"}

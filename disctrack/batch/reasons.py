@@ -1,0 +1,45 @@
+"""Why something failed, in one line."""
+
+from __future__ import annotations
+
+import signal
+
+from disctrack.errors import DiscTrackError
+
+
+def reason_of(error: BaseException) -> str:
+    """What to tell about an error, whatever it is."""
+    if isinstance(error, DiscTrackError):
+        text = str(error)
+    elif isinstance(error, MemoryError):
+        text = "out of memory. Run fewer side by side with -j, or give the machine more memory."
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}." if error.filename else f"{error.strerror}."
+    else:
+        text = f"internal error ({type(error).__name__}: {error}); please report it."
+    return " ".join(text.split())
+
+
+def reason_of_death(returncode: int | None, said: str = "") -> str:
+    """What to tell about a worker process that ended by itself.
+
+    said : the last that it wrote on stderr
+    """
+    if returncode == -getattr(signal, "SIGKILL", 9):
+        text = (
+            "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side "
+            "with -j, or give the machine more memory."
+        )
+    elif returncode is not None and returncode < 0:
+        text = f"its process was ended by signal {-returncode} ({_signal_name(-returncode)})."
+    else:
+        text = f"its process ended by itself (exit code {returncode})."
+    last = " ".join(said.split())[-300:]
+    return f"{text} It said: {last}" if last else text
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return "unknown"

@@ -1,0 +1,91 @@
+"""What is kept beside each recording's results: how far they are complete, of what they were made, and their row."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from disctrack.batch.plan import BatchOptions
+from disctrack.errors import DiscTrackError
+from disctrack.storage import is_result_of, read_provenance
+from disctrack.whole_files import write_whole
+
+RECORD = "batch.json"
+SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
+MEASURED, SKIPPED, FAILED, NOT_MEASURED = "measured", "skipped", "failed", "not measured"
+
+
+@dataclass(frozen=True)
+class Record:
+    """Outcome of one recording; written last, so that all it speaks of is there."""
+
+    status: str  # MEASURED or FAILED
+    reason: str = ""
+    fingerprint: str = ""  # of the trajectory's inputs, settings and version
+    stages: dict[str, Any] = field(default_factory=dict)  # what was made of the trajectory, with which settings
+    files: dict[str, str] = field(default_factory=dict)  # what -> path relative to the record's folder
+    numbers: dict[str, Any] = field(default_factory=dict)  # columns of the summary
+
+
+def stages_asked(options: BatchOptions) -> dict[str, Any]:
+    """What the options ask for beyond the trajectory."""
+    return {
+        "window_s": options.window,
+        "circle_s": options.circle,
+        "report": options.report,
+        "diagnose": options.diagnose,
+    }
+
+
+def write_record(folder: Path, record: Record) -> None:
+    """Write it whole. Raises OutputError."""
+    document = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **record.__dict__}
+    write_whole(folder / RECORD, (json.dumps(document, indent=1) + "\n").encode())
+
+
+def read_record(folder: Path) -> Record | None:
+    """The record in the folder; None if there is none that can be read."""
+    try:
+        document = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        if document.pop("schema") != SCHEMA or document.pop("schema_version") != SCHEMA_VERSION:
+            return None
+        return Record(**document)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return None
+
+
+def is_done(folder: Path, record: Record | None, asked: dict[str, Any]) -> bool:
+    """True if the record tells of a measured recording with all stages asked for, and all its files are there.
+
+    The trajectory must be the record's; whether that is the result of the present inputs is another question
+    (`storage.is_result_of`).
+    """
+    if record is None or record.status != MEASURED or "trajectory" not in record.files:
+        return False
+    for stage, value in asked.items():
+        made = record.stages.get(stage)
+        if made != value and not (value is False and made is True):
+            return False
+    if not all((folder / file).is_file() for file in record.files.values()):
+        return False
+    try:
+        return read_provenance(folder / record.files["trajectory"]).fingerprint == record.fingerprint
+    except DiscTrackError:
+        return False
+
+
+__all__ = [
+    "FAILED",
+    "MEASURED",
+    "NOT_MEASURED",
+    "RECORD",
+    "SKIPPED",
+    "Record",
+    "is_done",
+    "is_result_of",
+    "read_record",
+    "stages_asked",
+    "write_record",
+]

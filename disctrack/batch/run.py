@@ -1,0 +1,180 @@
+"""A batch from end to end: find, plan, do, sum up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from disctrack.batch.cluster import connect, run_on_cluster
+from disctrack.batch.find import Found, find_recordings
+from disctrack.batch.jobs import JobQueue
+from disctrack.batch.measure import Result
+from disctrack.batch.plan import FOLDER, BatchOptions, Job, Places, Plan, Shard, make_plan, with_threads
+from disctrack.batch.processes import run_here
+from disctrack.batch.records import FAILED, NOT_MEASURED, Record
+from disctrack.batch.summary import Row, counts, line_of, write_summary
+from disctrack.errors import OutputError
+from disctrack.readers.blocks import default_threads
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """What a batch did."""
+
+    rows: tuple[Row, ...]  # of the recordings that were this batch's to do
+    all_rows: tuple[Row, ...]  # of all that were found
+    files: tuple[Path, ...]  # summary.json, summary.csv, index.html; none where they could not be written
+    problems: tuple[str, ...]  # besides those of single recordings
+    interrupted: bool = False
+
+    @property
+    def failed(self) -> bool:
+        """Some recording has no result, or the summary none."""
+        return bool(self.problems) or any(row["status"] in (FAILED, NOT_MEASURED) for row in self.rows)
+
+    @property
+    def incomplete(self) -> bool:
+        """Some recording was measured, but not all of it could be used."""
+        return any(row["reason"] for row in self.rows)
+
+    def lines(self) -> list[str]:
+        """One line per recording, then the totals."""
+        width = max(len(row["recording"]) for row in self.rows)
+        total = ", ".join(f"{n} {status}" for status, n in counts(self.rows).items() if n)
+        return [*(line_of(row, width) for row in self.rows), f"{'total':<13} {total}"]
+
+
+def run_batch(
+    folders: Sequence[Path],
+    options: BatchOptions | None = None,
+    output: Path | None = None,
+    side_by_side: int | None = None,
+    shard: Shard | None = None,
+    cluster: str | None = None,
+) -> BatchOutcome:
+    """Measure all recordings at and below `folders`.
+
+    output : folder for all results, in the order of the recordings' own folders; without it, each recording's own
+    `results`, and `batch_results` in the deepest folder common to all
+    side_by_side : processes; without it, one per core
+    cluster : address of a dask.distributed scheduler
+    Raises RecordingError if there is nothing to measure, OutputError, ClusterError. What is wrong with one recording
+    is in its row.
+    """
+    options = options or BatchOptions()
+    client = connect(cluster) if cluster is not None else None  # before the work: a wrong address must be told at once
+    try:
+        places = _places(folders, output)
+        mine = (shard or Shard()).part(places.found.recordings)
+        plan = make_plan(places, mine, options)
+        results = {name: Result.failed(reason) for name, reason in plan.failures.items()}
+        cores = default_threads()
+        n = side_by_side or cores
+        interrupted = _do(plan, results, n if client is None else None, cores, client)
+    finally:
+        if client is not None:
+            client.close()
+    for job in plan.recordings:
+        results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, "interrupted before it was done")))
+    return _summed_up(places, mine, results, options, interrupted)
+
+
+def summarise_batch(
+    folders: Sequence[Path], options: BatchOptions | None = None, output: Path | None = None
+) -> BatchOutcome:
+    """The summary of what lies on the disk; nothing is measured. Raises RecordingError."""
+    places = _places(folders, output)
+    return _summed_up(places, places.found.recordings, {}, options or BatchOptions(), False)
+
+
+def _places(folders: Sequence[Path], output: Path | None) -> Places:
+    output = None if output is None else Path(output).resolve()
+    found = find_recordings(folders, [] if output is None else [output])
+    return Places(found, output)
+
+
+def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> bool:
+    """Fill `results` with what becomes of the plan's recordings; True if the user interrupted it."""
+    recordings = with_threads(plan.recordings, cores, n) if n is not None else plan.recordings
+    with _Bar(plan, len(results)) as bar:
+
+        def done(job: Job, result: Result) -> None:
+            if job.kind == "recording":
+                results[job.name] = result
+            bar.done(job, result)
+
+        jobs = JobQueue(plan.rigs, recordings, done)
+        try:
+            if client is None:
+                run_here(jobs, n or 1, bar.share)
+            else:
+                run_on_cluster(client, jobs, bar.share)
+        except KeyboardInterrupt:
+            return True
+    return False
+
+
+def _summed_up(
+    places: Places, mine: Sequence[Path], results: dict[str, Result], options: BatchOptions, interrupted: bool
+) -> BatchOutcome:
+    from disctrack.batch.summary import rows_of
+
+    problems = [f"not searched: {problem}" for problem in places.found.problems]
+    files: tuple[Path, ...] = ()
+    try:
+        rows, files = write_summary(places, places.found.recordings, results, options)
+    except OutputError as error:  # the results themselves may be safe all the same
+        problems.append(str(error))
+        rows = rows_of(places, places.found.recordings, results)
+    names = {places.found.name(folder) for folder in mine}
+    own = tuple(row for row in rows if row["recording"] in names)
+    return BatchOutcome(own, tuple(rows), files, tuple(problems), interrupted)
+
+
+class _Bar:
+    """One bar for the whole batch, on stderr, where that is a terminal. What was skipped does not spoil the rate."""
+
+    def __init__(self, plan: Plan, n_failed: int) -> None:
+        self._jobs = (*plan.rigs, *plan.recordings)
+        self._share: dict[tuple[str, str], float] = {}
+        self._n, self._n_failed, self._finished = len(plan.recordings) + n_failed, n_failed, n_failed
+
+    def __enter__(self) -> _Bar:
+        self._bar = tqdm(
+            total=sum(job.work for job in self._jobs),
+            desc="batch",
+            bar_format="{desc} {percentage:3.0f}%|{bar}| {postfix} [{elapsed}<{remaining}]",
+            disable=None,
+            leave=False,
+            smoothing=0.1,
+        )
+        self._tell()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def share(self, job: Job, share: float) -> None:
+        key = (job.kind, job.name)
+        self._bar.update((share - self._share.get(key, 0.0)) * job.work)
+        self._share[key] = share
+
+    def done(self, job: Job, result: Result) -> None:
+        if result.status in ("skipped", FAILED) and not self._bar.disable:
+            self._bar.total -= (1.0 - self._share.get((job.kind, job.name), 0.0)) * job.work
+        else:
+            self.share(job, 1.0)
+        if job.kind == "recording":
+            self._finished += 1
+            self._n_failed += result.status == FAILED
+        self._tell()
+
+    def _tell(self) -> None:
+        failed = f", {self._n_failed} failed" if self._n_failed else ""
+        self._bar.set_postfix_str(f"{self._finished} of {self._n} recordings{failed}")
+
+
+__all__ = ["FOLDER", "BatchOutcome", "Found", "run_batch", "summarise_batch"]

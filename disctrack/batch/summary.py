@@ -1,0 +1,142 @@
+"""The summary of a batch: one row per recording, as JSON and as CSV, merged from all who took part."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import disctrack
+from disctrack.batch.locks import locked
+from disctrack.batch.measure import Result
+from disctrack.batch.plan import BatchOptions, Places, options_as_json
+from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
+from disctrack.batch.rows import COLUMNS
+from disctrack.errors import OutputError
+from disctrack.whole_files import write_whole
+
+SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
+_PATHS = ("trajectory", "report", "diagnosis_report")
+_WAIT = 60.0  # [s] for another process that writes the summary
+
+Row = dict[str, Any]
+
+
+def rows_of(places: Places, recordings: Sequence[Path], results: Mapping[str, Result]) -> list[Row]:
+    """A row for every recording: from `results` (by name) where it took part now, else from what lies on the disk."""
+    rows = []
+    for folder in recordings:
+        name = places.found.name(folder)
+        record, status = _outcome(places.results(folder), results.get(name))
+        rows.append(_row(places, folder, name, record, status))
+    return rows
+
+
+def _outcome(folder: Path, result: Result | None) -> tuple[Record, str]:
+    if result is not None:
+        return result.record, result.status
+    record = read_record(folder)
+    if record is None:
+        return Record(NOT_MEASURED, "not measured yet, or by another shard that has not come to it"), NOT_MEASURED
+    if record.status == MEASURED and not is_done(folder, record, {}):
+        return Record(NOT_MEASURED, "its files are not those that were measured, or not all there"), NOT_MEASURED
+    return record, SKIPPED if record.status == MEASURED else FAILED
+
+
+def _row(places: Places, folder: Path, name: str, record: Record, status: str) -> Row:
+    row: Row = dict.fromkeys(COLUMNS)
+    row |= {k: v for k, v in record.numbers.items() if k in COLUMNS}
+    row |= {"recording": name, "status": status, "reason": record.reason, "folder": _relative(folder, places.common)}
+    for what in _PATHS:
+        if what in record.files:
+            row[what] = _relative(places.results(folder) / record.files[what], places.common)
+    if row["rig"]:
+        row["rig"] = _relative(Path(row["rig"]), places.common)
+    return row
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # another drive
+        return path.as_posix()
+
+
+def write_summary(
+    places: Places, recordings: Sequence[Path], results: Mapping[str, Result], options: BatchOptions
+) -> tuple[list[Row], tuple[Path, ...]]:
+    """Write summary.json, summary.csv and index.html; returns the rows and the files. Raises OutputError.
+
+    Shards that end at the same time write one after the other, each with all that is on the disk by then: the last one
+    has everything.
+    """
+    from disctrack.batch.index import write_index
+
+    folder = places.common
+    with locked(folder / ".summary.lock", wait=_WAIT):
+        rows = rows_of(places, recordings, results)
+        document = {
+            "schema": SCHEMA,
+            "schema_version": SCHEMA_VERSION,
+            "version": disctrack.__version__,
+            "searched": [str(places.found.base), *places.found.problems],
+            "options": options_as_json(options),
+            "counts": counts(rows),
+            "columns": COLUMNS,
+            "recordings": rows,
+        }
+        write_whole(folder / "summary.json", (json.dumps(document, indent=1) + "\n").encode())
+        write_whole(folder / "summary.csv", _as_csv(rows).encode())
+        write_index(folder / "index.html", rows)
+    return rows, tuple(folder / name for name in ("summary.json", "summary.csv", "index.html"))
+
+
+def read_summary(path: Path) -> list[Row]:
+    """Rows of a summary.json. Raises OutputError if it is none."""
+    try:
+        document = json.loads(Path(path).read_text(encoding="utf-8"))
+        if document["schema"] == SCHEMA:
+            return list(document["recordings"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OutputError(f"{path}: cannot be read as the summary of a batch ({error}).") from error
+    raise OutputError(f"{path}: not the summary of a batch. Give the summary.json that disctrack batch wrote.")
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """How many recordings have which status."""
+    statuses = [row["status"] for row in rows]
+    return {status: statuses.count(status) for status in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
+
+
+def _as_csv(rows: Sequence[Row]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(COLUMNS))
+    writer.writeheader()
+    writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def line_of(row: Row, width: int) -> str:
+    """One line for people: what became of a recording. width : of the longest name"""
+    head = f"{row['status']:<13} {row['recording']:<{width}}"
+    if row["status"] in (FAILED, NOT_MEASURED):
+        return f"{head}  {row['reason']}"
+    parts = [f"{row['pairs_measured']} of {row['pairs']} pairs"]
+    if row["k_m_m_s2"] is not None:
+        parts.append(f"k_m {row['k_m_m_s2'] * 1e8:.4f} +- {row['k_m_sigma_m_s2'] * 1e8:.4f} e-8 m s2")
+    if row["n_theta"] is not None:
+        parts.append(f"n_theta {row['n_theta']:.4f} +- {row['n_theta_sigma']:.4f}")
+    if row["t_f_s"] is not None:
+        parts.append(f"t_f {row['t_f_s']:.5f} s")
+    rms = [row[f"reprojection_rms_{camera}_px"] for camera in ("left", "right")]
+    if None not in rms:
+        parts.append(f"rms {max(rms):.4f} px")
+    if row["diagnosis"]:
+        parts.append(str(row["diagnosis"]))
+    if row["reason"]:
+        parts.append(f"but {row['reason']}")
+    return f"{head}  {', '.join(parts)}"

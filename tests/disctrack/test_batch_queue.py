@@ -1,0 +1,193 @@
+"""What a batch does with jobs, locks and folders, without measuring anything."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from disctrack.batch import locks
+from disctrack.batch.find import find_recordings
+from disctrack.batch.jobs import JobQueue
+from disctrack.batch.locks import Busy, locked
+from disctrack.batch.measure import BUSY, Result
+from disctrack.batch.plan import BatchOptions, Job, Shard
+from disctrack.batch.reasons import reason_of, reason_of_death
+from disctrack.batch.records import FAILED, MEASURED, Record
+from disctrack.errors import RecordingError
+
+GOOD = Result(MEASURED, Record(MEASURED))
+
+
+def recordings_at(root, *names):
+    for name in names:
+        (root / name).mkdir(parents=True, exist_ok=True)
+        (root / name / "recording.toml").write_text("")
+    return root
+
+
+def names_of(found):
+    return [found.name(folder) for folder in found.recordings]
+
+
+def test_recordings_are_found_at_any_depth_in_natural_order_and_results_are_not_searched(tmp_path):
+    root = recordings_at(tmp_path / "all", "day 2/r10", "day 2/r9", "day 10/r1", "r3", "r3/results/rendered")
+    (root / "empty").mkdir()
+    (root / "day 2" / "loop").symlink_to(root / "day 2", target_is_directory=True)
+    assert names_of(find_recordings([root])) == ["day 2/r9", "day 2/r10", "day 10/r1", "r3"]
+    again = find_recordings([root / "day 2", root / "day 10", root / "day 2" / "r9"])
+    assert names_of(again) == ["day 2/r9", "day 2/r10", "day 10/r1"]  # each once, below what both have in common
+    out = recordings_at(root / "out", "copy")
+    assert "out/copy" in names_of(find_recordings([root]))
+    assert "out/copy" not in names_of(find_recordings([root], leave_out=[out]))
+    assert names_of(find_recordings([root / "r3"])) == ["r3"]
+
+
+def test_no_folder_and_no_recording_are_told_apart(tmp_path):
+    with pytest.raises(RecordingError, match="no such folder"):
+        find_recordings([tmp_path / "nothing"])
+    with pytest.raises(RecordingError, match="no recording found"):
+        find_recordings([tmp_path])
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 8])
+def test_shards_give_every_recording_once(n, tmp_path):
+    recordings = [tmp_path / str(i) for i in range(n)]
+    parts = [Shard(i, 3).part(recordings) for i in (1, 2, 3)]
+    assert sorted(folder for part in parts for folder in part) == sorted(recordings)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def job(name, rig="given.h5", kind="recording", needs_rig=False):
+    return Job(kind, name, f"/{name}", f"/{name}/results", rig, BatchOptions(), needs_rig)
+
+
+@pytest.fixture
+def results():
+    return {}
+
+
+def queue_of(rigs, recordings, results):
+    return JobQueue(rigs, recordings, lambda job, result: results.__setitem__((job.kind, job.name), result))
+
+
+def test_a_job_survives_its_journey_as_text():
+    for options in (BatchOptions(), BatchOptions(window=0.25, diagnose=True, report=False)):
+        there = Job("rig", "a b", "/é", "/r", "/x", options, True, 3, 2, ("/1", "/2"))
+        assert Job.from_json(there.as_json()) == there
+
+
+def test_recordings_wait_for_their_rig_and_no_others_do(results):
+    jobs = queue_of(
+        [job("a", "shared.h5", "rig")],
+        [job("a", "shared.h5", needs_rig=True), job("b"), job("c", "shared.h5", needs_rig=True)],
+        results,
+    )
+    rig, b = jobs.next(), jobs.next()
+    assert (rig.kind, b.name, jobs.next()) == ("rig", "b", None)
+    jobs.finish(rig, GOOD)
+    assert [jobs.next().name, jobs.next().name] == ["a", "c"]
+    assert not jobs.finished
+
+
+def test_without_its_rig_a_recording_fails_with_the_rigs_reason_and_others_go_on(results):
+    jobs = queue_of([job("a", "shared.h5", "rig")], [job("a", "shared.h5", needs_rig=True), job("b")], results)
+    jobs.finish(jobs.next(), Result.failed("no corners found"))
+    assert "no corners found" in results["recording", "a"].record.reason
+    jobs.finish(jobs.next(), GOOD)
+    assert jobs.finished
+    assert results["recording", "b"].status == MEASURED
+
+
+def test_a_recording_at_which_another_batch_works_is_asked_for_again(results, monkeypatch):
+    monkeypatch.setattr("disctrack.batch.jobs.ASK_AGAIN", 0.02)
+    jobs = queue_of([], [job("a")], results)
+    jobs.finish(jobs.next(), Result(BUSY, Record(FAILED)))
+    assert jobs.next() is None
+    assert not jobs.finished
+    time.sleep(0.03)
+    jobs.finish(jobs.next(), GOOD)
+    assert jobs.finished
+    assert results["recording", "a"].status == MEASURED
+
+
+def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone(results):
+    jobs = queue_of([], [job("a"), job("b"), job("c")], results)
+    a, b = jobs.next(), jobs.next()
+    jobs.died(a, "killed")
+    c = jobs.next()
+    assert c.name == "c"
+    jobs.finish(c, GOOD)
+    assert jobs.next() is None  # b still runs
+    jobs.finish(b, GOOD)
+    assert jobs.next() == a
+    jobs.died(a, "killed")
+    assert jobs.finished
+    assert results["recording", "a"].record.reason == "twice, killed"
+    assert results["recording", "b"].status == MEASURED
+
+
+def test_reasons_are_one_line_and_say_what_to_do():
+    assert reason_of(RecordingError("a\n  b")) == "a b"
+    assert "-j" in reason_of(MemoryError())
+    assert reason_of(OSError(errno.EIO, "Input/output error", "x.png")) == "x.png: Input/output error."
+    assert "ZeroDivisionError" in reason_of(ZeroDivisionError("division by zero"))
+    assert "memory" in reason_of_death(-9)
+    assert "SIGSEGV" in reason_of_death(-signal.SIGSEGV, "said\n at last")
+    assert "exit code 3" in reason_of_death(3)
+
+
+_HOLD = """
+import fcntl, sys, time
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print(flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds a lock until it is killed; the lock's path, and the process."""
+    process = subprocess.Popen([sys.executable, "-c", _HOLD, tmp_path / "lock"], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"\n"
+    yield tmp_path / "lock", process
+    process.kill()
+    process.communicate()
+
+
+def test_a_lock_keeps_another_process_out_until_its_holder_is_killed(holder):
+    path, process = holder
+    with pytest.raises(Busy), locked(path):
+        pass
+    process.kill()
+    with locked(path, wait=5.0), pytest.raises(Busy), locked(path):  # what the killed one left does not count
+        pass
+    assert not path.exists()
+
+
+def test_a_disk_without_locks_is_locked_by_a_file_and_a_dead_holders_file_is_cleared(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(locks.fcntl, "flock", no_locks)
+    path, holder = tmp_path / "lock", tmp_path / "lock.holder"
+    with locked(path), pytest.raises(Busy), locked(path):
+        pass
+    assert not holder.exists()
+    host = os.uname().nodename
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    holder.write_text(f"{host} {dead.pid}\n")
+    with locked(path, wait=5.0):
+        assert holder.read_text() == f"{host} {os.getpid()}\n"
+    holder.write_text("another-host 1\n")  # who knows whether it lives
+    with pytest.raises(Busy), locked(path):
+        pass
+    old = time.time() - locks.SILENT_FOR - 1
+    os.utime(holder, (old, old))
+    with locked(path, wait=5.0):
+        pass

@@ -1,0 +1,247 @@
+"""Many recordings: each is measured once, none takes another down, and the summary tells of all."""
+
+import csv
+import json
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from disctrack.batch import BatchOptions, find_recordings, read_summary, run_batch
+from disctrack.batch import measure as stage
+from disctrack.batch.plan import Places, make_plan
+from disctrack.batch.records import read_record
+from disctrack.cli import main
+from disctrack.storage import read_trajectory
+from disctrack.whole_files import output_error
+
+FAST = ["--no-report"]
+MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
+
+
+def copy_of(recording: Path, folder: Path) -> Path:
+    """A recording of the same images as links: a test replaces files, and never writes into them."""
+    for file in recording.rglob("*"):
+        if file.is_file() and "results" not in file.relative_to(recording).parts:
+            target = folder / file.relative_to(recording)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.link(file, target)
+    return folder
+
+
+def replace(file: Path, content: bytes) -> None:
+    file.unlink()
+    file.write_bytes(content)
+
+
+def statuses(path: Path) -> dict[str, str]:
+    return {row["recording"]: row["status"] for row in read_summary(path)}
+
+
+def datasets(path: Path) -> dict[str, np.ndarray]:
+    """All numbers of a trajectory file."""
+    found = {}
+    with h5py.File(path) as file:
+        assert file.attrs["complete"] == 1
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def assert_same_result(path: Path, other: Path) -> None:
+    ours, theirs = datasets(path), datasets(other)
+    assert ours.keys() == theirs.keys()
+    for name, values in ours.items():
+        np.testing.assert_array_equal(values, theirs[name], err_msg=name)
+
+
+def jobs_of(folder: Path, **options):
+    found = find_recordings([folder])
+    return make_plan(Places(found, None), found.recordings, BatchOptions(report=False, **options)).recordings
+
+
+def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short_recording, tmp_path, capsys):
+    root = tmp_path / "day"
+    for name in ("r1", "r2", "r10", "spoilt"):
+        copy_of(short_recording, root / name)
+    copy_of(short_recording, root / "bad toml")
+    replace(root / "bad toml" / "recording.toml", b"x = = 3")
+    replace(root / "spoilt" / "left" / "000005.png", b"junk")
+    assert main(["batch", str(root), "-j", "2", *FAST, *MODEL]) == 1
+    said, errors = capsys.readouterr()
+    lines = said.splitlines()
+    assert [line.split()[:2] for line in lines[:5]] == [
+        ["failed", "bad"],
+        ["measured", "r1"],
+        ["measured", "r2"],
+        ["measured", "r10"],
+        ["measured", "spoilt"],
+    ]
+    assert "not valid TOML" in lines[0]
+    assert "000005.png" in lines[4]
+    assert "4 measured, 1 failed" in said
+    assert errors.count("\n") == 1  # no bar where stderr is no terminal
+    assert len(list((root / "batch_results" / "rigs").rglob("rig.h5"))) == 1
+
+    rows = {row["recording"]: row for row in read_summary(root / "batch_results" / "summary.json")}
+    with (root / "batch_results" / "summary.csv").open() as stream:
+        table = {row["recording"]: row for row in csv.DictReader(stream)}
+    assert list(table) == list(rows) == ["bad toml", "r1", "r2", "r10", "spoilt"]
+    for name, row in rows.items():
+        for column, value in row.items():
+            cell = table[name][column]
+            assert (cell == "") if value is None else (str(value) == cell), column
+    trajectory = read_trajectory(root / "r2" / "results" / "trajectory.h5")
+    assert rows["r2"]["pairs_measured"] == len(trajectory)
+    assert rows["r2"]["z_sigma_m"] == np.median(trajectory.coordinate_sigma[:, 2])
+    assert (root / "batch_results" / rows["r2"]["trajectory"]).samefile(root / "r2" / "results" / "trajectory.h5")
+    assert_same_result(root / "r1" / "results" / "trajectory.h5", root / "r10" / "results" / "trajectory.h5")
+    page = (root / "batch_results" / "index.html").read_text()
+    assert all(name in page for name in rows)
+
+    # the same command goes on where something was wrong, and nowhere else
+    kept = (root / "r1" / "results" / "trajectory.h5").stat().st_mtime_ns
+    replace(root / "bad toml" / "recording.toml", (root / "r1" / "recording.toml").read_bytes())
+    assert main(["batch", str(root), "-j", "1", *FAST, *MODEL]) == 3  # the spoilt image is still spoilt
+    assert (root / "r1" / "results" / "trajectory.h5").stat().st_mtime_ns == kept
+    again = statuses(root / "batch_results" / "summary.json")
+    assert again.pop("bad toml") == "measured"
+    assert set(again.values()) == {"skipped"}
+
+
+@pytest.fixture
+def one(recording):
+    """Job of the short recording with the given rig."""
+    (job,) = jobs_of(recording)
+    return job
+
+
+def test_what_counts_is_content_not_existence(one, recording):
+    assert stage.do(one).status == "measured"
+    results = recording / "results"
+    assert stage.do(one).status == "skipped"
+    (recording / "recording.toml").touch()
+    assert stage.do(one).status == "skipped"
+
+    image = cv2.imread(str(recording / "left" / "000003.png"), cv2.IMREAD_UNCHANGED)
+    before = read_record(results)
+    replace(recording / "left" / "000003.png", cv2.imencode(".png", image ^ 1)[1].tobytes())
+    assert stage.do(one).status == "measured"
+    assert read_record(results).numbers["input_sha256"] != before.numbers["input_sha256"]
+
+    toml = (recording / "recording.toml").read_text()
+    replace(recording / "recording.toml", toml.replace("mass_g = 209.69", "mass_g = 209.7").encode())
+    assert stage.do(one).status == "measured"
+    (wider,) = jobs_of(recording, window=0.4)
+    assert stage.do(wider).status == "measured"
+    assert stage.do(wider).status == "skipped"
+    (again,) = jobs_of(recording, window=0.4, overwrite=True)
+    assert stage.do(again).status == "measured"
+
+
+def test_a_file_of_unknown_origin_is_kept(one, recording):
+    foreign = recording / "results" / "trajectory.h5"
+    foreign.parent.mkdir()
+    foreign.write_bytes(b"years of work")
+    result = stage.do(one)
+    assert result.status == "failed"
+    assert "--overwrite" in result.record.reason
+    assert foreign.read_bytes() == b"years of work"
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_that_looks_whole(one, recording, monkeypatch):
+    def full(path, *_, **__):
+        raise output_error(path, OSError(28, "No space left on device"))
+
+    monkeypatch.setattr("disctrack.storage.write_whole", full)
+    result = stage.do(one)
+    assert result.status == "failed"
+    assert "disk is full" in result.record.reason
+    assert [file.name for file in (recording / "results").iterdir()] == ["batch.json"]
+    monkeypatch.undo()
+    assert stage.do(one).status == "measured"
+
+
+def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, recording, monkeypatch):
+    real = stage.measure
+
+    def after_the_last_images_went(*given, **options):
+        for camera in ("left", "right"):
+            for file in sorted((recording / camera).iterdir())[-4:]:
+                file.unlink()
+        return real(*given, **options)
+
+    monkeypatch.setattr(stage, "measure", after_the_last_images_went)
+    spoilt = stage.do(one)
+    assert spoilt.status == "measured"
+    assert spoilt.record.numbers["pairs_measured"] == 20
+    assert "8 images could not be read" in spoilt.record.reason
+    monkeypatch.undo()
+
+    for file in sorted((recording / "right").iterdir())[-2:]:
+        file.unlink()
+    failed = stage.do(one)
+    assert failed.status == "failed"
+    assert "left has 20 frames" in failed.record.reason
+    shutil.rmtree(recording)
+    assert "recording.toml" in stage.do(one).record.reason
+
+
+def test_an_unexpected_fault_of_one_is_its_own(recording, tmp_path, monkeypatch):
+    root = tmp_path / "day"
+    for name in ("a", "b"):
+        copy_of(recording, root / name)
+    real = stage.measure
+
+    def faulty(recording, *rest, **options):
+        if recording.folder.name == "a":
+            raise MemoryError
+        return real(recording, *rest, **options)
+
+    monkeypatch.setattr(stage, "measure", faulty)
+    a, b = (stage.do(job) for job in jobs_of(root))
+    assert (a.status, b.status) == ("failed", "measured")
+    assert "out of memory" in a.record.reason
+
+
+def test_the_summary_is_that_of_all_shards(recording, tmp_path):
+    root = tmp_path / "day"
+    for name in ("a", "b", "c"):
+        copy_of(recording, root / name)
+    options = ["batch", str(root), "-j", "1", *FAST]
+    summary = root / "batch_results" / "summary.json"
+    assert main([*options, "--shard", "2/2"]) == 0
+    assert statuses(summary) == {"a": "not measured", "b": "measured", "c": "not measured"}
+    assert main([*options, "--summary-only"]) == 1
+    assert main([*options, "--shard", "1/2"]) == 0
+    assert statuses(summary) == {"a": "measured", "b": "skipped", "c": "measured"}
+    assert main([*options, "--summary-only"]) == 0
+    (root / "c" / "results" / "trajectory.h5").unlink()
+    assert main([*options, "--summary-only"]) == 1
+    assert statuses(summary)["c"] == "not measured"
+
+
+@pytest.mark.parametrize("words", [["--shard", "0/3"], ["--shard", "4/3"], ["--shard", "x"], ["-j", "0"], []])
+def test_wrong_usage_is_told_apart_from_failure(words, tmp_path):
+    with pytest.raises(SystemExit) as stop:
+        main(["batch", *([str(tmp_path)] if words else []), *words])
+    assert stop.value.code == 2
+
+
+def test_nothing_to_measure_is_an_error(tmp_path, capsys):
+    assert main(["batch", str(tmp_path)]) == 1
+    assert "no recording found" in capsys.readouterr().err
+
+
+def test_results_may_go_elsewhere_and_the_recordings_stay_as_they_are(recording, tmp_path):
+    root, output = tmp_path / "day", tmp_path / "out"
+    copy_of(recording, root / "x" / "a")
+    before = sorted(root.rglob("*"))
+    outcome = run_batch([root], BatchOptions(report=False), output, side_by_side=1)
+    assert not outcome.failed
+    assert sorted(root.rglob("*")) == before
+    assert (output / "x" / "a" / "trajectory.h5").is_file()
+    assert json.loads((output / "summary.json").read_text())["counts"]["measured"] == 1
