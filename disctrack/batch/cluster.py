@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any
 
@@ -40,27 +41,21 @@ def connect(address: str) -> Any:
 
 def run_on_cluster(client: Any, jobs: JobQueue, share: Share) -> None:
     """Do all jobs on the cluster's workers, each in a process of its own there."""
-    import distributed
-
     pending: dict[Any, Job] = {}
     try:
         while not jobs.finished:
             while (job := jobs.next()) is not None:
-                key = f"{job.kind}-{job.name}-{time.monotonic_ns()}"
-                future = client.submit(run_alone, job.as_json(), key=key, pure=False, retries=RETRIES)
-                pending[future] = job
-            if not pending:
-                time.sleep(0.1)
-                continue
-            try:
-                ready = distributed.wait(list(pending), timeout=0.3, return_when="FIRST_COMPLETED").done
-            except (TimeoutError, distributed.TimeoutError):
-                _check_connection(client)
-                continue
+                key = f"{job.kind}-{job.name}-{time.monotonic_ns()}"  # a job that is tried again is another task
+                pending[client.submit(run_alone, job.as_json(), key=key, pure=False, retries=RETRIES)] = job
+            ready = [future for future in pending if future.done()]
             for future in ready:
                 _collect(jobs, pending.pop(future), future)
+            if not ready:
+                _check_connection(client)
+                time.sleep(0.1)
     finally:
-        client.cancel(list(pending), force=True)
+        with contextlib.suppress(Exception):  # the scheduler may have gone
+            client.cancel(list(pending), force=True)
 
 
 def _collect(jobs: JobQueue, job: Job, future: Any) -> None:

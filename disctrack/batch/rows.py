@@ -46,11 +46,11 @@ def analysed_numbers(analysis: Analysis) -> Numbers:
     numbers: Numbers = {}
     for name in ("n_energy", "n_theta", "n_psidot"):
         exponent = getattr(laws, name)
-        numbers[name] = _number(exponent.value)
-        numbers[f"{name}_sigma"] = _number(exponent.sigma)
+        numbers[name] = _number(exponent.value) if laws.determined else None
+        numbers[f"{name}_sigma"] = _number(exponent.sigma) if laws.determined else None
     return numbers | {
-        "t_f_s": _number(laws.t_f),
-        "t_f_sigma_s": _number(laws.t_f_sigma),
+        "t_f_s": _number(laws.t_f) if laws.determined else None,
+        "t_f_sigma_s": _number(laws.t_f_sigma) if laws.determined else None,
         "exponents_undetermined": laws.reason,
         "energy_loss_J": _number(energy.loss),
         "energy_loss_sigma_J": _number(np.hypot(energy.loss_sigma, energy.loss_sigma_calibration)),
