@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
@@ -22,6 +23,7 @@ from disctrack.storage import Provenance
 from disctrack.tracking import TrackingSettings, prepare, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
+Array = NDArray[np.float64]
 Progress = Callable[[int], None]
 
 
@@ -144,15 +146,18 @@ def measure(
         "acquisitions": tracking.acquisitions,
         **pairs.camera_headers(),
     }
-    trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start)
+    trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start, stamps)
     return Measurement(trajectory, tuple(unreadable), findings, seconds)
 
 
 _FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}
 
 
-def at_full_length(part: Trajectory, n: int, start: int) -> Trajectory:
-    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED."""
+def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | None = None) -> Trajectory:
+    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED.
+
+    timestamps (n,) [s] where the camera wrote them; otherwise frames are evenly spaced.
+    """
     length = len(part)
     if length == n:
         return part
@@ -164,7 +169,7 @@ def at_full_length(part: Trajectory, n: int, start: int) -> Trajectory:
             whole[field.name] = np.full((n, *value.shape[1:]), fill, value.dtype)
             whole[field.name][start : start + length] = value
     whole["frame"] = np.arange(n)
-    whole["time"] = np.arange(n) / part.frame_rate
+    whole["time"] = np.arange(n) / part.frame_rate if timestamps is None else np.array(timestamps, float)
     whole["time"][start : start + length] = part.time
     return dataclasses.replace(part, **whole)
 

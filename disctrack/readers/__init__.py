@@ -14,6 +14,7 @@ Frame = NDArray[np.uint8] | NDArray[np.uint16]
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
 MRAW_SUFFIXES = frozenset({".cih", ".cihx", ".mraw"})  # Photron
+CINE_SUFFIXES = frozenset({".cine", ".cin", ".cci"})  # Phantom
 HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
 
 # Suffixes of a format, the module that reads it, and its function (files, camera) -> FrameReader.
@@ -21,6 +22,7 @@ FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
     (IMAGE_SUFFIXES, "images", "open_images"),
     (VIDEO_SUFFIXES, "video", "open_video"),
     (MRAW_SUFFIXES, "mraw", "open_mraw"),
+    (CINE_SUFFIXES, "cine", "open_cine"),
     (HDF5_SUFFIXES, "hdf5", "open_hdf5"),
 )
 SUFFIXES = frozenset[str]().union(*(suffixes for suffixes, _, _ in FORMATS))

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+import numpy as np
+
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
 SAME_EXPOSURE = 0.01  # relative; the two cameras' clocks round to different ticks
+SAME_INSTANT = 0.05  # of a frame period
 SAME_TAKE_S = 600.0  # computers' clocks, and the time that saving one camera after the other takes
 
 
@@ -27,7 +30,9 @@ class CameraHeader:
     exposure: float | None  # [s]
     trigger: str  # trigger mode
     first_frame: int | None  # the camera's own number of frame 0; trigger modes differ in what is counted from
-    trigger_time: float | None  # [s] since 1970, UTC
+    first_time: float | None  # [s] from the trigger to frame 0, by the camera's clock
+    trigger_time: float | None  # [s] since 1970, UTC, by the camera's clock
+    locked_clock: bool  # to a common time signal (IRIG)
     recorded: datetime | None  # by the clock of the camera or its computer
     saturation: int  # largest grey value that a pixel can have
 
@@ -72,10 +77,12 @@ def check_headers(left: FrameReader, right: FrameReader, frame_rate: float, decl
     for camera, header in zip(CAMERAS, (ours, theirs), strict=True):
         if header is not None:
             _check_rate(header, camera, frame_rate, declared_in)
+    warnings = _stated_rates(left, right, frame_rate, declared_in)
     if ours is None or theirs is None:
-        return ()
+        return warnings
     _check_same_rate(ours, theirs)
-    return (*_first_frames(ours, theirs), *_exposures(ours, theirs), *_takes(ours, theirs))
+    doubts = (*_first_frames(ours, theirs), *_exposures(ours, theirs), *_takes(ours, theirs))
+    return (*warnings, *doubts, *_instants(left, right, ours, theirs))
 
 
 def _check_rate(header: CameraHeader, camera: str, frame_rate: float, declared_in: str) -> None:
@@ -84,6 +91,17 @@ def _check_rate(header: CameraHeader, camera: str, frame_rate: float, declared_i
             f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}, but the {camera} camera's frames were recorded "
             f"with {header.rate}, says {header.file}. Every velocity would be wrong by their ratio: correct that."
         )
+
+
+def _stated_rates(left: FrameReader, right: FrameReader, frame_rate: float, declared_in: str) -> tuple[str, ...]:
+    """Warnings where a file without a camera's header states another rate: it may be that of a player."""
+    return tuple(
+        f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}, the {camera} file states {reader.frame_rate:g} Hz"
+        for camera, reader in zip(CAMERAS, (left, right), strict=True)
+        if header_of(reader) is None
+        and reader.frame_rate is not None
+        and abs(reader.frame_rate - frame_rate) > RATE_ROUNDING_HZ
+    )
 
 
 def _check_same_rate(left: CameraHeader, right: CameraHeader) -> None:
@@ -134,3 +152,35 @@ def _takes(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
         f"the headers' dates lie {apart / 60:.0f} minutes apart: left {left.recorded:%Y-%m-%d %H:%M:%S}, right "
         f"{right.recorded:%Y-%m-%d %H:%M:%S}. Are both files of the same take?",
     )
+
+
+def _instants(left: FrameReader, right: FrameReader, ours: CameraHeader, theirs: CameraHeader) -> tuple[str, ...]:
+    """Compare the times of the frames: from each camera's trigger, or as they are where both clocks are locked."""
+    if ours.first_time is None or theirs.first_time is None or left.timestamps is None or right.timestamps is None:
+        return ()
+    n = min(len(left.timestamps), len(right.timestamps))
+    later = (theirs.first_time - ours.first_time) + (right.timestamps[:n] - left.timestamps[:n])
+    since = "the trigger"
+    if ours.locked_clock and theirs.locked_clock and ours.trigger_time and theirs.trigger_time:
+        later += theirs.trigger_time - ours.trigger_time
+        since = "the common clock"
+    period = 1.0 / ours.frame_rate
+    middle, spread = float(np.median(later)), float(np.ptp(later))
+    if abs(middle) > 0.5 * period:
+        raise RecordingError(
+            f"by the time stamps, counted from {since}, frame i of the right camera ({theirs.file}) was taken "
+            f"{1e6 * middle:.4g} us after frame i of the left one ({ours.file}); a frame lasts {1e6 * period:.4g} us. "
+            "Export the frames of the same instants, of the same take."
+        )
+    warnings = []
+    if abs(middle) > SAME_INSTANT * period:
+        warnings.append(
+            f"by the time stamps, the right camera's frames were taken {1e6 * middle:.3g} us after the left one's: the "
+            "cameras were not synchronised. The motion in between is in every pose"
+        )
+    if spread > SAME_INSTANT * period:
+        warnings.append(
+            f"by the time stamps, the time between a left frame and its right one changes by {1e6 * spread:.3g} us in "
+            "the recording: a camera lost frames, or each ran on a clock of its own"
+        )
+    return tuple(warnings)

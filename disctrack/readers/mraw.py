@@ -248,7 +248,9 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
         exposure=exposure,
         trigger=entries.text("Trigger Mode")[:40],
         first_frame=int(first) if re.fullmatch(r"-?[0-9]{1,15}", first) else None,
+        first_time=None,
         trigger_time=None,
+        locked_clock=False,
         recorded=_date(entries.text("Date"), entries.text("Time")),
         saturation=saturation,
     )

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack.cli import main
 from disctrack.storage import read_findings, read_trajectory
-from tests.oracles.camera_files import write_mraw
+from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]
 
@@ -66,6 +66,24 @@ def test_poses_do_not_depend_on_the_unit_of_grey(recording, from_png):
     assert_allclose(found.q, from_png.q, atol=0.05 * from_png.coordinate_sigma.min())
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+def test_poses_and_times_from_cine_are_those_from_png(recording, from_png, bits):
+    """Of 8 bit to the last bit, with the camera's own times; of 16 bit 257 times the grey values."""
+    for name in ("left", "right"):
+        images = grey_values(recording / name).astype(np.uint16) * (1 if bits == 8 else 257)
+        write_cine(recording / f"{name}.cine", images, bits, rate=1000, first_image=-5)
+    use_files(recording, "left.cine", "right.cine")
+    assert main(["run", str(recording), *QUICK]) == 0
+    found = recording / "results" / "trajectory.h5"
+    trajectory = read_trajectory(found)
+    if bits == 8:
+        assert_array_equal(trajectory.q, from_png.q)
+    else:  # as for 12 bit above
+        assert_allclose(trajectory.q, from_png.q, atol=0.05 * from_png.coordinate_sigma.min())
+    assert_allclose(trajectory.time, from_png.time, atol=2**-29)  # stamps have 2**-30 s
+    assert read_findings(found)["camera_headers"]["left"]["first_frame"] == -5
+
+
 def test_headers_that_contradict_the_recording_stop_it_before_any_work(recording, capsys):
     for name in ("left", "right"):
         write_mraw(recording / "raw" / name, grey_values(recording / name), 8, Record_Rate="2000")
@@ -86,3 +104,15 @@ def test_doubts_about_the_headers_are_told_and_kept(recording, capsys):
     assert main(["run", str(recording), *QUICK]) == 0
     assert "the cameras exposed for different times" in capsys.readouterr().out
     assert "left 50 us" in "".join(read_findings(recording / "results" / "trajectory.h5")["warnings"])
+
+
+def test_a_part_of_a_recording_keeps_the_time_of_every_frame(recording):
+    """Three frames were lost before the part that is measured: time goes on after it as before."""
+    times = np.delete(np.arange(27), [4, 5, 6]) / 1000
+    for name in ("left", "right"):
+        write_cine(recording / f"{name}.cine", grey_values(recording / name), 8, rate=1000, times=times)
+    use_files(recording, "left.cine", "right.cine")
+    assert main(["run", str(recording), *QUICK, "--frames", "6:16"]) == 0
+    found = read_trajectory(recording / "results" / "trajectory.h5")
+    assert_allclose(found.time, times, atol=2**-29)
+    assert found.measured.sum() == 10
