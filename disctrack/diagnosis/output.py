@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,9 +51,13 @@ def _separation(separation: Separation | None) -> dict[str, Any] | None:
     }
 
 
-def _effect(found: Found, result: DiscDiagnosis) -> dict[str, Any]:
-    diagnosis = result.diagnosis
-    apart = result.separated_by.get(found.candidate.name, {})
+def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None] | None = None) -> dict[str, Any]:
+    """One effect found, of any system.
+
+    after : fit of the enlarged model
+    apart : recordings that would separate the effect from its rivals, by their names
+    """
+    apart = apart or {}
     c = found.candidate
     return {
         "name": c.effect,
@@ -60,7 +65,7 @@ def _effect(found: Found, result: DiscDiagnosis) -> dict[str, Any]:
         "kind": c.kind,
         "title": c.title,
         "source": c.source,
-        "parameters": _parameters(c.quantities, diagnosis.after),
+        "parameters": _parameters(c.quantities, after),
         "class": [
             {
                 "name": r.candidate.name,
@@ -111,7 +116,8 @@ def _errors(errors: Errors | None) -> dict[str, Any] | None:
     }
 
 
-def _tried(tried: Tried) -> dict[str, Any]:
+def tried_json(tried: Tried) -> dict[str, Any]:
+    """What became of one candidate, of any system."""
     return {
         "name": tried.candidate.name,
         "kind": tried.candidate.kind,
@@ -149,7 +155,8 @@ def _learned(learned: Learned) -> dict[str, Any]:
 def as_json(result: DiscDiagnosis) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     diagnosis = result.diagnosis
-    effects = [_effect(f, result) for f in diagnosis.found]
+    apart = result.separated_by
+    effects = [effect_json(f, diagnosis.after, apart.get(f.candidate.name)) for f in diagnosis.found]
     return {
         "verdict": diagnosis.verdict,
         "sentence": result.sentence,
@@ -160,7 +167,7 @@ def as_json(result: DiscDiagnosis) -> dict[str, Any]:
         "after": (_errors(result.after) or {}) | {"parameters": _declared(result.after_fit)},
         "noise_variance_over_stated": _number(diagnosis.noise),
         "energy_J": result.energy,
-        "tried": [_tried(t) for t in diagnosis.tried],
+        "tried": [tried_json(t) for t in diagnosis.tried],
         "settings": vars(diagnosis.settings),
     }
 

@@ -35,6 +35,8 @@ class Settings:
     judged: int = 3  # of them, that also have to stand a free run
     train_fraction: float = TRAIN_FRACTION
     at_noise: float = 1.1  # reduced chi-square over the noise found in the data, up to which nothing is left
+    unexplained_share: float = UNEXPLAINED_SHARE
+    noise: float | None = None  # variance over that stated; None: from the residual's fast part
 
 
 @dataclass(frozen=True)
@@ -97,12 +99,15 @@ class Diagnosis:
     partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
 
 
-def diagnose(system: System, start: Values, settings: Settings | None = None) -> Diagnosis:
+def diagnose(
+    system: System, start: Values, settings: Settings | None = None, rows: NDArray[np.bool_] | None = None
+) -> Diagnosis:
     """Fit the base model, look for what it lacks, and say how sure that is.
 
     start : values of the base quantities from which Gauss-Newton converges
+    rows : (n,) samples of the fits that are judged by the others; the first part of the time, if not given
     """
-    return _Search(system, settings or Settings()).run(start)
+    return _Search(system, settings or Settings(), rows).run(start)
 
 
 def noise_variance(system: System, fit_: Fit) -> float:
@@ -121,9 +126,9 @@ def noise_variance(system: System, fit_: Fit) -> float:
 
 
 class _Search:
-    def __init__(self, system: System, settings: Settings) -> None:
+    def __init__(self, system: System, settings: Settings, rows: NDArray[np.bool_] | None = None) -> None:
         self.system, self.settings = system, settings
-        self.rows = training_rows(system, settings.train_fraction)
+        self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
         self.noise = 1.0
         self.refits: dict[str, Trial] = {}
 
@@ -131,7 +136,8 @@ class _Search:
         base = fit(self.system, self.system.base, start)
         if not base.converged:
             return self._refusal(base)
-        self.noise = max(noise_variance(self.system, base), 1e-12)
+        stated = self.settings.noise
+        self.noise = max(noise_variance(self.system, base) if stated is None else stated, 1e-12)
         current = Trial((), base, 0.0, self._held_out(base), 0.0)
         before = current
         linear = Linearisation(self.system, base, self.system.candidates)
@@ -157,7 +163,8 @@ class _Search:
             return True
         excess = [trial.fit.chi_square / self.noise - trial.fit.degrees_of_freedom for trial in (before, after)]
         free = [(t.held_out.chi_square / self.noise - t.held_out.expected) for t in (before, after) if t.held_out]
-        return excess[1] < UNEXPLAINED_SHARE * excess[0] and free[1] < UNEXPLAINED_SHARE * free[0]
+        share = self.settings.unexplained_share
+        return excess[1] < share * excess[0] and free[1] < share * free[0]
 
     def threshold(self, k: int) -> float:
         """Gain with k quantities that noise reaches with the allowed probability, over all candidates."""
