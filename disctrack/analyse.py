@@ -329,7 +329,8 @@ def _write_scaling(path: Path, scaling: Scaling) -> None:
 def _warnings(trajectory: Trajectory, motion: Motion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
     """What an experimenter should know before using the numbers, in plain words."""
     found = []
-    n, missing, unknown = len(motion), int((~motion.measured).sum()), int((~motion.known).sum())
+    asked = trajectory.looked_for
+    n, missing, unknown = (int(rows.sum()) for rows in (asked, asked & ~motion.measured, asked & ~motion.known))
     if missing:
         found.append(
             f"{missing} of {n} frames have no pose of their own; {missing - unknown} were bridged from their "

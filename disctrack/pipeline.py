@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
+from disctrack.first_pass import MotionSpan, find_motion
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, iter_pair_blocks
@@ -113,7 +114,9 @@ def measure(
     Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
     Raises TrackingError if the disc is found in no frame.
     """
+    settings = settings or TrackingSettings()
     unreadable: list[Unreadable] = []
+    rate = recording.frame_rate
 
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=threads):
@@ -123,15 +126,17 @@ def measure(
     stamps = pairs.left.timestamps
     prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
     began = time.perf_counter()
+    span = _span(pairs, rate, settings, threads)
+    progress(len(pairs) - (span.stop - span.start))
     tracking = track(
         read_blocks,
-        range(pairs.start, pairs.stop),
+        range(span.start, span.stop),
         rig,
         recording.disc,
-        recording.frame_rate,
+        rate,
         gravity=recording.gravity,
         settings=settings,
-        timestamps=None if stamps is None else stamps[pairs.start : pairs.stop],
+        timestamps=None if stamps is None else stamps[span.start : span.stop],
         progress=progress,
     )
     seconds = time.perf_counter() - began
@@ -144,10 +149,22 @@ def measure(
         "variance_factor": tracking.variance_factor,
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
+        "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),
     }
-    trajectory = at_full_length(tracking.trajectory, len(pairs.left), pairs.start, stamps)
+    trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
+    for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
+        trajectory.frame_status[still] = FrameStatus.STILL
     return Measurement(trajectory, tuple(unreadable), findings, seconds)
+
+
+def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:
+    """What is to be tracked of the pairs."""
+    if not settings.first_pass:
+        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame, as asked for")
+    if not (pairs.left.random_access and pairs.right.random_access):
+        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame: these files can only be read in order")
+    return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate, threads)
 
 
 _FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}

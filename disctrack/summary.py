@@ -41,6 +41,8 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
 def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> list[str]:
     """Frames measured and lost with the reasons, sigmas, reprojection error, warnings."""
     lines = [*_frame_lines(trajectory)]
+    if found := findings.get("first_pass"):
+        lines.append(_line("motion", f"{found['verdict']} (first pass, {found['looked_at']} pairs looked at)"))
     if trajectory.measured.any():
         lines += [
             _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
@@ -68,7 +70,7 @@ def _line(head: str, text: str) -> str:
 
 
 def _frame_lines(trajectory: Trajectory) -> Iterable[str]:
-    processed = trajectory.frame_status != FrameStatus.NOT_PROCESSED
+    processed = trajectory.looked_for
     measured = int(np.sum(trajectory.measured))
     of = f" of {len(trajectory)} frames" if not processed.all() else ""
     yield _line("frames", f"{measured} measured, {int(processed.sum()) - measured} lost{of}")

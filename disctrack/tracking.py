@@ -75,6 +75,7 @@ class TrackingSettings:
         False  # the rig within its own calibration covariance; hides a camera that moved, so not by default
     )
     reject_outliers: bool = True
+    first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (first_pass.py)
 
 
 @dataclass(frozen=True)

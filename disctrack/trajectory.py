@@ -25,11 +25,17 @@ class FrameStatus(IntEnum):
     NOT_CONVERGED = 4
     UNREADABLE = 5
     NOT_PROCESSED = 6
+    STILL = 7
 
     @property
     def has_pose(self) -> bool:
         """True where the pose is a number, perhaps with a large sigma."""
         return self in (FrameStatus.MEASURED, FrameStatus.ONE_CAMERA, FrameStatus.FEW_MARKERS)
+
+    @property
+    def looked_for(self) -> bool:
+        """True where a pose was looked for, found or not."""
+        return self not in (FrameStatus.NOT_PROCESSED, FrameStatus.STILL)
 
     @property
     def sentence(self) -> str:
@@ -45,6 +51,7 @@ _FRAME_SENTENCES = {
     FrameStatus.NOT_CONVERGED: "no pose fits the dots: two exchanged, or the rig does not belong to this recording",
     FrameStatus.UNREADABLE: "image file could not be read",
     FrameStatus.NOT_PROCESSED: "not processed",
+    FrameStatus.STILL: "left out: nothing moves before the start or after the end; --all measures them, too",
 }
 
 
@@ -88,6 +95,11 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def looked_for(self) -> NDArray[np.bool_]:
+        """(n,) True where a pose was looked for, found or not."""
+        return np.isin(self.frame_status, [int(status) for status in FrameStatus if status.looked_for])
 
     @property
     def measured(self) -> NDArray[np.bool_]:

@@ -18,6 +18,7 @@ from disctrack.errors import OutputError, RecordingError
 from disctrack.pipeline import ImagePairs, check_rig, measure, trajectory_provenance
 from disctrack.progress import progress_bar
 from disctrack.recording import Recording
+from disctrack.tracking import TrackingSettings
 from disctrack.trajectory import Trajectory
 from disctrack.whole_files import make_folder, output_error
 
@@ -33,12 +34,17 @@ class TrackOptions:
     figures: bool
     video: bool
     threads: int | None
+    frames: tuple[int | None, int | None]  # first and one past the last to measure, None for the recording's ends
+    settings: TrackingSettings
 
 
 def add_track_options(parser: argparse.ArgumentParser) -> None:
     """Options that `run` and `track` have in common."""
-    parser.add_argument("--frames", type=_frame_range, default=(None, None), metavar="A:B",
-                        help="measure frames A to B-1 only; the file keeps the recording's length")  # fmt: skip
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--frames", type=_frame_range, metavar="A:B",
+                      help="measure frames A to B-1, no others; the file keeps the recording's length")  # fmt: skip
+    part.add_argument("--all", action="store_true",
+                      help="measure every frame (default: not the rest before and after the motion)")  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace results of other inputs or settings")
     parser.add_argument("--csv", action="store_true", help="also write the trajectory as a table (mm, deg)")
     parser.add_argument("--no-figures", action="store_true", help="no pictures")
@@ -61,6 +67,8 @@ def track_options(arguments: argparse.Namespace) -> TrackOptions:
         not arguments.no_figures,
         not arguments.no_video,
         arguments.threads,
+        arguments.frames or (None, None),
+        TrackingSettings(first_pass=not (arguments.all or arguments.frames)),
     )
 
 
@@ -106,7 +114,7 @@ def track_into(
     lines = [f"{'recording':<13} {recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz"]
     trajectory, findings = None, {}
     if path.exists() and not options.overwrite:
-        if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, None)):
+        if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, options.settings)):
             raise OutputError(
                 f"{path}: exists, and is not the complete result of these images, settings and version. Keep it and "
                 "choose another place with -o, or replace it with --overwrite."
@@ -115,9 +123,9 @@ def track_into(
         lines.append(f"{'reused':<13} {path}: complete result of the same images, settings and version")
     if trajectory is None:
         with progress_bar("track", len(pairs), "pair") as advance:
-            measurement = measure(recording, rig, pairs, threads=options.threads, progress=advance)
+            measurement = measure(recording, rig, pairs, options.settings, options.threads, advance)
         trajectory, findings = measurement.trajectory, measurement.findings
-        provenance = trajectory_provenance(recording, rig, pairs, None)
+        provenance = trajectory_provenance(recording, rig, pairs, options.settings)
         storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, findings=findings)
         lines.append(summary.speed_line(len(pairs), measurement.seconds))
         fresh = True

@@ -28,8 +28,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     recording = read_recording(arguments.recording)
     folder = arguments.output or recording.folder / outputs.RESULTS
-    pairs = pipeline.open_pairs(recording, arguments.frames)
     options = outputs.track_options(arguments)
+    pairs = pipeline.open_pairs(recording, options.frames)
     outputs.check_writable(folder)
     if recording.rig_file is not None:
         rig_name = str(recording.rig_file)

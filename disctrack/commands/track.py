@@ -35,9 +35,9 @@ def run(arguments: argparse.Namespace) -> int:
             "or name the rig with --rig."
         )
     rig = read_rig(rig_file)
-    pairs = pipeline.open_pairs(recording, arguments.frames)
-    outputs.check_writable(path.parent)
     options = outputs.track_options(arguments)
+    pairs = pipeline.open_pairs(recording, options.frames)
+    outputs.check_writable(path.parent)
     lines, files, whole = outputs.track_into(path, recording, rig, str(rig_file), pairs, options)
     print("\n".join([*lines, *summary.file_lines([outputs.relative(file) for file in files])]))
     if not whole:

@@ -1,6 +1,7 @@
 """The commands on a real recording: one line runs the measurement, a second run reuses it, and the summary tells."""
 
 import csv
+import os
 import subprocess
 import sys
 import time
@@ -68,6 +69,53 @@ def test_track_takes_a_range_of_frames_and_keeps_the_length(recording, rig_file,
     assert (np.delete(trajectory.frame_status, range(5, 19)) == FrameStatus.NOT_PROCESSED).all()
     assert np.isnan(np.delete(trajectory.q, range(5, 19), axis=0)).all()
     assert_allclose(trajectory.time, np.arange(24) / trajectory.frame_rate, rtol=1e-12)
+
+
+@pytest.fixture
+def rested(recording) -> Path:
+    """The recording with 100 frames of rest before and after it: its first and its last pair, over and over.
+
+    It is said to be slow, so that the margin of 0.25 s is 50 frames.
+    """
+    toml = recording / "recording.toml"
+    toml.write_text(toml.read_text().replace("frame_rate_hz = 1000", "frame_rate_hz = 200"))
+    for camera in ("left", "right"):
+        folder = recording / camera
+        files = sorted(folder.iterdir())
+        for i, file in reversed(list(enumerate(files))):
+            file.rename(folder / f"{100 + i:06d}.png")
+        last = 100 + len(files)
+        for i in range(100):
+            os.link(folder / "000100.png", folder / f"{i:06d}.png")
+            os.link(folder / f"{last - 1:06d}.png", folder / f"{last + i:06d}.png")
+    return recording
+
+
+def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, capsys):
+    path = rested / "results" / "trajectory.h5"
+    assert main(["run", str(rested), *QUICK]) == 0
+    text = (rested / "results" / "summary.txt").read_text()
+    assert "rest in frames 0-" in text
+    assert "first pass" in text
+    trajectory = read_trajectory(path)
+    still = trajectory.frame_status == FrameStatus.STILL
+    assert len(trajectory) == 224
+    assert still[:25].all()
+    assert still[-25:].all()
+    assert (trajectory.frame_status[52:172] == FrameStatus.MEASURED).all()
+    assert np.isnan(trajectory.q[still]).all()
+    assert_allclose(trajectory.time, np.arange(224) / trajectory.frame_rate, rtol=1e-12)
+    assert main(["run", str(rested), *QUICK]) == 0
+    assert "reused" in capsys.readouterr().out
+    assert main(["run", str(rested), *QUICK, "--all"]) == 1  # another setting: kept unless told
+    assert main(["run", str(rested), *QUICK, "--all", "--overwrite"]) == 0
+    every = read_trajectory(path)
+    assert (every.frame_status == FrameStatus.MEASURED).all()
+    sigma = np.sqrt(np.diagonal(every.pose_covariance, axis1=1, axis2=2))
+    change = np.abs(every.q - trajectory.q)[~still]
+    assert (change[:, :3] < 0.5 * sigma[~still, :3]).all()  # noise laws measured on different frames
+    with pytest.raises(SystemExit):
+        main(["run", str(rested), "--all", "--frames", "0:5"])
 
 
 def test_the_result_does_not_depend_on_the_number_of_reading_threads(recording, tmp_path):

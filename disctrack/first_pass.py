@@ -1,0 +1,175 @@
+"""Where the motion of a recording starts and ends, from a few of its frames, before anything is measured.
+
+From each end of the recording, frames at intervals are held against the frame at that end until one differs: what lies
+before it, less a margin, is rest. Only the ends are looked at, so a recording that moves throughout costs eight pairs,
+and a pause in the middle stays. "Differs" means more than noise, a change of the light as a whole, or trembling below
+VIBRATION_PX: anything else counts as motion, a hand as well as the disc, so that doubt costs time and not data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.errors import RecordingError
+from disctrack.readers import FrameReader
+from disctrack.readers.blocks import default_threads
+
+Array = NDArray[np.float32]
+Pair = tuple[NDArray, NDArray]
+
+STRIDE = 16  # frames between two looks; irregular by JITTER, so that no turn of the disc comes back to every look
+JITTER = 5
+MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts below what can be seen
+MIN_SAVED = 0.1  # [s] of rest at an end that are worth leaving out
+THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
+MIN_PIXELS = 12  # of a quarter of the image's pixels: fewer are hot pixels or an insect
+VIBRATION_PX = 0.03  # a fan's trembling; motion shows from THRESHOLD times this on, summed since rest
+MIN_SIGMA = 0.3  # grey values: rounding, where the sensor's noise is below it
+NOISE_BINS = 16
+
+
+@dataclass(frozen=True)
+class MotionSpan:
+    """Frames start..stop-1 hold everything that moves, with a margin at either end."""
+
+    start: int
+    stop: int
+    looked_at: int  # pairs read for this
+    moves: bool  # False where no frame differs from the first: then nothing is left out
+    verdict: str
+
+
+class StillScene:
+    """One camera's view at rest, and how its pixels scatter without motion."""
+
+    def __init__(self, first: NDArray, second: NDArray) -> None:
+        self._mean = _reduced(first)
+        steep = np.hypot(cv2.Sobel(self._mean, -1, 1, 0, scale=0.125), cv2.Sobel(self._mean, -1, 0, 1, scale=0.125))
+        variance = _noise(self._mean, _reduced(second) - self._mean, steep)
+        tremble = 0.5 * VIBRATION_PX * steep  # the reduced image has half the pixels per side
+        self._weight = 1.0 / np.sqrt(variance + tremble**2)
+        self._centred = self._mean - self._mean.mean()
+        self._square = float(np.vdot(self._centred, self._centred)) or 1.0
+
+    def differs(self, image: NDArray) -> bool:
+        """True where more has changed than noise and the brightness of the whole."""
+        now = _reduced(image)
+        level = float(now.mean())
+        gain = float(np.vdot(self._centred, now)) / self._square
+        z = np.abs(now - level - gain * self._centred) * self._weight
+        return int(np.count_nonzero(z > THRESHOLD)) >= MIN_PIXELS
+
+
+def _reduced(image: NDArray) -> Array:
+    """Means of two by two pixels."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    whole = image[: 2 * height, : 2 * width].astype(np.float32)
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _noise(mean: Array, difference: Array, steep: Array) -> Array:
+    """Variance (h, w) of a difference of two reduced images at rest, read + gain * grey, from flat parts.
+
+    Medians, because the two images may already show motion; where things move, they move at edges.
+    """
+    flat = steep <= np.quantile(steep, 0.6)
+    grey, change = mean[flat], difference[flat]
+    change = change - np.median(change)
+    edges = np.quantile(grey, np.linspace(0, 1, NOISE_BINS + 1))
+    number = np.clip(np.searchsorted(edges, grey, side="right") - 1, 0, NOISE_BINS - 1)
+    levels, variances = [], []
+    for k in range(NOISE_BINS):
+        mine = number == k
+        if np.count_nonzero(mine) >= 50:
+            levels.append(float(grey[mine].mean()))
+            variances.append((1.4826 * float(np.median(np.abs(change[mine])))) ** 2)
+    read, gain = (float(np.mean(variances)) if variances else 0.0), 0.0
+    if len(levels) > 2 and np.ptp(levels) > 1.0:
+        gain, read = np.polyfit(levels, variances, 1)
+        if gain < 0:
+            read, gain = float(np.mean(variances)), 0.0
+    return np.maximum(read + gain * mean, MIN_SIGMA**2).astype(np.float32)
+
+
+def find_motion(
+    left: FrameReader,
+    right: FrameReader,
+    start: int,
+    stop: int,
+    frame_rate: float,
+    threads: int | None = None,
+) -> MotionSpan:
+    """The part of frames start..stop-1 in which something moves, with a margin of MARGIN seconds at either end.
+
+    Frames that cannot be read are passed over. Less than MIN_SAVED of rest at an end is not left out.
+    """
+    margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
+    looked: list[int] = []
+    if stop - start < 2 * margin:
+        return MotionSpan(start, stop, 0, True, "too short to leave anything out")
+    with ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="look") as pool:
+
+        def read(frames: list[int]) -> list[Pair | None]:
+            looked.extend(frames)
+            return list(pool.map(lambda frame: _read(left, right, frame), frames))
+
+        last_still = _last_still(read, start, stop, 1)
+        if last_still is None:
+            return MotionSpan(start, stop, len(looked), False, "nothing moves in the whole recording")
+        first_still = _last_still(read, stop - 1, start - 1, -1)
+    begin, end = last_still - margin, (stop - 1 if first_still is None else first_still) + margin + 1
+    worth = MIN_SAVED * frame_rate
+    begin = begin if begin - start >= worth else start
+    end = end if stop - end >= worth else stop
+    parts = [
+        *([f"rest in frames {start}-{begin - 1}"] if begin > start else []),
+        *([f"rest in frames {end}-{stop - 1}"] if end < stop else []),
+    ]
+    verdict = " and ".join(parts) if parts else "moves from end to end"
+    return MotionSpan(begin, end, len(looked), True, verdict)
+
+
+def _read(left: FrameReader, right: FrameReader, frame: int) -> Pair | None:
+    try:
+        return left.read(frame), right.read(frame)
+    except RecordingError:
+        return None
+
+
+def _last_still(read: Callable[[list[int]], list[Pair | None]], first: int, end: int, sign: int) -> int | None:
+    """Last frame, going from `first` towards `end`, that shows what the first shows; None where all do."""
+    scenes: tuple[StillScene, StillScene] | None = None
+    last = first
+    for frames in _looks(first, end, sign):
+        pairs = read(frames)
+        if scenes is None:
+            good = [pair for pair in pairs if pair is not None]
+            if len(good) < 2:
+                continue
+            scenes = StillScene(good[0][0], good[1][0]), StillScene(good[0][1], good[1][1])
+        for frame, pair in zip(frames, pairs, strict=True):
+            if pair is None:
+                continue
+            if any(scene.differs(image) for scene, image in zip(scenes, pair, strict=True)):
+                return last
+            last = frame
+    return None
+
+
+def _looks(first: int, end: int, sign: int) -> Iterator[list[int]]:
+    """Frames to look at, in growing batches: two neighbours, then one in STRIDE, the last before `end` included."""
+    yield [first, first + sign]
+    count = abs(end - first)
+    offsets = [STRIDE * i + (5 * i * i) % (2 * JITTER + 1) - JITTER for i in range(1, count // STRIDE + 1)]
+    offsets = [offset for offset in offsets if 1 < offset < count - 1] + [count - 1]
+    size = 2
+    while offsets:
+        yield [first + sign * offset for offset in offsets[:size]]
+        offsets = offsets[size:]
+        size = min(2 * size, 32)
