@@ -7,9 +7,9 @@ s and one pose per frame are fitted together; the poses are eliminated frame by 
     (sum_i C_i^T C_i - C_i^T P_i (P_i^T P_i)^-1 P_i^T C_i + prior^-1) ds = sum_i C_i^T (1 - P_i (...)^-1 P_i^T) r_i
 
 P, C: whitened Jacobians by the pose and by s. Priors: the rig's own covariance; DOT_SIGMA for every dot in the plane
-of the face. Gauge: moving or turning the whole pattern on the disc cannot be told from moving the disc, so the prior
-keeps the mean displacement and turn of the pattern at zero: the centre of mass is taken to lie where the declared
-pattern says; the cameras do not see it.
+of the face. Gauge: moving or turning the whole pattern on the disc cannot be told from moving the disc. The pattern is
+moved and turned to where the sum of the dots' displacements is smallest: if one dot is misprinted, the others stay
+where they were declared, and the centre of mass with them; the cameras do not see it.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def refine_as_built(
         if iteration == 0:
             before = after
         used = fits.used & ok[:, None, None]
-        normal, gradient = _shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
+        normal, gradient = shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
         # common errors: the data's information is bounded by what SYSTEMATIC_PX allows
         # dots that scatter more than the image noise alone makes them tell accordingly less
         scale = _information_scale(covariance, used) / max(1.0, after)
@@ -117,12 +117,14 @@ def refine_as_built(
             reduced_chi_square_before=before,
             reduced_chi_square_after=before,
         )
+    kept = declared_places_kept(disc, shift[N_RIG:].reshape(m, 2))
+    current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
     return AsBuilt(
         rig=replace(current_rig, covariance=rig_covariance),
         disc=current_disc,
-        marker_shift=_body_shift(shift, m),
+        marker_shift=kept,
         marker_shift_sigma=np.sqrt(np.diag(remaining)[N_RIG:]).reshape(m, 2),
         rig_shift_sigmas=in_sigmas,
         reduced_chi_square_before=before,
@@ -150,6 +152,29 @@ def _body_shift(shift: Array, m: int) -> Array:
     return np.column_stack([shift[N_RIG:].reshape(m, 2), np.zeros(m)])
 
 
+def declared_places_kept(disc: Disc, shift: Array) -> Array:
+    """Displacements (m, 3) that differ from `shift` (m, 2) by a displacement and a turn of the whole pattern only.
+
+    Of all these the one with the smallest sum of lengths: as many dots as possible stay where they were declared.
+    """
+    x, y = disc.marker_centres_body[:, :2].T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)  # (m, 2, 3)
+    scale = np.sqrt(np.mean(x * x + y * y))
+    motions[..., 2] /= scale
+    rest = shift
+    for _ in range(100):  # iteratively reweighted least squares; 1 nm keeps the weights finite
+        weight = 1.0 / np.maximum(np.linalg.norm(rest, axis=1), 1e-9)
+        weighted = motions * weight[:, None, None]
+        normal = np.einsum("kai,kaj->ij", weighted, motions)
+        new = shift - motions @ np.linalg.solve(normal, np.einsum("kai,ka->i", weighted, shift))
+        done = np.abs(new - rest).max() < 1e-10
+        rest = new
+        if done:
+            break
+    return np.column_stack([rest, np.zeros(len(rest))])
+
+
 def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:
     """Factor on the data's information: n frames of sigma count at most as (sigma / SYSTEMATIC_PX)^2 frames."""
     variance = float(np.median(0.5 * np.trace(covariance, axis1=-2, axis2=-1)[used]))
@@ -158,7 +183,7 @@ def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:
     return 1.0 / (1.0 + n / max(independent, 1e-9))
 
 
-def _shared_normal_equations(
+def shared_normal_equations(
     observed: Array,
     covariance: Array,
     used: NDArray[np.bool_],
@@ -167,8 +192,15 @@ def _shared_normal_equations(
     R: Array,
     t: Array,
     free: NDArray[np.bool_],
+    further: Array | None = None,
 ) -> tuple[Array, Array]:
-    size = int(free.sum())
+    """Normal matrix (k, k) and gradient (k,) of what the frames share, every frame's pose eliminated.
+
+    free : (30 + 2m,) which of RIG_PARAMETERS and of the dots' places are asked for; after them `further`,
+    (n, 2, m, 2, j) derivatives of the pixels by anything else, so that k = free.sum() + j
+    """
+    extra = np.zeros((*observed.shape, 0)) if further is None else further
+    size = int(free.sum()) + extra.shape[-1]
     normal, gradient = np.zeros((size, size)), np.zeros(size)
     m = disc.n_markers
     for block in np.array_split(np.arange(len(R)), max(1, len(R) // 256)):
@@ -185,7 +217,7 @@ def _shared_normal_equations(
         W = np.where(seen[..., None, None], whitening(np.where(seen[..., None, None], covariance[block], np.eye(2))), 0)
         r = (W @ np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None])[..., 0].reshape(len(block), -1)
         J = (W @ P).reshape(len(block), -1, 6)
-        S = (W @ C[..., free]).reshape(len(block), -1, size)
+        S = (W @ np.concatenate([C[..., free], extra[block]], axis=-1)).reshape(len(block), -1, size)
         JtJ = np.swapaxes(J, 1, 2) @ J + 1e-12 * np.eye(6)
         projected = S - J @ np.linalg.solve(JtJ, np.swapaxes(J, 1, 2) @ S)
         flat = projected.reshape(-1, size)

@@ -147,6 +147,7 @@ def measure(
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,
+        "noise_factor": tracking.noise_factor,
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
         "first_pass": dataclasses.asdict(span),

@@ -20,7 +20,7 @@ from calibration.camera import StereoRig
 from disctrack import _kernels as kernels
 from disctrack import frames
 from disctrack.acquisition import acquire, symmetry_order
-from disctrack.as_built import AsBuilt, refine_as_built
+from disctrack.as_built import MIN_MARKER_SHIFT, AsBuilt, refine_as_built
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.markers import (
@@ -34,6 +34,7 @@ from disctrack.markers import (
     normalised_maps,
 )
 from disctrack.pose import PoseFits, fit_poses
+from disctrack.shared_faults import SharedFaults, trimmed_reduced_chi_square, without_shared_faults
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -62,6 +63,7 @@ NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every th
 MIN_GOOD_DOT_IMAGES = 6
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 MIN_PAIRS_PER_WORKER = 200  # a stretch must outweigh its own search for the disc
+FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
 
@@ -87,7 +89,9 @@ class Tracking:
     blur_px: tuple[float, float]
     as_built: AsBuilt
     variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared;
-    # all covariances of the trajectory are multiplied by it (never by less than 1)
+    # the covariances of the poses are multiplied by it (never by less than 1)
+    noise_factor: float  # the same with cameras, dots and clock free (`shared_faults`): the dots' own scatter, by which
+    # their covariances are multiplied
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     warnings: tuple[str, ...]
 
@@ -406,6 +410,11 @@ def _assemble(
         refine_rig=settings.refine_rig,
         max_frames=SHARED_FRAMES,
     )
+    faults = without_shared_faults(
+        dots.pixels, dots.covariance_px2, first.rig, first.disc, tables.R, tables.t, max_frames=SHARED_FRAMES
+    )
+    if settings.refine_markers and faults is not None:
+        as_built = _without_false_shifts(as_built, first.disc, faults)
     fits = fit_poses(
         dots.pixels,
         dots.covariance_px2,
@@ -415,8 +424,9 @@ def _assemble(
         tables.t,
         reject_outliers=settings.reject_outliers,
     )
-    factor = max(1.0, _variance_factor(fits))
-    dots = replace(dots, covariance_px2=dots.covariance_px2 * factor)
+    factor = max(1.0, trimmed_reduced_chi_square(fits))
+    noise_factor = factor if faults is None else min(factor, max(1.0, faults.reduced_chi_square))
+    dots = replace(dots, covariance_px2=dots.covariance_px2 * noise_factor)
     fits = replace(fits, covariance=fits.covariance * factor, chi_square=fits.chi_square / factor)
     trajectory = _trajectory(dots, fits, tables, as_built, time, pairs, frame_rate, gravity)
     return Tracking(
@@ -425,19 +435,21 @@ def _assemble(
         blur_px=(first.blur[0], first.blur[1]),
         as_built=as_built,
         variance_factor=factor,
+        noise_factor=noise_factor,
         acquisitions=sum(f.acquisitions for f in followers),
-        warnings=_warnings(first, factor, trajectory),
+        warnings=_warnings(first, factor, noise_factor, trajectory),
     )
 
 
-def _variance_factor(fits: PoseFits) -> float:
-    """Mean reduced chi-square of the frames, without the twentieth that fits worst (smears, objects in view)."""
-    reduced = np.sort(fits.reduced_chi_square[fits.degrees_of_freedom >= 6])
-    if len(reduced) < 20:
-        return 1.0
-    kept = reduced[: int(0.95 * len(reduced))]
-    # the 5 % that are cut hold more than 5 % of the sum: 18 degrees of freedom lose 4 % of their mean
-    return float(kept.mean() / 0.96)
+def _without_false_shifts(as_built: AsBuilt, declared: Disc, faults: SharedFaults) -> AsBuilt:
+    """Where cameras and clock are wrong, dots refined alone would be moved to make up for that: take the joint ones."""
+    if not as_built.reduced_chi_square_after > FAULTY * max(1.0, faults.reduced_chi_square):
+        return as_built
+    shift = faults.marker_shift
+    if np.sqrt(np.mean(shift**2)) < MIN_MARKER_SHIFT:
+        shift = np.zeros_like(shift)
+    disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
+    return replace(as_built, disc=disc, marker_shift=shift, marker_shift_sigma=faults.marker_shift_sigma)
 
 
 def _trajectory(
@@ -496,7 +508,9 @@ def _table_gap(trajectory: Trajectory) -> Array:
     return z - trajectory.disc.resting_height(theta)
 
 
-def _warnings(follower: _Follower, variance_factor: float, trajectory: Trajectory) -> tuple[str, ...]:
+def _warnings(
+    follower: _Follower, variance_factor: float, noise_factor: float, trajectory: Trajectory
+) -> tuple[str, ...]:
     warnings = []
     one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
     if one > both:
@@ -510,10 +524,16 @@ def _warnings(follower: _Follower, variance_factor: float, trajectory: Trajector
             f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
             "multiples of that (its rate is not affected)"
         )
-    if variance_factor > 4.0:
+    if variance_factor > FAULTY * noise_factor:
         warnings.append(
-            f"the dots miss their fitted places by {np.sqrt(variance_factor):.1f} times what the image noise explains: "
-            "the calibration is off, or a camera moved or lags since, or the dots are not round"
+            f"the dots miss their fitted places by {np.sqrt(variance_factor / noise_factor):.1f} times their own "
+            "scatter: a camera moved, was refocused or lags since the calibration. disctrack diagnose tells which; "
+            "calibrate again, or check the synchronisation"
+        )
+    elif variance_factor > 4.0:
+        warnings.append(
+            f"the dots scatter {np.sqrt(variance_factor):.1f} times more than the image noise explains: they are not "
+            "round, or their edges are not sharp, or the images were processed"
         )
     gap = _table_gap(trajectory)
     if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:

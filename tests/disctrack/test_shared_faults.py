@@ -1,0 +1,89 @@
+"""Scatter of the dots apart from what all frames share: cameras, printed dots, clock."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import minimize
+
+from disctrack.as_built import declared_places_kept
+from disctrack.disc import MA_2014
+from disctrack.frames import rotation_from_quaternion
+from disctrack.scene import CameraFault, Faults
+from disctrack.shared_faults import without_shared_faults
+from tests.oracles.measured_disc import measured
+
+N = 160
+# relative scatter of chi-square with 18 degrees of freedom in N frames: sqrt(2 / 18 / N) = 2.6 %; four of these
+TOLERANCE = 0.105
+
+
+def judged(trajectory):
+    R = rotation_from_quaternion(trajectory.quaternion)
+    return without_shared_faults(
+        trajectory.markers_px,
+        trajectory.markers_covariance_px2,
+        trajectory.rig,
+        trajectory.disc,
+        R,
+        trajectory.q[:, :3],
+    )
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        Faults(),
+        Faults(right_delay_s=2.5e-4),
+        Faults(right=CameraFault(rotation_deg=(0.02, -0.01, 0.015), translation_mm=(0.1, 0.0, -0.1))),
+        Faults(left=CameraFault(focal_scale=1.004, k1_change=0.01)),
+    ],
+    ids=["none", "delay", "moved", "lens"],
+)
+def test_faulty_cameras_do_not_count_as_noise_and_move_no_dot(faults):
+    trajectory = measured(faults=faults, n=N)
+    loud = np.nanmedian(trajectory.reduced_chi_square)
+    found = judged(trajectory)
+    assert abs(found.reduced_chi_square - 1) < TOLERANCE
+    assert loud > 5 or faults == Faults()
+    assert np.abs(found.marker_shift[:, :2]).max() < 5 * found.marker_shift_sigma.max()
+    assert_allclose(found.delay, 1e3 * faults.right_delay_s, atol=0.02)
+
+
+def test_noise_of_the_dots_themselves_remains(rng):
+    trajectory = measured(n=N)
+    doubled = trajectory.markers_px + np.sqrt(3) * 0.006 * rng.standard_normal(trajectory.markers_px.shape)
+    assert_allclose(judged(replace(trajectory, markers_px=doubled)).reduced_chi_square, 4.0, rtol=TOLERANCE)
+
+
+def test_misprinted_dot_is_found_where_it_is_and_the_others_stay():
+    misprint = [(0.0, 0.0)] * 6
+    misprint[2] = (0.12, -0.08)
+    found = judged(measured(faults=Faults(misprint_mm=tuple(misprint)), n=N))
+    assert abs(found.reduced_chi_square - 1) < TOLERANCE
+    assert_allclose(1e3 * found.marker_shift[:, :2], misprint, atol=4e3 * found.marker_shift_sigma.max())
+
+
+def test_too_few_frames_give_no_judgement():
+    assert judged(measured(n=15)) is None
+
+
+def test_pattern_is_left_where_most_dots_say(rng):
+    shift = 2e-5 * rng.standard_normal((6, 2))
+    places = MA_2014.marker_centres_body[:, :2]
+
+    def moved(motion):
+        x, y = places.T
+        return shift - motion[:2] * 1e-5 - motion[2] * 1e-3 * np.column_stack([-y, x])
+
+    kept = declared_places_kept(MA_2014, shift)
+    best = minimize(
+        lambda motion: np.linalg.norm(moved(motion), axis=1).sum() * 1e5,
+        np.zeros(3),
+        method="Nelder-Mead",
+        options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 10_000, "maxfev": 10_000},
+    )
+    assert_allclose(kept[:, :2], moved(best.x), atol=2e-9)  # the sum of lengths is flat to 1e-10 there
+    turned = 1e-4 * np.column_stack([-places[:, 1], places[:, 0]]) + [3e-5, -1e-5]
+    assert_allclose(declared_places_kept(MA_2014, turned), 0.0, atol=2e-9)
