@@ -149,6 +149,7 @@ def measure(
         "variance_factor": tracking.variance_factor,
         "noise_factor": tracking.noise_factor,
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
+        "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),

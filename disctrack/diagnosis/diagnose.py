@@ -11,6 +11,7 @@ import numpy as np
 
 from disctrack.diagnosis.disc_errors import Errors, energy_balance, errors
 from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.dots import with_declared_dots
 from disctrack.diagnosis.enlarged import PAPER, declared_model, model_toml
 from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
@@ -20,7 +21,7 @@ from disctrack.diagnosis.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.separation import Separation, separations
 from disctrack.diagnosis.words import sentence
 from disctrack.errors import AnalysisError, OutputError
-from disctrack.storage import read_provenance, read_trajectory
+from disctrack.storage import read_findings, read_provenance, read_trajectory
 from disctrack.trajectory import Trajectory
 from disctrack.whole_files import write_whole
 
@@ -151,7 +152,8 @@ def run_diagnose(
     report = folder / "diagnosis.json"
     if report.exists() and not overwrite:
         raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
-    trajectory, provenance = read_trajectory(path), read_provenance(path)
+    provenance = read_provenance(path)
+    trajectory = with_declared_dots(read_trajectory(path), read_findings(path))
     try:
         result = diagnose_trajectory(trajectory, model)
     except AnalysisError as error:
