@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.camera import Array
 from calibration.corner_fit import CornerView, fit_view, local_axes
+from calibration.grey_levels import level_step
 
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
 MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
@@ -52,6 +53,9 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int]) -> CornerView |
     inner_corners : counts along the board's i and j; see `Board` for the order of the corners
     """
     grey, notes = grey_values(image)
+    step = level_step(grey)
+    if step > 1:  # an image whose values are multiples of a step is that image, whatever the step
+        grey = grey // step
     start = _rough_corners(_as_8_bit(grey), inner_corners)
     if start is None:
         columns, rows = inner_corners
@@ -71,13 +75,18 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int]) -> CornerView |
             f"(first reason: {next(r for r in view.reasons if r)})"
         )
     beyond = _larger_board(values, view, inner_corners)
-    return BoardNotFound(beyond) if beyond else replace(view, notes=notes)
+    if beyond:
+        return BoardNotFound(beyond)
+    noise = (view.noise[0] * step**2, view.noise[1] * step)
+    return replace(view, notes=notes, contrast=view.contrast * step, noise=noise)
 
 
 def _as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
     """Grey values stretched to 8 bit, for the rough search only."""
     if grey.dtype == np.uint8:
         return grey
+    if grey.dtype == np.uint16 and grey.max() < 256:
+        return grey.astype(np.uint8)
     low, high = np.percentile(grey, [0.5, 99.5])
     return np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.uint8)
 

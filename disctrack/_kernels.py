@@ -346,8 +346,9 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
-    noise (2,): variance = noise[0] + noise[1] grey; rim: radius of an edge about the plane's origin whose blur must
-    not reach the pixels used, nor that of `neighbours` (k, 2), the other dots' centres; scratch (SCRATCH_ROWS, N).
+    noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
+    about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
+    centres; scratch (SCRATCH_ROWS, N).
     p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (12,) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -387,13 +388,13 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
             p[LEVEL], p[SLOPE_X], p[SLOPE_Y] = outside, 0.0, 0.0
             p[CONTRAST] = 1.0 - inside / max(outside, 1e-6)
         dark = p[LEVEL] * (1.0 - p[CONTRAST])
-        if abs(p[LEVEL] - dark) < 4.0 * math.sqrt(max(noise[0] + noise[1] * max(p[LEVEL], dark), 0.1)):
+        if abs(p[LEVEL] - dark) < 4.0 * math.sqrt(max(noise[0] + noise[1] * max(p[LEVEL], dark), 0.1 * noise[2])):
             return LOW_CONTRAST
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(scratch[5, i] / p[SIGMA])
             expected = p[LEVEL] + (dark - p[LEVEL]) * s
-            scratch[5, i] = 1.0 / math.sqrt(max(noise[0] + noise[1] * expected, 1e-3))
+            scratch[5, i] = 1.0 / math.sqrt(max(noise[0] + noise[1] * expected, noise[2] / 12.0))
         px_per_unit = largest / abs(det)
         converged, chi2, n_clipped, worst = _descend(scratch, n, p, G, det, px_per_unit, radius, np.inf, M, rhs)
         if not converged:
@@ -661,7 +662,7 @@ def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, r
                  R_last, t_last, R_before, t_before, results, status, R_out, t_out, max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the two before by constant velocity and turn.
 
-    images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 2), limits (5,)
+    images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 3), limits (5,)
     for `judge_dot`. R_last ... t_before hold the last two poses and are updated. Filled: results (n, 2, m, 12), status
     (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was
     lost at that frame.

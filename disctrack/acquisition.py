@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import StereoRig, normalise, triangulate
+from calibration.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_vector
 from disctrack.pose import fit_poses, marker_pixels
@@ -44,7 +45,7 @@ def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
     A blob's pixels differ from the mean of their surroundings (so uneven light does not matter), and its area must be
     that of the ellipse with the same second moments.
     """
-    grey = np.asarray(image, np.float32)
+    grey = np.asarray(image, np.float32) / np.float32(level_step(image))  # images of any depth alike, to the last bit
     block = 2 * int(1.25 * expected_diameter_px) + 1
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     mean = cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE)

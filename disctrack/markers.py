@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import Camera, normalise, project
+from calibration.grey_levels import full_scale, level_step
 from disctrack import _kernels as kernels
 from disctrack.disc import Disc
 from disctrack.trajectory import MarkerStatus
@@ -37,15 +38,22 @@ class NoiseModel:
 
     read: float
     gain: float
+    step: float = 1.0  # between neighbouring grey values: 16 where 12 bits fill the upper end of 16
 
     def variance(self, grey: Array) -> Array:
-        """Variance [grey^2] at mean grey values of any shape; never below that of rounding, 1/12."""
-        return np.maximum(self.read + self.gain * np.asarray(grey, float), 1.0 / 12.0)
+        """Variance [grey^2] at mean grey values of any shape; never below that of rounding, step^2 / 12."""
+        return np.maximum(self.read + self.gain * np.asarray(grey, float), self.step**2 / 12.0)
 
     @property
     def parameters(self) -> Array:
-        """(read, gain)."""
-        return np.array([self.read, self.gain])
+        """(read, gain, step^2)."""
+        return np.array([self.read, self.gain, self.step**2])
+
+
+def typical_noise(image: Image) -> NoiseModel:
+    """Noise of an ordinary camera (50 electrons per grey value of 8 bits), where nothing was measured."""
+    grey = full_scale(image) / 255.0
+    return NoiseModel(grey**2, 0.02 * grey, float(level_step(image)))
 
 
 @dataclass(frozen=True)
@@ -115,7 +123,7 @@ def locate_on_disc(
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
     results = np.full((disc.n_markers, kernels.N_RESULT), np.nan)
     status = np.zeros(disc.n_markers, np.uint8)
-    noise = noise or NoiseModel(1.0, 0.02)
+    noise = noise or typical_noise(image)
     kernels.locate_dots(
         np.ascontiguousarray(image),
         map_x,
@@ -157,7 +165,7 @@ def locate_on_plane(
     H = np.broadcast_to(np.asarray(image_from_plane, float), (len(centres), 3, 3))
     height, width = image.shape
     map_x, map_y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    noise = noise or NoiseModel(1.0, 0.02)
+    noise = noise or typical_noise(image)
     limits = limits or TemplateLimits()
     results = np.full((len(centres), kernels.N_RESULT), np.nan)
     status = np.zeros(len(centres), np.uint8)
@@ -238,23 +246,24 @@ def measure_noise(
                 variances.append(residual @ residual / (len(v) - 3))
                 weights.append(len(v) - 3)
     if len(means) < 4:
-        return NoiseModel(1.0, 0.02)
+        return typical_noise(images[0])
+    step = float(level_step(images[0]))
     mean, variance, weight = np.array(means), np.array(variances), np.array(weights)
     bright = mean > 0.5 * (mean.min() + mean.max())
     keep = np.ones(len(mean), bool)
     for group in (bright, ~bright):
         if group.any():
             middle = np.median(variance[group])
-            spread = 1.4826 * np.median(np.abs(variance[group] - middle)) + 1e-9
+            spread = 1.4826 * np.median(np.abs(variance[group] - middle)) + 1e-9 * step**2
             keep[group] = np.abs(variance[group] - middle) < 4 * spread
     A = np.column_stack([np.ones(keep.sum()), mean[keep]])
     # a variance with f degrees of freedom scatters by sqrt(2 / f) of itself
-    w = np.sqrt(weight[keep] / 2) / np.maximum(variance[keep], 1e-3)
+    w = np.sqrt(weight[keep] / 2) / np.maximum(variance[keep], 1e-3 * step**2)
     read, gain = np.linalg.lstsq(A * w[:, None], variance[keep] * w, rcond=None)[0]
     if gain < 0:  # noise that does not grow with light: a constant says all
-        return NoiseModel(float(np.average(variance[keep], weights=weight[keep])), 0.0)
+        return NoiseModel(float(np.average(variance[keep], weights=weight[keep])), 0.0, step)
     # a negative intercept is a clipped black level: keep the law above it, `variance` holds the floor
-    return NoiseModel(float(read), float(gain))
+    return NoiseModel(float(read), float(gain), step)
 
 
 def _dot_windows(

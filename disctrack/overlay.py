@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.grey_levels import full_scale
 from disctrack.errors import OutputError
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -96,10 +97,10 @@ def _caption_strip(trajectory: Trajectory, row: int, width: int) -> ColourImage:
 
 
 def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
-    """For the eye only: 16-bit images are scaled to their own brightest value."""
+    """For the eye only: deep images are scaled from the full scale of their camera, so that brightness is steady."""
     if image.dtype == np.uint8:
         return image
-    return np.asarray(image * (255.0 / max(int(image.max()), 1)), np.uint8)
+    return np.asarray(image * (255.0 / full_scale(image)), np.uint8)
 
 
 def _caption(trajectory: Trajectory, row: int) -> list[str]:

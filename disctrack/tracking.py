@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calibration.camera import StereoRig
+from calibration.grey_levels import saturation_level
 from disctrack import _kernels as kernels
 from disctrack import frames
 from disctrack.acquisition import acquire, symmetry_order
@@ -32,6 +33,7 @@ from disctrack.markers import (
     face_edge,
     measure_noise,
     normalised_maps,
+    typical_noise,
 )
 from disctrack.pose import PoseFits, fit_poses
 from disctrack.shared_faults import SharedFaults, trimmed_reduced_chi_square, without_shared_faults
@@ -124,6 +126,7 @@ class _Follower:
     measured: bool = False  # blur and noise known
     acquisitions: int = 0
     first_reason: str = ""
+    saturated: tuple[int | None, int | None] = (None, None)  # grey value at which the dots' background is clipped
 
     def run(self, images: Images, readable: NDArray[np.bool_], tables: _Tables, at: slice) -> int:
         """Follow the disc through images; returns the number of frames before it was lost."""
@@ -251,7 +254,7 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
         1.0,
         1.0,
         zeros(2),
-        zeros((2, 2)),
+        zeros((2, 3)),
         zeros(5),
         *(np.eye(3), zeros(3), np.eye(3), zeros(3)),
         zeros((0, 2, 1, kernels.N_RESULT)),
@@ -363,6 +366,8 @@ def _measure_blur_and_noise(
                 follower.disc,
                 (follower.maps_x[camera], follower.maps_y[camera]),
             )
+        elif readable[:n, camera].any():
+            follower.noise[camera] = typical_noise(images[int(np.argmax(readable[:n, camera])), camera])
     for blur_known in (False, True):  # the second time with the blur of the first
         follower.start_from(pose, following)
         trial = _empty_tables(n, m)
@@ -385,7 +390,21 @@ def _measure_blur_and_noise(
                 (follower.maps_x[camera], follower.maps_y[camera]),
                 follower.blur[camera],
             )
+    follower.saturated = (
+        _saturated(images[:done, 0], trial.results[:done, 0], follower.noise[0]),
+        _saturated(images[:done, 1], trial.results[:done, 1], follower.noise[1]),
+    )
     follower.measured = True
+
+
+def _saturated(images: Images, results: Array, noise: NoiseModel) -> int | None:
+    """Grey value at which the background of the dots (n, m, 12) is clipped; None where it is not."""
+    saturation = saturation_level(images)
+    light = results[..., kernels.FIT_LEVEL]
+    if saturation is None or not np.isfinite(light).any():
+        return None
+    level = float(np.nanmedian(light))
+    return saturation if saturation - level < 3.0 * np.sqrt(noise.variance(np.array(level))) else None
 
 
 def _assemble(
@@ -524,6 +543,12 @@ def _warnings(
             f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
             "multiples of that (its rate is not affected)"
         )
+    for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
+        if saturation is not None:
+            warnings.append(
+                f"{camera} camera: the light round the dots is clipped at grey value {saturation}, which hides part of "
+                "their edges and of the noise: positions may be off by a micrometre. Expose for a shorter time"
+            )
     if variance_factor > FAULTY * noise_factor:
         warnings.append(
             f"the dots miss their fitted places by {np.sqrt(variance_factor / noise_factor):.1f} times their own "

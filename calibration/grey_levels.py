@@ -1,0 +1,49 @@
+"""What the grey values of an image can be: their step, their full scale, and where pixels saturate.
+
+A camera of 12 bits writes files of 16 bits, with the values as they are or shifted to the upper end; an 8-bit image may
+have been multiplied by 257. The step between neighbouring values is what rounding costs, and it is the unit in which
+images of any depth look alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Fewer different values than this may share a factor by chance.
+_ENOUGH_LEVELS = 16
+# At the saturation level pixels pile up: so many times more of them than at any of the levels just below.
+_PILE, _PILE_PIXELS, _LEVELS_BELOW = 8, 30, 8
+
+
+def level_step(image: NDArray) -> int:
+    """Largest whole number that divides all grey values of an image; 1 for 8-bit images and for those of few levels."""
+    if image.dtype != np.uint16:
+        return 1
+    values = np.flatnonzero(np.bincount(image.reshape(-1), minlength=2))
+    values = values[values > 0]
+    return int(np.gcd.reduce(values)) if len(values) >= _ENOUGH_LEVELS else 1
+
+
+def full_scale(image: NDArray) -> int:
+    """Largest grey value of the camera that took an image: of 8 bits, or of as few more as the image needs."""
+    if image.dtype == np.uint8:
+        return 255
+    step = level_step(image)
+    bits = max(8, int(image.max() // step).bit_length())
+    return step * (2**bits - 1)
+
+
+def saturation_level(images: NDArray) -> int | None:
+    """Grey value at which pixels saturate, where it shows: the largest, if it is full scale or pixels pile up there.
+
+    images : any shape, uint8 or uint16; several images of a recording together show it sooner. None where it does not
+    show: then nothing is clipped, or nearly nothing.
+    """
+    counts = np.bincount(np.asarray(images).reshape(-1))
+    levels = np.flatnonzero(counts)
+    if len(levels) < _ENOUGH_LEVELS or counts[-1] < _PILE_PIXELS:
+        return None
+    below = counts[levels[-1 - _LEVELS_BELOW : -1]]
+    found = levels[-1] == full_scale(images) or counts[-1] >= _PILE * int(below.max())
+    return int(levels[-1]) if found else None

@@ -1,0 +1,43 @@
+"""Grey values of any depth: their step, their full scale, saturation; corners do not depend on the unit of grey."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from calibration.chessboard import BoardNotFound, find_corners
+from calibration.grey_levels import full_scale, level_step, saturation_level
+from calibration.images import read_image
+
+
+@pytest.mark.parametrize(("bits", "step"), [(8, 1), (8, 16), (8, 257), (10, 64), (12, 1), (12, 16), (16, 1)])
+def test_step_and_full_scale_of_a_camera_are_found_from_its_grey_values(rng, bits, step):
+    light = rng.uniform(0.02, 0.7, (64, 64))  # of full scale
+    image = (step * np.rint(light * (2**bits - 1))).astype(np.uint16)
+    assert level_step(image) == step
+    assert full_scale(image) == step * (2**bits - 1)
+    assert level_step(image.astype(np.uint8)) == 1
+
+
+def test_images_of_few_values_have_no_step():
+    assert level_step(np.full((8, 8), 4000, np.uint16)) == 1
+    assert level_step(np.where(np.eye(8) > 0, 160, 4000).astype(np.uint16)) == 1
+
+
+@pytest.mark.parametrize(("dtype", "level"), [(np.uint8, 255), (np.uint16, 4095), (np.uint16, 3700)])
+def test_saturation_shows_where_pixels_are_clipped_and_only_there(rng, dtype, level):
+    light = rng.normal(0.9 * level, 0.03 * level, (200, 200))
+    light[:, :60] *= 0.2
+    assert saturation_level(np.rint(light * 0.8).astype(dtype)) is None
+    clipped = np.minimum(np.rint(light * 1.1), level).astype(dtype)
+    assert saturation_level(clipped) == level
+
+
+@pytest.mark.parametrize("scale", [3, 16, 257])
+def test_corners_do_not_depend_on_the_unit_of_grey(sample_clip, scale):
+    image = read_image(sample_clip / "calibration" / "left" / "03.png")
+    plain, scaled = find_corners(image, (9, 6)), find_corners(image.astype(np.uint16) * np.uint16(scale), (9, 6))
+    assert not isinstance(plain, BoardNotFound)
+    assert not isinstance(scaled, BoardNotFound)
+    assert_array_equal(scaled.points, plain.points)
+    assert_array_equal(scaled.covariance, plain.covariance)
+    assert_array_equal(scaled.contrast, plain.contrast * scale)
