@@ -1,0 +1,260 @@
+"""Published exponents as a system that the engine of `disctrack.diagnosis` can diagnose.
+
+A row is one exponent of one trial, cleared of what the exponents before it in the same trial foretell (Cholesky), so
+that all rows are independent with variance one. One more row per surface is the time that the last stage lasts: the
+paper's k_m is that with which its simulation collapses at the measured instant, which is all that k_m can say once
+another law acts beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.diagnosis import Candidate, Quantity
+from disctrack.diagnosis.disc_motion import SLIP, motion_candidates
+from disctrack.diagnosis.system import Values
+from disctrack.disc import MA_2014
+from disctrack.examples.exponent_model import LastStage, Reading, Setup
+from disctrack.published import SURFACES, published_table
+from disctrack.rolling import CATALOGUE, Model, effects
+
+Array = NDArray[np.float64]
+
+ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin
+DURATION_SIGMA = 0.03  # of ln duration: simulation and measurement of figures 17 and 18 end within 50 ms of 1.5 s
+SPIN = "state.omega3"  # at the start of the last stage; each series has its own
+SPIN_AT_REST = 0.97  # [rad/s] omega_3 at 8 deg when the centre stays at rest, h psidot sin(theta) / r
+SPIN_SIGMA = 2.0  # [rad/s]: the centre then runs on a circle of 1 mm
+K_M = {"steel": 0.381e-7, "glass": 0.28e-7}  # [m s^2] section 5c
+LONGEST = {"steel": 0.5, "glass": 0.3}  # [s] section 4a: time left where the fits of tables 2 and 3 begin
+LAST_STAGE = 1.5  # [s] simulated in section 5c
+STATED_T_F = 0.2e-3  # [s] accuracy that the paper states for t_f
+BRAKING = 0.02  # [s] in which the disc comes to rest on its paper, figure 10
+STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
+_SHARED = ("air", "body")  # modules of effects that do not depend on the surface
+
+
+@dataclass(frozen=True)
+class Series:
+    """Trials on one surface."""
+
+    setup: Setup
+    exponents: Array  # (n, 3) n_theta, n_psidot, n_energy
+    covariance: Array  # (3, 3) of one trial's
+    ln_duration: float  # of the last stage, at the start nutation of the setup
+
+    @property
+    def mean(self) -> Array:
+        """(3,) over the trials."""
+        return np.asarray(self.exponents.mean(axis=0), float)
+
+
+def sample_covariance(exponents: Array) -> Array:
+    """Covariance (k, k) of one trial, widened so that its inverse is unbiased (Hartlap, Simon & Schneider 2007).
+
+    With the sample covariance as it is, chi-square of n = 8 trials of three numbers would be 7/3 of what it should be.
+    """
+    n, k = exponents.shape
+    if n < k + 3:
+        raise ValueError(f"{n} trials of {k} numbers: their covariance needs {k + 3} or more")
+    return np.asarray(np.cov(exponents.T) * (n - 1) / (n - k - 2), float)
+
+
+def setup_of(surface: str) -> Setup:
+    """The paper's trials on "steel" or "glass"; simulated from the nutation that (5.11) has 1.5 s before the end."""
+    disc, k_m, g = MA_2014, K_M[surface], 9.81
+    start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * g / disc.radius ** (5 / 3)
+    return Setup(surface, k_m, LONGEST[surface], start=float(start), disc=disc, gravity=g)
+
+
+def series_of(setup: Setup, exponents: Array) -> Series:
+    """Trials with their own covariance; the duration is that of the paper's model."""
+    stage = LastStage(setup, {"km.k_m": setup.k_m}, SPIN_AT_REST)
+    return Series(setup, exponents, sample_covariance(exponents), float(np.log(stage.duration)))
+
+
+def published_series() -> tuple[Series, ...]:
+    """Tables 2 and 3."""
+    return tuple(series_of(setup_of(s), published_table(s).exponents[:, ORDER]) for s in SURFACES)
+
+
+def _reading_quantities() -> dict[str, tuple[str, Quantity]]:
+    """Measurement: attribute of `Reading` and quantity, by the name of the effect."""
+    wide = {
+        "t_f": ("t_f_bias", Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2)),
+        "cut": ("cut_shift", Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02)),
+        "theta_zero": ("theta_zero", Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05))),
+        "height_zero": ("height_zero", Quantity("height_zero.shift", "m", 1e-6, typical=2e-5)),
+        "attitude_noise": (
+            "attitude_variance",
+            Quantity("attitude_noise.variance", "rad^2", 1e-8, lower=0.0, typical=np.radians(0.05) ** 2),
+        ),
+        "smoothing": (
+            "smoothing_square",
+            Quantity("smoothing.square", "s^2", 1e-6, lower=0.0, upper=0.06**2, typical=0.01**2),
+        ),
+    }
+    return wide
+
+
+_READING = _reading_quantities()
+_TITLES = {
+    "t_f": ("the instant called t_f is not that of collapse", "section 4a"),
+    "cut": ("the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),
+    "theta_zero": ("zero of the nutation (plane of the table)", "section 3b: accuracy 0.05 deg"),
+    "height_zero": ("zero of the height (plane of the table)", "section 3b: accuracy 5 um"),
+    "attitude_noise": ("noise of the attitude, which central differences turn into bias", "section 3b"),
+    "smoothing": ("moving average over the record", "section 3b: 'a differential method'"),
+}
+
+
+def at(name: str, surface: str) -> str:
+    """Name of a quantity that each surface has for itself."""
+    return f"{name}@{surface}"
+
+
+def _per_surface(quantity: Quantity, surfaces: Sequence[str]) -> tuple[Quantity, ...]:
+    return tuple(replace(quantity, name=at(quantity.name, s)) for s in surfaces)
+
+
+def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = None) -> tuple[Candidate, ...]:
+    """Everything in the catalogue of motions, laws of the contact per surface; and what the reading may do wrong."""
+    found = []
+    for c in motion_candidates(Model(MA_2014, effects=(effects.effect_class("km").absent(),))):
+        shared = CATALOGUE[c.effect].__module__.rpartition(".")[2] in _SHARED and not c.threshold
+        quantities = c.quantities if shared else tuple(q for own in c.quantities for q in _per_surface(own, surfaces))
+        found.append(replace(c, quantities=quantities))
+    for name, (_, quantity) in _READING.items():
+        title, source = _TITLES[name]
+        found.append(Candidate(name, name, "measurement", title, source, (quantity,)))
+        if len(surfaces) > 1:
+            each = _per_surface(quantity, surfaces)
+            title = f"{title}, each surface its own"
+            found.append(Candidate(f"{name}_each", name, "measurement", title, source, each))
+    return tuple(c for c in found if names is None or c.name in names)
+
+
+class ExponentSystem:
+    """Several series of trials with their model, for the engine."""
+
+    def __init__(self, series: Sequence[Series], candidates: Sequence[str] | None = None) -> None:
+        """Candidates : names of those to look at; all if not given."""
+        self.series = tuple(series)
+        self.surfaces = tuple(dict.fromkeys(s.setup.surface for s in series))
+        self._candidates = exponent_candidates(self.surfaces, candidates)
+        self._stages: dict[tuple[object, ...], LastStage] = {}
+        owner, trial, number = [], [], []
+        for i, s in enumerate(self.series):
+            n = len(s.exponents)
+            owner += [i] * (3 * n + 1)
+            trial += [-1.0, *np.repeat((np.arange(n) + 0.5) / n, 3)]
+            number += [3, *np.tile(np.arange(3), n)]
+        # trials of all surfaces take turns, so that the first part of them holds a like share of each
+        order = np.lexsort((number, owner, trial))
+        self.owner, self.trial, self.number = (np.array(a)[order] for a in (owner, trial, number))
+        self.time = np.cumsum(np.concatenate([[0], (np.diff(self.trial) != 0) | (np.diff(self.owner) != 0)])) * 1.0
+        self.weights = np.ones(len(self.time))
+        self._whiten = [np.linalg.inv(np.linalg.cholesky(s.covariance)) for s in self.series]
+
+    @property
+    def base(self) -> tuple[Quantity, ...]:
+        """The paper's k_m and the spin, per surface."""
+        k_m = {
+            name: Quantity(name, "m s^2", 1e-3 * s.setup.k_m, lower=0.0, typical=s.setup.k_m)
+            for s in self.series
+            for name in [at("km.k_m", s.setup.surface)]
+        }
+        spin = [
+            Quantity(
+                at(SPIN, s.setup.surface + s.setup.label), "rad/s", 0.01, null=SPIN_AT_REST, prior_sigma=SPIN_SIGMA
+            )
+            for s in self.series
+        ]
+        return (*k_m.values(), *spin)
+
+    @property
+    def start(self) -> dict[str, float]:
+        """Values from which the base fit begins."""
+        return {q.name: q.null for q in self.base} | {at("km.k_m", s.setup.surface): s.setup.k_m for s in self.series}
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Effects that the model or the reading may lack."""
+        return self._candidates
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """Slip: friction coefficients that rolling would just exceed on every surface."""
+        return [(1 / mu,) * len(candidate.quantities) for mu in (0.05, 0.02)]
+
+    def outcomes(self, index: int, values: Values) -> Array:
+        """(4,) predicted means of one series: n_theta, n_psidot, n_energy, ln duration."""
+        return self._stage(index, values).outcomes(self._reading(index, values))
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """Whitened residual (n, 1) and derivative (n, 1, k) by central differences, one-sided at bounds."""
+        predicted = [self.outcomes(i, values) for i in range(len(self.series))]
+        residual = self._rows([self._data(i) - p for i, p in enumerate(predicted)])
+        known = {q.name: q for q in (*self.base, *(q for c in self._candidates for q in c.quantities))}
+        derivative = np.zeros((len(residual), len(names)))
+        for k, name in enumerate(names):
+            q, value = known[name], values.get(name, 0.0)
+            # central differences away from bounds: with large residuals their gradient decides about convergence
+            up, down = min(value + STEP * q.scale, q.upper), max(value - STEP * q.scale, q.lower)
+            ends = [dict(values) | {name: v} for v in (up, down)]
+            change = [
+                self.outcomes(i, ends[0]) - self.outcomes(i, ends[1]) if self._concerns(i, name) else np.zeros(4)
+                for i in range(len(self.series))
+            ]
+            derivative[:, k] = self._rows(change) / (up - down)
+        return residual[:, None], derivative[:, None]
+
+    def _data(self, index: int) -> Array:
+        """(n, 4) observed."""
+        s = self.series[index]
+        return np.column_stack([s.exponents, np.full(len(s.exponents), s.ln_duration)])
+
+    def _rows(self, differences: Sequence[Array]) -> Array:
+        """(n,) whitened rows from differences (n_trials, 4) or (4,) of each series."""
+        rows = np.zeros(len(self.time))
+        for i, (s, whiten) in enumerate(zip(self.series, self._whiten, strict=True)):
+            d = np.broadcast_to(differences[i], (len(s.exponents), 4))
+            rows[(self.owner == i) & (self.number < 3)] = (d[:, :3] @ whiten.T).ravel()
+            rows[(self.owner == i) & (self.number == 3)] = d[0, 3] / DURATION_SIGMA
+        return rows
+
+    def _concerns(self, index: int, name: str) -> bool:
+        plain, mark, owner = name.partition("@")
+        setup = self.series[index].setup
+        return not mark or owner == (setup.surface + setup.label if plain == SPIN else setup.surface)
+
+    def _own(self, index: int, values: Values) -> dict[str, float]:
+        """Values that one series sees, without the surface in their names; what both have adds up."""
+        own: dict[str, float] = {}
+        for name, value in values.items():
+            if self._concerns(index, name):
+                plain = name.partition("@")[0]
+                own[plain] = own.get(plain, 0.0) + value
+        return own
+
+    def _reading(self, index: int, values: Values) -> Reading:
+        own = self._own(index, values)
+        given = {field: own.get(q.name, 0.0) for field, q in _READING.values()}
+        assert set(given) == {f.name for f in fields(Reading)}
+        return Reading(**given)
+
+    def _stage(self, index: int, values: Values) -> LastStage:
+        own = self._own(index, values)
+        spin = own.pop(SPIN, SPIN_AT_REST)
+        inverse = own.pop(SLIP, 0.0)
+        reading = {q.name for _, q in _READING.values()}
+        laws = {name: value for name, value in own.items() if name not in reading and (value or name == "km.k_m")}
+        if inverse > 0:
+            laws["slip.mu"] = 1 / inverse
+        key = (index, spin, *sorted(laws.items()))
+        if key not in self._stages:
+            self._stages[key] = LastStage(self.series[index].setup, laws, spin)
+        return self._stages[key]
