@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,13 +102,15 @@ def calibrate_into(path: Path, source: CalibrationSource, overwrite: bool, figur
     lines = summary.calibration_lines(found, problems)
     with whole_file(path, suffix=".h5") as part:
         write_rig(part, found)
-        with h5py.File(part, "r+") as file:
+        buffer = io.BytesIO(part.read_bytes())  # a disk that fills up fails in one plain write, not inside HDF5
+        with h5py.File(buffer, "r+") as file:
             file.attrs["fingerprint"] = provenance.fingerprint
             file.attrs["inputs_sha256"] = json.dumps(dict(provenance.inputs))
             file.attrs["settings"] = json.dumps(dict(provenance.settings))
             file.attrs["software_version"] = provenance.version
             file.attrs["summary"] = json.dumps(lines)
             file.attrs["complete"] = 1
+        part.write_bytes(buffer.getbuffer())
     files = [path]
     if figures:
         from disctrack.calibration_plots import FIGURES

@@ -7,6 +7,7 @@ import errno
 import os
 import re
 import socket
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -57,6 +58,16 @@ def make_folder(folder: Path) -> None:
     """Create the folder and its parents. Raises OutputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(folder, error) from error
+
+
+def check_writable(folder: Path) -> None:
+    """Create the folder and a file in it for a moment: a long run must not end at the door. Raises OutputError."""
+    make_folder(folder)
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
     except OSError as error:
         raise output_error(folder, error) from error
 

@@ -7,9 +7,9 @@ import time
 from typing import Any
 
 from disctrack.batch.jobs import JobQueue, Share
-from disctrack.batch.measure import Result
 from disctrack.batch.plan import Job
 from disctrack.batch.processes import run_alone
+from disctrack.batch.records import Result
 from disctrack.errors import ClusterError
 
 CONNECT = 10.0  # [s]

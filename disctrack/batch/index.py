@@ -8,18 +8,40 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from disctrack.batch.reasons import reason_of
 from disctrack.whole_files import write_whole
 
 Row = dict[str, Any]
 
 
-def write_index(path: Path, rows: Sequence[Row]) -> None:
-    """Write the page. Raises OutputError."""
-    write_whole(path, page(rows).encode())
+def write_index(path: Path, rows: Sequence[Row], compare: bool) -> str:
+    """Write the page; with the comparison of repeats, if that is wanted, into `repeats` beside it.
+
+    returns : why there is no comparison although it was wanted; empty otherwise
+    Raises OutputError.
+    """
+    fragment, problem = _comparison(path.parent, rows) if compare else ("", "")
+    write_whole(path, page(rows, fragment).encode())
+    return problem
 
 
-def page(rows: Sequence[Row]) -> str:
-    """HTML that needs no other file but the reports that it links."""
+def _comparison(folder: Path, rows: Sequence[Row]) -> tuple[str, str]:
+    """The repeats as a part of the page, and what went wrong."""
+    trajectories = [folder / row["trajectory"] for row in rows if row["report"]]
+    if len(trajectories) < 2:
+        return "", ""
+    from disctrack import repeats  # draws figures: only where they are wanted
+    from disctrack.report import STYLE
+
+    try:
+        written = repeats.write(repeats.compare(trajectories), folder / "repeats")
+    except Exception as error:  # the single results are worth more than their comparison
+        return "", f"the repeats could not be compared: {reason_of(error)}"
+    return f"<style>{STYLE}</style>{written.fragment}", ""
+
+
+def page(rows: Sequence[Row], fragment: str = "") -> str:
+    """HTML that needs no other file but the reports that it links. fragment : HTML to end with"""
     done = [row for row in rows if row["pairs_measured"] is not None]
     pairs = sum(row["pairs_measured"] for row in done)
     said = (
@@ -31,7 +53,7 @@ def page(rows: Sequence[Row]) -> str:
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
         f"<body><main><h1>Batch of recordings</h1><p>{escape(said)}</p>{_problems(rows)}{_table(rows)}"
         '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
-        "</main></body></html>\n"
+        f"{fragment}</main></body></html>\n"
     )
 
 

@@ -6,8 +6,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from disctrack.batch.measure import BUSY, FAILED, Result
 from disctrack.batch.plan import Job
+from disctrack.batch.records import BUSY, FAILED, Result
 
 ASK_AGAIN = 0.3  # [s] whether another batch has finished with a recording
 

@@ -16,19 +16,21 @@ from calibration.rig_file import read_rig
 from disctrack import storage
 from disctrack.analyse import Analysis, analyse, run_analyse, write_analysis
 from disctrack.batch.locks import Busy, locked
+from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job
 from disctrack.batch.reasons import reason_of
 from disctrack.batch.records import (
+    BUSY,
     FAILED,
     MEASURED,
     SKIPPED,
     Record,
+    Result,
     is_done,
     read_record,
     stages_asked,
     write_record,
 )
-from disctrack.batch.rows import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.calibration_stage import calibrate_into, is_rig_of, source_of
 from disctrack.errors import AnalysisError, DiscTrackError, OutputError
 from disctrack.pipeline import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
@@ -40,30 +42,7 @@ from disctrack.whole_files import write_whole
 Progress = Callable[[float], None]  # is told the share of the job that is done
 
 LOCK = ".batch.lock"
-BUSY = "busy"  # another batch is at it
 _TRACKED = 0.5  # share of the progress after tracking
-
-
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """What became of a job: MEASURED, SKIPPED, FAILED or BUSY, and the record of a recording."""
-
-    status: str
-    record: Record
-
-    def as_dict(self) -> dict[str, Any]:
-        """Of JSON's types."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> Result:
-        """What `as_dict` gave."""
-        return cls(fields["status"], Record(**fields["record"]))
-
-    @classmethod
-    def failed(cls, reason: str, numbers: dict[str, Any] | None = None) -> Result:
-        """A failure with its reason."""
-        return cls(FAILED, Record(FAILED, reason, numbers=numbers or {}))
 
 
 def do(job: Job, progress: Progress = lambda share: None) -> Result:

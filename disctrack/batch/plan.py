@@ -15,7 +15,6 @@ from disctrack.batch.reasons import reason_of
 from disctrack.calibration_stage import source_of
 from disctrack.pipeline import open_pairs
 from disctrack.recording import Recording, read_recording
-from disctrack.scaling import WINDOW
 
 FOLDER = "batch_results"  # for what belongs to no single recording
 # Work in units of one tracked pair, from timings; it only sets how the progress bar is divided.
@@ -28,7 +27,7 @@ class BatchOptions:
 
     distortion: str = "auto"  # see CalibrationSettings
     board: str = "auto"
-    window: float = WINDOW  # [s] before t_f, for the exponents
+    window: float = 0.5  # [s] before t_f, for the exponents; as analyse has it
     circle: float = 0.6  # [s] before the end, for the circle through the contact
     report: bool = True  # report.html and figures of each recording
     diagnose: bool = False

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from disctrack.batch.jobs import JobQueue, Share
-from disctrack.batch.measure import Result
 from disctrack.batch.plan import Job
 from disctrack.batch.reasons import reason_of_death
+from disctrack.batch.records import Result
 
 # One thread each: side by side, more would wait for one another.
 ONE_THREAD = {

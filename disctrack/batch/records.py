@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,12 +10,13 @@ from typing import Any
 
 from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
-from disctrack.storage import is_result_of, read_provenance
+from disctrack.storage import read_provenance
 from disctrack.whole_files import write_whole
 
 RECORD = "batch.json"
 SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
 MEASURED, SKIPPED, FAILED, NOT_MEASURED = "measured", "skipped", "failed", "not measured"
+BUSY = "busy"  # another batch is at it
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,28 @@ class Record:
     stages: dict[str, Any] = field(default_factory=dict)  # what was made of the trajectory, with which settings
     files: dict[str, str] = field(default_factory=dict)  # what -> path relative to the record's folder
     numbers: dict[str, Any] = field(default_factory=dict)  # columns of the summary
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a job: MEASURED, SKIPPED, FAILED or BUSY, and the record of a recording."""
+
+    status: str
+    record: Record
+
+    def as_dict(self) -> dict[str, Any]:
+        """Of JSON's types."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> Result:
+        """What `as_dict` gave."""
+        return cls(fields["status"], Record(**fields["record"]))
+
+    @classmethod
+    def failed(cls, reason: str, numbers: dict[str, Any] | None = None) -> Result:
+        """A failure with its reason."""
+        return cls(FAILED, Record(FAILED, reason, numbers=numbers or {}))
 
 
 def stages_asked(options: BatchOptions) -> dict[str, Any]:
@@ -74,18 +98,3 @@ def is_done(folder: Path, record: Record | None, asked: dict[str, Any]) -> bool:
         return read_provenance(folder / record.files["trajectory"]).fingerprint == record.fingerprint
     except DiscTrackError:
         return False
-
-
-__all__ = [
-    "FAILED",
-    "MEASURED",
-    "NOT_MEASURED",
-    "RECORD",
-    "SKIPPED",
-    "Record",
-    "is_done",
-    "is_result_of",
-    "read_record",
-    "stages_asked",
-    "write_record",
-]

@@ -9,15 +9,15 @@ from pathlib import Path
 from tqdm import tqdm
 
 from disctrack.batch.cluster import connect, run_on_cluster
-from disctrack.batch.find import Found, find_recordings
+from disctrack.batch.find import find_recordings
 from disctrack.batch.jobs import JobQueue
-from disctrack.batch.measure import Result
-from disctrack.batch.plan import FOLDER, BatchOptions, Job, Places, Plan, Shard, make_plan, with_threads
+from disctrack.batch.plan import BatchOptions, Job, Places, Plan, Shard, make_plan, with_threads
 from disctrack.batch.processes import run_here
-from disctrack.batch.records import FAILED, NOT_MEASURED, Record
-from disctrack.batch.summary import Row, counts, line_of, write_summary
+from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
+from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
 from disctrack.errors import OutputError
 from disctrack.readers.blocks import default_threads
+from disctrack.whole_files import check_writable
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ def run_batch(
     client = connect(cluster) if cluster is not None else None  # before the work: a wrong address must be told at once
     try:
         places = _places(folders, output)
+        check_writable(places.common)
         mine = (shard or Shard()).part(places.found.recordings)
         plan = make_plan(places, mine, options)
         results = {name: Result.failed(reason) for name, reason in plan.failures.items()}
@@ -120,12 +121,11 @@ def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, clien
 def _summed_up(
     places: Places, mine: Sequence[Path], results: dict[str, Result], options: BatchOptions, interrupted: bool
 ) -> BatchOutcome:
-    from disctrack.batch.summary import rows_of
-
     problems = [f"not searched: {problem}" for problem in places.found.problems]
     files: tuple[Path, ...] = ()
     try:
-        rows, files = write_summary(places, places.found.recordings, results, options)
+        rows, files, wrong = write_summary(places, places.found.recordings, results, options)
+        problems += wrong
     except OutputError as error:  # the results themselves may be safe all the same
         problems.append(str(error))
         rows = rows_of(places, places.found.recordings, results)
@@ -163,7 +163,7 @@ class _Bar:
         self._share[key] = share
 
     def done(self, job: Job, result: Result) -> None:
-        if result.status in ("skipped", FAILED) and not self._bar.disable:
+        if result.status in (SKIPPED, FAILED) and not self._bar.disable:
             self._bar.total -= (1.0 - self._share.get((job.kind, job.name), 0.0)) * job.work
         else:
             self.share(job, 1.0)
@@ -175,6 +175,3 @@ class _Bar:
     def _tell(self) -> None:
         failed = f", {self._n_failed} failed" if self._n_failed else ""
         self._bar.set_postfix_str(f"{self._finished} of {self._n} recordings{failed}")
-
-
-__all__ = ["FOLDER", "BatchOutcome", "Found", "run_batch", "summarise_batch"]

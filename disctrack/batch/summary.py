@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import disctrack
-from disctrack.batch.locks import locked
-from disctrack.batch.measure import Result
+from disctrack.batch.columns import COLUMNS
+from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places, options_as_json
-from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
-from disctrack.batch.rows import COLUMNS
+from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
 from disctrack.errors import OutputError
 from disctrack.whole_files import write_whole
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
 _PATHS = ("trajectory", "report", "diagnosis_report")
-_WAIT = 60.0  # [s] for another process that writes the summary
+_WAIT = 300.0  # [s] for another process that writes the summary
 
 Row = dict[str, Any]
 
@@ -68,16 +68,16 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_summary(
     places: Places, recordings: Sequence[Path], results: Mapping[str, Result], options: BatchOptions
-) -> tuple[list[Row], tuple[Path, ...]]:
-    """Write summary.json, summary.csv and index.html; returns the rows and the files. Raises OutputError.
+) -> tuple[list[Row], tuple[Path, ...], tuple[str, ...]]:
+    """Write summary.json, summary.csv and index.html; returns the rows, the files, and what is wrong with them.
 
     Shards that end at the same time write one after the other, each with all that is on the disk by then: the last one
-    has everything.
+    has everything. Raises OutputError.
     """
     from disctrack.batch.index import write_index
 
     folder = places.common
-    with locked(folder / ".summary.lock", wait=_WAIT):
+    with _for_writing(folder):
         rows = rows_of(places, recordings, results)
         document = {
             "schema": SCHEMA,
@@ -91,8 +91,20 @@ def write_summary(
         }
         write_whole(folder / "summary.json", (json.dumps(document, indent=1) + "\n").encode())
         write_whole(folder / "summary.csv", _as_csv(rows).encode())
-        write_index(folder / "index.html", rows)
-    return rows, tuple(folder / name for name in ("summary.json", "summary.csv", "index.html"))
+        problem = write_index(folder / "index.html", rows, compare=options.report)
+    files = tuple(folder / name for name in ("summary.json", "summary.csv", "index.html"))
+    return rows, files, (problem,) if problem else ()
+
+
+@contextlib.contextmanager
+def _for_writing(folder: Path) -> Iterator[None]:
+    try:
+        with locked(folder / ".summary.lock", wait=_WAIT):
+            yield
+    except Busy as error:
+        raise OutputError(
+            f"{folder}: another process has been writing the summary for {_WAIT:g} s. Make it anew with --summary-only."
+        ) from error
 
 
 def read_summary(path: Path) -> list[Row]:

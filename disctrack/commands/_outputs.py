@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from disctrack.progress import progress_bar
 from disctrack.recording import Recording
 from disctrack.tracking import TrackingSettings
 from disctrack.trajectory import Trajectory
-from disctrack.whole_files import make_folder, output_error
+from disctrack.whole_files import check_writable as check_writable
 
 RESULTS = "results"
 
@@ -90,16 +89,6 @@ def _positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number above 0")
     return number
-
-
-def check_writable(folder: Path) -> None:
-    """Create the folder and a file in it for a moment: a long run must not end at the door. Raises OutputError."""
-    make_folder(folder)
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise output_error(folder, error) from error
 
 
 def track_into(

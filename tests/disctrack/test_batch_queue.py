@@ -13,10 +13,9 @@ from disctrack.batch import locks
 from disctrack.batch.find import find_recordings
 from disctrack.batch.jobs import JobQueue
 from disctrack.batch.locks import Busy, locked
-from disctrack.batch.measure import BUSY, Result
 from disctrack.batch.plan import BatchOptions, Job, Shard
 from disctrack.batch.reasons import reason_of, reason_of_death
-from disctrack.batch.records import FAILED, MEASURED, Record
+from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
 from disctrack.errors import RecordingError
 
 GOOD = Result(MEASURED, Record(MEASURED))

@@ -1,4 +1,4 @@
-"""One row of the summary per recording: what was measured, with sigmas, in SI units."""
+"""What was measured in one recording, with sigmas, in SI units: the numbers of its row in the summary."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ _K_M = "km.k_m"
 def tracked_numbers(trajectory: Trajectory) -> Numbers:
     """Pairs, misfit in the images and median sigmas; None where unknown."""
     rms = trajectory.reprojection_rms_px
-    processed = trajectory.frame_status != FrameStatus.NOT_PROCESSED
+    left_out = (FrameStatus.NOT_PROCESSED, FrameStatus.STILL)
+    processed = ~np.isin(trajectory.frame_status, left_out)
     numbers: Numbers = {
         "pairs": int(processed.sum()),
         "pairs_measured": int(trajectory.measured.sum()),
@@ -92,48 +93,3 @@ def _number(value: Any) -> float | None:
 def _median(values: Any) -> float | None:
     known = np.asarray(values)[np.isfinite(values)]
     return _number(np.median(known)) if known.size else None
-
-
-# Every column of the summary in order, and what it means.
-COLUMNS: dict[str, str] = {
-    "recording": "folder below the batch's, with slashes",
-    "name": "as recording.toml says",
-    "status": "measured, skipped (done already), failed, or not measured",
-    "reason": "why it failed, or what is missing although it was measured",
-    "pairs": "image pairs that were to be measured",
-    "pairs_measured": "pairs with a pose",
-    "duration_s": "from the first of them to the last",
-    "k_m_m_s2": "lever arm of the rolling friction per squared precession rate, fitted to the dots [m s^2]",
-    "k_m_sigma_m_s2": "its standard deviation",
-    "k_m_reduced_chi_square": "of that fit; far from 1, the model lacks something",
-    "k_m_undetermined": "why there is no k_m",
-    "n_energy": "exponent of the energy in t_f - t",
-    "n_energy_sigma": "",
-    "n_theta": "exponent of the nutation",
-    "n_theta_sigma": "",
-    "n_psidot": "exponent of the precession rate",
-    "n_psidot_sigma": "",
-    "t_f_s": "instant of collapse",
-    "t_f_sigma_s": "",
-    "exponents_undetermined": "why there are no exponents",
-    "energy_loss_J": "from the first frame to the last",
-    "energy_loss_sigma_J": "noise and calibration",
-    **{f"reprojection_rms_{camera}_px": "observed - projected dots" for camera in CAMERAS},
-    "reduced_chi_square": "of the poses, median of the frames",
-    **{f"{n}_sigma_{u}": "noise of one frame, median" for n, u in zip(COORDINATES, _UNITS, strict=True)},
-    **{
-        f"{n}_sigma_calibration_{u}": "from the rig, common to all frames"
-        for n, u in zip(COORDINATES, _UNITS, strict=True)
-    },
-    "diagnosis": "verdict, where a diagnosis was asked for",
-    "diagnosis_sentence": "",
-    "seconds": "that the measurement took",
-    "folder": "of the recording; this and the following paths are relative to the summary's folder",
-    "trajectory": "",
-    "report": "",
-    "diagnosis_report": "",
-    "rig": "",
-    "input_sha256": "of the images, the rig and their names in the result file",
-    "fingerprint": "of inputs, settings and version",
-    "version": "of disctrack that measured it",
-}

@@ -1,0 +1,49 @@
+"""The columns of the summary."""
+
+from disctrack.frames import CAMERAS, COORDINATES
+
+_UNITS = ("m",) * 3 + ("rad",) * 3
+
+# Every column of the summary in order, and what it means.
+COLUMNS: dict[str, str] = {
+    "recording": "folder below the batch's, with slashes",
+    "name": "as recording.toml says",
+    "status": "measured, skipped (done already), failed, or not measured",
+    "reason": "why it failed, or what is missing although it was measured",
+    "pairs": "image pairs that were to be measured, without the rest before and after the motion",
+    "pairs_measured": "pairs with a pose",
+    "duration_s": "from the first of them to the last",
+    "k_m_m_s2": "lever arm of the rolling friction per squared precession rate, fitted to the dots [m s^2]",
+    "k_m_sigma_m_s2": "its standard deviation",
+    "k_m_reduced_chi_square": "of that fit; far from 1, the model lacks something",
+    "k_m_undetermined": "why there is no k_m",
+    "n_energy": "exponent of the energy in t_f - t",
+    "n_energy_sigma": "",
+    "n_theta": "exponent of the nutation",
+    "n_theta_sigma": "",
+    "n_psidot": "exponent of the precession rate",
+    "n_psidot_sigma": "",
+    "t_f_s": "instant of collapse",
+    "t_f_sigma_s": "",
+    "exponents_undetermined": "why there are no exponents",
+    "energy_loss_J": "from the first frame to the last",
+    "energy_loss_sigma_J": "noise and calibration",
+    **{f"reprojection_rms_{camera}_px": "observed - projected dots" for camera in CAMERAS},
+    "reduced_chi_square": "of the poses, median of the frames",
+    **{f"{n}_sigma_{u}": "noise of one frame, median" for n, u in zip(COORDINATES, _UNITS, strict=True)},
+    **{
+        f"{n}_sigma_calibration_{u}": "from the rig, common to all frames"
+        for n, u in zip(COORDINATES, _UNITS, strict=True)
+    },
+    "diagnosis": "verdict, where a diagnosis was asked for",
+    "diagnosis_sentence": "",
+    "seconds": "that the measurement took",
+    "folder": "of the recording; this and the following paths are relative to the summary's folder",
+    "trajectory": "",
+    "report": "",
+    "diagnosis_report": "",
+    "rig": "",
+    "input_sha256": "of the images, the rig and their names in the result file",
+    "fingerprint": "of inputs, settings and version",
+    "version": "of disctrack that measured it",
+}

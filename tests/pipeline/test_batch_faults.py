@@ -1,0 +1,188 @@
+"""What may go wrong with the processes of a batch: killed, interrupted, doubled, lost with their machine."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from disctrack.batch import BatchOptions, find_recordings, processes, run_batch
+from disctrack.batch.locks import locked
+from disctrack.batch.measure import LOCK, do
+from disctrack.batch.plan import Places, make_plan
+from disctrack.batch.records import MEASURED, is_done, read_record
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+NAMES = ("a", "b")
+PATIENCE = 120.0  # [s] on a busy machine
+
+
+@pytest.fixture
+def day(recording, tmp_path) -> Path:
+    """A folder with two recordings of one rig."""
+    return a_day(recording, tmp_path / "day")
+
+
+def a_day(recording: Path, root: Path) -> Path:
+    for name in NAMES:
+        for file in recording.rglob("*.*"):
+            target = root / name / file.relative_to(recording)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.link(file, target)
+    return root
+
+
+def start(root: Path, *words: str) -> subprocess.Popen:
+    """`disctrack batch` in a process group of its own."""
+    command = [sys.executable, "-m", "disctrack", "batch", str(root), "--no-report", "-j", "2", *words]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=REPOSITORY, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+
+
+def wait_until(condition, process=None) -> None:
+    until = time.monotonic() + PATIENCE
+    while not condition() and (process is None or process.poll() is None):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def begun(root: Path) -> bool:
+    return any((root / name / "results" / LOCK).exists() for name in NAMES)
+
+
+def numbers(path: Path) -> dict[str, np.ndarray]:
+    found = {}
+    with h5py.File(path) as file:
+        assert file.attrs["complete"] == 1
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def assert_whole(root: Path, reference: Path) -> int:
+    """Whatever has the name of a result is one, equal to that of an undisturbed run; returns how many are finished."""
+    expected = numbers(reference / "a" / "results" / "trajectory.h5")
+    finished = 0
+    for name in NAMES:
+        results = root / name / "results"
+        with locked(results / LOCK, wait=PATIENCE):  # its process has ended, too
+            there = [file for file in results.rglob("*") if file.is_file() and ".part" not in file.name]
+        for file in there:
+            if file.suffix == ".h5":
+                for key, values in numbers(file).items():  # groups of later stages may not be there yet
+                    np.testing.assert_array_equal(values, expected[key], err_msg=key)
+            elif file.suffix == ".json":
+                json.loads(file.read_text())
+            else:
+                assert file.name == LOCK
+        record = read_record(results)
+        if record is not None:
+            assert record.status == MEASURED
+            assert is_done(results, record, {"report": False})
+            assert numbers(results / "trajectory.h5").keys() == expected.keys()
+            finished += 1
+    return finished
+
+
+@pytest.fixture
+def undisturbed(recording, tmp_path) -> Path:
+    """The same day, measured without a fault, in this process."""
+    root = a_day(recording, tmp_path / "undisturbed")
+    found = find_recordings([root / "a"])
+    (job,) = make_plan(Places(found, None), found.recordings, BatchOptions(report=False)).recordings
+    assert do(job).status == MEASURED
+    return root
+
+
+def kill_at_random_instants(
+    recording: Path, tmp_path: Path, undisturbed: Path, kills: int, duration: float
+) -> dict[int, int]:
+    """Kill batches until `kills` have died in mid-run, some several times, and complete the last one.
+
+    duration : [s] from the first recording's begin in which the kills fall
+    returns : how often how many recordings were finished at the kill
+    """
+    chance = random.Random(17)
+    died: dict[int, int] = {}
+    finished, root, tree = len(NAMES), tmp_path, 0
+    while sum(died.values()) < kills or finished < len(NAMES):
+        if finished == len(NAMES):
+            tree += 1
+            root = a_day(recording, tmp_path / f"tree {tree}")
+        process = start(root)
+        if sum(died.values()) < kills:
+            wait_until(lambda root=root: begun(root), process)
+            time.sleep(chance.uniform(0, duration))
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+        process.communicate(timeout=PATIENCE)
+        finished = assert_whole(root, undisturbed)
+        if process.returncode == -signal.SIGKILL:
+            died[finished] = died.get(finished, 0) + 1
+        else:
+            assert process.returncode == 0
+            assert finished == len(NAMES)
+            assert not list(root.rglob("*.part*"))  # those that killed processes left are cleared away
+    return died
+
+
+def test_a_batch_killed_at_a_random_instant_leaves_only_whole_results_and_can_go_on(recording, tmp_path, undisturbed):
+    assert sum(kill_at_random_instants(recording, tmp_path, undisturbed, kills=1, duration=1.0).values()) == 1
+
+
+@pytest.mark.slow
+def test_a_batch_killed_at_fifty_instants_leaves_only_whole_results_and_can_go_on(recording, tmp_path, undisturbed):
+    process = start(a_day(recording, tmp_path / "timed"))
+    wait_until(lambda: begun(tmp_path / "timed"), process)
+    began = time.monotonic()
+    process.communicate()
+    died = kill_at_random_instants(recording, tmp_path, undisturbed, 50, time.monotonic() - began)
+    print(f"finished recordings at the kill: {dict(sorted(died.items()))}")
+    assert sum(died.values()) == 50
+    assert len(died) > 1  # kills fell into different stages of a batch
+
+
+def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(day):
+    process = start(day)
+    wait_until(lambda: begun(day), process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes
+    said, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert "interrupted before it was done" in said
+    assert errors.splitlines()[-1].startswith("disctrack: interrupted")
+    assert "Traceback" not in errors
+    assert not [file for file in day.rglob("*") if ".part" in file.name or file.name == LOCK]
+    statuses = json.loads((day / "batch_results" / "summary.json").read_text())["counts"]
+    assert statuses["not measured"] > 0
+
+
+def test_a_killed_worker_is_tried_again_and_a_deadly_recording_fails_alone(day, monkeypatch):
+    begin, deaths = processes.Worker.begin, {"a": 2, "b": 1}  # how often the process is killed
+
+    def deadly(self, job):
+        begin(self, job)
+        if deaths[job.name]:
+            deaths[job.name] -= 1
+            self._process.kill()
+
+    monkeypatch.setattr(processes.Worker, "begin", deadly)
+    outcome = run_batch([day], BatchOptions(report=False), side_by_side=2)
+    a, b = outcome.rows
+    assert (a["status"], b["status"]) == ("failed", "measured")
+    assert "twice" in a["reason"]
+    assert "killed (signal 9)" in a["reason"]
+
+
+def test_two_batches_on_one_folder_measure_each_recording_once(day):
+    both = [start(day), start(day)]
+    said = [process.communicate(timeout=PATIENCE) for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    words = [line.split()[:2] for output, _ in said for line in output.splitlines()[: len(NAMES)]]
+    assert sorted(words) == [["measured", "a"], ["measured", "b"], ["skipped", "a"], ["skipped", "b"]]
+    assert json.loads((day / "batch_results" / "summary.json").read_text())["counts"]["failed"] == 0
