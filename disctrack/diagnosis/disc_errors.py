@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from disctrack.diagnosis.disc_motion import state_of
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.fit import Fit
 from disctrack.diagnosis.held_out import HeldOut
 from disctrack.diagnosis.system import Values
 from disctrack.diagnosis.whiteness import Whiteness, whiteness
 from disctrack.frames import euler_jacobian, nodal_axes_world
-from disctrack.rolling import Motion, State, simulate
+from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_power, kinematics
 
 Array = NDArray[np.float64]
@@ -116,8 +117,7 @@ def simulated(system: DiscSystem, values: Values) -> Motion:
     """The fitted motion with forces, moments and energies, at the instants of the frames."""
     rate = 1.0 + values.get("frame_rate.change", 0.0)
     times = system.start_time + (system.time - system.start_time) / rate
-    state = State(**{k.partition(".")[2]: v for k, v in values.items() if k.startswith("state.")})
-    return simulate(system.model_with(values), state, times=times)
+    return simulate(system.model_with(values), state_of(values), times=times)
 
 
 def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from disctrack.diagnosis.system import Candidate, Quantity
-from disctrack.rolling import CATALOGUE, Effect, Model, Parameter
+from disctrack.diagnosis.system import Candidate, Quantity, Values
+from disctrack.rolling import CATALOGUE, Effect, Model, Parameter, State
 from disctrack.rolling.effects import FORMULAS
 
 # Parameters of one effect that act so differently that each part is a question of its own.
@@ -25,6 +25,22 @@ def state_quantities() -> tuple[Quantity, ...]:
         Quantity(f"state.{name}", _STATE_UNITS[name], scale, meaning="at the first instant")
         for name, scale in STATE_SCALES.items()
     )
+
+
+def state_of(values: Values) -> State:
+    """Initial state among the values; with v_x, v_y the disc may slip at first."""
+    return State(**{k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")})
+
+
+SLIP_VELOCITY = ("state.v_x", "state.v_y")
+
+
+def slipping_start_quantities(model: Model) -> tuple[Quantity, ...]:
+    """Velocity of the centre at the first instant, and 1/mu unless the model has a coefficient of friction already."""
+    velocity = tuple(
+        Quantity(name, "m/s", 1e-3, meaning="velocity of the centre at the first instant") for name in SLIP_VELOCITY
+    )
+    return velocity if model.effect("slip") else (*velocity, *slip_candidate(CATALOGUE["slip"]).quantities)
 
 
 def effect_quantity(effect: type[Effect], parameter: Parameter) -> Quantity:

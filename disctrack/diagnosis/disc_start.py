@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.diagnosis.disc_motion import model_quantities, state_quantities
+from disctrack.diagnosis.disc_motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
+from disctrack.diagnosis.disc_stretch import FIRST_WINDOW
 from disctrack.diagnosis.fit import fit
-from disctrack.diagnosis.system import Subset, Values
+from disctrack.diagnosis.system import Values
 from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_rotation
 
 if TYPE_CHECKING:
@@ -17,42 +18,60 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-FIRST = 0.02  # [s] over which the motion is a cubic in time: a quarter turn of nutation at 12 Hz
 STRETCHES = (0.03, 0.08, 0.2, 0.5)  # [s] a linear step from one stretch's fit stays in the next one's basin
+FRICTIONS = (0.03, 1.0)  # coefficients to begin with are sought between these
 
 
 def first_state(time: Array, q: Array) -> dict[str, float]:
-    """Initial state of rolling from poses (n, 6), some of them NaN, by a cubic through the first ones.
+    """Initial state from poses (n, 6), some of them NaN, by a cubic in time through the first ones.
 
-    returns : state.x ... state.omega3
+    A quarter turn of nutation at 12 Hz is a cubic. Returns state.x ... state.omega3, and the centre's velocity as
+    state.v_x, state.v_y, which a rolling disc does not need.
     """
+    coefficients, first = _cubic(time, q)
+    psi, theta, phi = first
+    omega = coefficients[1, 3:]
+    e1, e2, e3 = nodal_axes_world(psi, theta)
+    numbers = (coefficients[0, 0], coefficients[0, 1], psi, theta, phi, omega @ e1, omega @ e2, omega @ e3)
+    names = (*(q.name for q in state_quantities()), *SLIP_VELOCITY)
+    return dict(zip(names, map(float, (*numbers, *coefficients[1, :2])), strict=True))
+
+
+def first_friction(time: Array, q: Array, gravity: float) -> float:
+    """Horizontal over vertical contact force at the first instant, from the centre's acceleration: mu in slip."""
+    x, y, z = 2 * _cubic(time, q)[0][2, :3]
+    return float(np.clip(np.hypot(x, y) / max(gravity + z, 0.1 * gravity), *FRICTIONS))
+
+
+def _cubic(time: Array, q: Array) -> tuple[Array, Array]:
+    """Coefficients (4, 6) of the first poses' displacement and turn by powers of time [s], and the first angles."""
     interval = float(np.median(np.diff(time)))
-    good = np.flatnonzero(np.isfinite(q).all(axis=1) & (time <= time[0] + max(FIRST, 10 * interval)))
+    good = np.flatnonzero(np.isfinite(q).all(axis=1) & (time <= time[0] + max(FIRST_WINDOW, 10 * interval)))
     t, poses = time[good] - time[0], q[good]
     R = rotation_from_euler(*poses[:, 3:].T)
     turned = vector_from_rotation(R @ R[0].T)
     span = max(float(t[-1]), interval)
     terms = np.vander(t / span, min(4, max(2, len(t) // 3)), increasing=True)
     coefficients = np.linalg.lstsq(terms, np.column_stack([poses[:, :3], turned]), rcond=None)[0]
-    psi, theta, phi = poses[0, 3:]
-    omega = coefficients[1, 3:] / span
-    e1, e2, e3 = nodal_axes_world(psi, theta)
-    numbers = (coefficients[0, 0], coefficients[0, 1], psi, theta, phi, omega @ e1, omega @ e2, omega @ e3)
-    return {q.name: float(v) for q, v in zip(state_quantities(), numbers, strict=True)}
+    found = np.zeros((4, 6))
+    found[: len(coefficients)] = coefficients / span ** np.arange(len(coefficients))[:, None]
+    return found, poses[0, 3:]
 
 
 def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
     """Values of state and declared effects from which the fit of the whole recording converges; `known` are kept."""
     q = system.trajectory.q[system.rows]
-    values = dict(known) | first_state(system.time, q)
+    names = {quantity.name for quantity in system.base}
+    values = dict(known) | {k: v for k, v in first_state(system.time, q).items() if k in names}
+    values |= {law.name: system.model.values[law.name] for law in model_quantities(system.model)}
+    if SLIP in names:
+        values[SLIP] = 1.0 / first_friction(system.time, q, system.model.gravity)
     laws = model_quantities(system.model)
-    values |= {q.name: system.model.values[q.name] for q in laws}
-    duration = system.time[-1] - system.time[0]
+    state = tuple(quantity for quantity in system.base if quantity.name.startswith("state.") or quantity.name == SLIP)
     for stretch in STRETCHES:
-        if stretch >= duration:
+        if stretch >= system.time[-1] - system.time[0]:
             break
-        rows = system.time <= system.time[0] + stretch
         # a law of friction shows only over several turns: held until the stretch is long enough
-        moved = state_quantities() if stretch < 0.1 else (*state_quantities(), *laws)
-        values = fit(Subset(system, rows), moved, values).values
+        moved = state if stretch < 0.1 else (*state, *laws)
+        values = fit(system.first_part(stretch), moved, values).values
     return values

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from disctrack.diagnosis.disc_motion import SLIP, STATE_SCALES, model_quantities, motion_candidates, state_quantities
+from disctrack.diagnosis.disc_motion import (
+    SLIP,
+    STATE_SCALES,
+    model_quantities,
+    motion_candidates,
+    slipping_start_quantities,
+    state_of,
+    state_quantities,
+)
 from disctrack.diagnosis.disc_optics import ellipse_centre_shift, measurement_candidates, predict
+from disctrack.diagnosis.disc_stretch import Stretch, free_stretch
 from disctrack.diagnosis.fit import triangle
 from disctrack.diagnosis.system import Candidate, Quantity, Values
-from disctrack.errors import AnalysisError
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.pose import whitening
-from disctrack.rolling import Model, State, sensitivities, simulate
+from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import find_effect
 from disctrack.trajectory import MarkerStatus, Trajectory
 
@@ -24,10 +33,9 @@ Array = NDArray[np.float64]
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
-MIN_THETA = np.radians(0.7)  # below, the disc of Ma et al. touches its paper, and leaves the model
-MIN_FRAMES = 40
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
+MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 _CLOCK = ("time_offset.delay", "frame_rate.change")
 _IMAGE = ("exposure_blur.T2", "ellipse_centre.share")
@@ -46,12 +54,25 @@ class _Path:
 class DiscSystem:
     """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
 
-    def __init__(self, trajectory: Trajectory, model: Model, candidates: tuple[Candidate, ...] | None = None) -> None:
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        model: Model,
+        candidates: tuple[Candidate, ...] | None = None,
+        *,
+        stretch: Stretch | None = None,
+        starts_in_slip: bool = False,
+    ) -> None:
         """Model : declared disc, gravity and effects; the parameters of its effects are fitted along.
 
-        candidates : all of the catalogue and of the measurement, if not given. Raises AnalysisError.
+        candidates : all of the catalogue and of the measurement, if not given
+        stretch : frames to take; those of `free_stretch` if not given
+        starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
+        Raises AnalysisError.
         """
-        rows = _usable(trajectory)
+        self.stretch = stretch or free_stretch(trajectory)
+        self.starts_in_slip = starts_in_slip
+        rows = self.stretch.rows
         self.model = model
         self.trajectory = trajectory
         self.rig, self.disc = trajectory.rig, trajectory.disc
@@ -66,12 +87,14 @@ class DiscSystem:
         safe = np.where(self.used[..., None, None], trajectory.markers_covariance_px2[rows], np.eye(2))
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
-        self.candidates = (
-            (*motion_candidates(model), *measurement_candidates(self.disc)) if candidates is None else candidates
-        )
+        of_slip = slipping_start_quantities(model) if starts_in_slip else ()
+        if candidates is None:
+            candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
+        in_base = {q.name for q in of_slip}
+        self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
-        self.base = (*state_quantities(), *model_quantities(model), *nuisances)
+        self.base = (*state_quantities(), *of_slip, *model_quantities(model), *nuisances)
 
     def _nuisances(self) -> tuple[tuple[Quantity, ...], Array]:
         """Errors common to all frames, with priors, and their whitened columns (n, 4 m, k).
@@ -114,6 +137,15 @@ class DiscSystem:
 
         return start_values(self, known or {})
 
+    def first_part(self, duration: float) -> DiscSystem:
+        """The same system with the frames of the first `duration` [s] only."""
+        part = copy(self)
+        n = int(np.searchsorted(self.time, self.time[0] + duration, side="right"))
+        part.rows = slice(self.rows.start, self.rows.start + n)
+        for name in ("time", "used", "_observed", "_whiten", "weights", "_nuisance_columns"):
+            setattr(part, name, getattr(self, name)[:n])
+        return part
+
     def model_with(self, values: Values) -> Model:
         """The model with every effect that has an amount in `values`."""
         effects = {name: v for name, v in values.items() if _is_effect(name)}
@@ -124,7 +156,7 @@ class DiscSystem:
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
         """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time."""
         rate = 1.0 + values.get("frame_rate.change", 0.0)
-        state = State(**{c: float(values[f"state.{c}"]) for c in STATE_SCALES})
+        state = state_of(values)
         motion = simulate(self.model_with(values), state, times=self.start_time + (self.time - self.start_time) / rate)
         needed = float(np.max(motion.friction_needed))
         return [(1.0 / (share * needed),) for share in SLIP_STARTS]
@@ -215,8 +247,11 @@ class DiscSystem:
         slips = SLIP in names and values.get(SLIP, 0.0) > 0
         if slips:
             parameters.append("slip.mu")
-        state = State(**{c: float(values[f"state.{c}"]) for c in STATE_SCALES})
-        found = sensitivities(model, state, times, parameters, components, theta_end=THETA_END, rtol=RTOL)
+        state = state_of(values)
+        if not THETA_END < state.theta <= np.pi / 2:  # a step of the fit may lead where no disc rolls
+            return _nowhere(len(times), names)
+        limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
+        found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit)
         axes = euler_rate_axes_world(found.q[:, 3], found.q[:, 4])
         by_motion = found.dq.copy()
         by_motion[:, 3:] = axes @ found.dq[:, 3:]
@@ -289,6 +324,12 @@ class DiscSystem:
         return (sides[0] - sides[1]) / (2 * step)
 
 
+def _nowhere(n: int, names: Sequence[str]) -> _Path:
+    """No motion at all."""
+    nothing = np.full((2, n, 6), np.nan)
+    return _Path(nothing, nothing, (), np.zeros((n, 6, 0)))
+
+
 def _is_effect(name: str) -> bool:
     effect, _, parameter = name.partition(".")
     known = find_effect(effect)
@@ -300,22 +341,3 @@ def _scaled(covariance: Array) -> tuple[Array, Array]:
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(sigma > 0, sigma, 1.0)
     return covariance / np.outer(safe, safe), sigma
-
-
-def _usable(trajectory: Trajectory) -> slice:
-    """Frames from the first pose to the last before the disc comes to lie. Raises AnalysisError."""
-    if not trajectory.rig.world_is_table:
-        raise AnalysisError(
-            "the trajectory is in the axes of the left camera, not of the table: the rolling model needs heights and "
-            "the vertical. Name the view whose board lies on the table, calibrate and track again."
-        )
-    measured = np.flatnonzero(trajectory.measured)
-    if measured.size:
-        flat = np.flatnonzero(trajectory.measured & (trajectory.q[:, 4] < MIN_THETA))
-        stop = flat[0] if flat.size else measured[-1] + 1
-        if np.sum((measured >= measured[0]) & (measured < stop)) >= MIN_FRAMES:
-            return slice(int(measured[0]), int(stop))
-    raise AnalysisError(
-        f"{measured.size} frames have a pose, with nutations above {np.degrees(MIN_THETA):.1f} deg; a diagnosis needs "
-        f"{MIN_FRAMES} of them in a row. Track more of the recording."
-    )

@@ -117,7 +117,7 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
     lower, upper = np.array([q.lower for q in quantities]), np.array([q.upper for q in quantities])
     residual, derivative = system.linearise(values, names)
     prior, prior_matrix = prior_rows(quantities, values)
-    cost = _cost(residual, prior)
+    cost = _cost(residual, prior, derivative)
     converged, iteration = False, 0
     matrix = np.zeros((0, len(names)))
     while np.isfinite(cost) and iteration < max_iterations:
@@ -135,7 +135,7 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             trial = values | dict(zip(names, np.clip(x + factor * step, lower, upper).tolist(), strict=True))
             new_residual, new_derivative = system.linearise(trial, names)
             new_prior, _ = prior_rows(quantities, trial)
-            new_cost = _cost(new_residual, new_prior)
+            new_cost = _cost(new_residual, new_prior, new_derivative)
             if np.isfinite(new_cost) and new_cost < cost:
                 break
         else:
@@ -149,10 +149,12 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
     return Fit(quantities, values, covariance, float(cost - penalty), penalty, n_data, converged, iteration)
 
 
-def _cost(residual: Array, prior: Array) -> float:
+def _cost(residual: Array, prior: Array, derivative: Array) -> float:
+    """Chi-square with priors; infinite where there is no prediction, or none next to it."""
     with np.errstate(over="ignore", invalid="ignore"):
         cost = float(np.sum(residual**2) + prior @ prior)
-    return cost if np.isfinite(cost) else np.inf
+        usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
+    return cost if usable else np.inf
 
 
 def _covariance(matrix: Array, x: Array, lower: Array, upper: Array) -> Array:

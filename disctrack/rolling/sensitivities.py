@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import effect_class
 from disctrack.rolling.model import DEFAULT_THETA_END, Model, split_name
-from disctrack.rolling.motion import coordinates
+from disctrack.rolling.motion import EndReason, coordinates
 from disctrack.rolling.records import STATE_COMPONENTS
-from disctrack.rolling.simulate import RTOL, _grid, _start, check_in_model, follow
+from disctrack.rolling.simulate import MAX_SWITCHES, RTOL, _grid, _start, check_in_model, follow
 from disctrack.rolling.state import State
 
 Array = NDArray[np.float64]
@@ -45,11 +45,13 @@ def sensitivities(
     components: Sequence[str] | None = None,
     theta_end: float = DEFAULT_THETA_END,
     rtol: float = RTOL,
+    max_switches: int = MAX_SWITCHES,
 ) -> Sensitivities:
     """D q(t), d qdot(t) by initial state and parameters.
 
     parameters : "effect.parameter" names; an effect that is not in the model is taken at its null value.
     components : of records.STATE_COMPONENTS; all that the state has if not given.
+    max_switches : between rolling and slip, beyond which the motion counts as over; then there are no derivatives.
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
@@ -59,9 +61,11 @@ def sensitivities(
     names = (*components, *parameters)
     dq, dqdot = np.full((2, len(grid), 6, len(names)), np.nan)
     q, qdot = np.full((2, len(grid), 6), np.nan)
-    path = follow(Assembly(enlarged, theta_end), y0, grid, rtol)
+    path = follow(Assembly(enlarged, theta_end), y0, grid, rtol, max_switches)
     n = len(path.samples.time)
     q[:n], qdot[:n] = coordinates(path.samples.kinematics)
+    if path.end is EndReason.CHATTER:
+        return Sensitivities(grid, q, qdot, names, dq, dqdot)
     for column, name in enumerate(names):
         y, values = y0.astype(complex), {}
         if column < len(components):

@@ -23,7 +23,7 @@ RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over
 # m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of what moves
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
 _N_STATE = {ROLLING: 8, SLIPPING: 10, FLYING: 12}
-_MAX_SWITCHES = 2000
+MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
 
 
 def time_grid(duration: float, rate: float = 1000.0, start: float = 0.0) -> Array:
@@ -130,7 +130,9 @@ class Path:
     end_state: NDArray[Any]
 
 
-def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float) -> Path:
+def follow(
+    assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_switches: int = MAX_SWITCHES
+) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
     t: Any = grid[0] * y.dtype.type(1.0)
@@ -159,7 +161,7 @@ def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float) -> Pat
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
                 regime = new
-                if len(switches) > _MAX_SWITCHES:
+                if len(switches) > max_switches:
                     end = EndReason.CHATTER
     if not pieces:  # over at its start
         pieces.append(_sample(assembly, regime, grid[:1], y[None]))
