@@ -17,8 +17,9 @@ from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn
 from disctrack.diagnosis.output import as_json, lines, write_diagnosis
-from disctrack.diagnosis.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.search import Diagnosis, Settings
 from disctrack.diagnosis.separation import Separation, separations
+from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.words import sentence
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.storage import read_findings, read_provenance, read_trajectory
@@ -52,6 +53,7 @@ class DiscDiagnosis:
     moment: MissingMoment | None = None  # that the model fails to supply, where it was asked for
     learned: Learned | None = None
     separated_by: dict[str, dict[str, Separation | None]] = field(default_factory=dict)  # effect -> rival -> recording
+    notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
 
     @property
     def after_fit(self) -> Fit:
@@ -88,18 +90,22 @@ def diagnose_trajectory(
     Raises AnalysisError, SceneError, ModelError.
     """
     declared = declared_model(trajectory, model)
-    system = DiscSystem(trajectory, declared.model)
-    diagnosis = diagnose(system, system.start(declared.faults), settings)
-    held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
-    if held_before is None or held_after is None:
+    answer = diagnose_motion(trajectory, declared.model, declared.faults, settings)
+    system, diagnosis = answer.system, answer.diagnosis
+    if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
         text = sentence(diagnosis, diagnosis.after, None, None)
-        return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {})
+        return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
     moment, learned = _beyond_the_catalogue(system, diagnosis)
     if learned is not None:
         reason = (
             f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
         )
         diagnosis = replace(diagnosis, verdict="unexplained", found=(), reason=reason)
+    if answer.slip is not None:
+        diagnosis = with_slip(diagnosis, answer.slip)
+    held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
+    assert held_before is not None
+    assert held_after is not None
     fit_ = learned.fit if learned else diagnosis.after
     before = errors(system, diagnosis.before, held_before)
     after = errors(system, fit_, learned.held_out if learned else held_after)
@@ -110,7 +116,9 @@ def diagnose_trajectory(
         for f in diagnosis.found
         if f.cannot_be_told_from and separate
     }
-    return DiscDiagnosis(system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart)
+    return DiscDiagnosis(
+        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, answer.notes
+    )
 
 
 def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[MissingMoment | None, Learned | None]:

@@ -95,7 +95,7 @@ def free_run(system: DiscSystem, held: HeldOut, horizons: tuple[float, ...] = HO
     found = []
     for horizon in horizons:
         near = np.abs(system.time - last - horizon) <= HALF_WINDOW
-        near &= held.test_rows & np.isfinite(delta).all(axis=1)
+        near &= held.test_rows & (system.weights >= 6)
         if not near.any() or system.time[-1] < last + horizon:
             continue
         rms = lambda x, near=near: float(np.sqrt(np.mean(np.sum(np.atleast_2d(x.T).T[near] ** 2, axis=1))))  # noqa: E731

@@ -11,6 +11,7 @@ from disctrack.diagnosis.disc_motion import SLIP, SLIP_VELOCITY, model_quantitie
 from disctrack.diagnosis.disc_stretch import FIRST_WINDOW
 from disctrack.diagnosis.fit import fit
 from disctrack.diagnosis.system import Values
+from disctrack.disc import Disc
 from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_rotation
 
 if TYPE_CHECKING:
@@ -41,6 +42,15 @@ def first_friction(time: Array, q: Array, gravity: float) -> float:
     """Horizontal over vertical contact force at the first instant, from the centre's acceleration: mu in slip."""
     x, y, z = 2 * _cubic(time, q)[0][2, :3]
     return float(np.clip(np.hypot(x, y) / max(gravity + z, 0.1 * gravity), *FRICTIONS))
+
+
+def first_slip(time: Array, q: Array, disc: Disc) -> float:
+    """Horizontal speed [m/s] of the disc's point at the contact at the first instant; rolling has none."""
+    coefficients, (psi, theta, _) = _cubic(time, q)
+    _, e2, e3 = nodal_axes_world(psi, theta)
+    arm = -disc.radius * e2 - disc.half_thickness * e3
+    slip = coefficients[1, :3] + np.cross(coefficients[1, 3:], arm)
+    return float(np.hypot(*slip[:2]))
 
 
 def _cubic(time: Array, q: Array) -> tuple[Array, Array]:

@@ -60,7 +60,7 @@ def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> Stretch:
     ]
     lost = rows.stop - rows.start - (last - first)
     if lost:
-        notes.append(f"{lost} of the {rows.stop - rows.start} frames between have no pose")
+        notes.append(f"{lost} of the {rows.stop - rows.start} frames have no pose")
     return Stretch(rows, tuple(notes))
 
 
@@ -102,21 +102,20 @@ def _left_out(which: str, trajectory: Trajectory, rows: Rows, still: Mask, flat:
     if rows.size == 0:
         return []
     time = trajectory.time[rows]
-    slipping = int(np.sum(time < start))
-    kinds = [
-        ("the disc lies flat", int(flat.sum())),
-        ("the disc is at rest or held", int(np.sum(still & ~flat))),
-        ("the disc slips", slipping),
-    ]
+    kinds = [*_counts(flat, still), ("the disc slips", int(np.sum(time < start)))]
     reasons = [f"{text} in {n} of them" if n < rows.size else text for text, n in kinds if n]
     reason = "; ".join(reasons) if reasons else "they are cut off from the longest run of frames in free motion"
     return [f"the {which} {rows.size} frames ({time[0]:.4f} to {time[-1]:.4f} s) are left out: {reason}"]
 
 
+def _counts(flat: Mask, still: Mask) -> list[tuple[str, int]]:
+    return [("the disc lies flat", int(flat.sum())), ("the disc is at rest or held", int(np.sum(still & ~flat)))]
+
+
 def _too_short(n: int, measured: int, longest: int, still: Mask, flat: Mask) -> str:
+    kinds = "".join(f"; {text} in {k} of them" for text, k in _counts(flat, still) if k)
+    run = f"; the longest motion on its own has {longest}" if longest < measured else ""
     return (
-        f"{measured} of {n} frames have a pose; in {int(np.sum(still & ~flat))} of them the disc is at rest, in "
-        f"{int(flat.sum())} it lies flat (nutation below {np.degrees(MIN_THETA):.1f} deg), and the longest motion in "
-        f"between has {longest}. A diagnosis needs {MIN_FRAMES} poses of one motion. Track more of the recording, or "
-        "film it again."
+        f"{measured} of {n} frames have a pose{kinds}{run}. A diagnosis needs {MIN_FRAMES} poses of one motion "
+        f"(nutation above {np.degrees(MIN_THETA):.1f} deg). Track more of the recording, or film it again."
     )

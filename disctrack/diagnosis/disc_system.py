@@ -12,7 +12,6 @@ from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.diagnosis.disc_motion import (
     SLIP,
-    STATE_SCALES,
     model_quantities,
     motion_candidates,
     slipping_start_quantities,
@@ -248,8 +247,10 @@ class DiscSystem:
         if slips:
             parameters.append("slip.mu")
         state = state_of(values)
-        if not THETA_END < state.theta <= np.pi / 2:  # a step of the fit may lead where no disc rolls
-            return _nowhere(len(times), names)
+        # a step of the fit may lead where no disc rolls, and where following it would take for ever
+        fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
+        if not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest:
+            return _nowhere(len(times))
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
         found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit)
         axes = euler_rate_axes_world(found.q[:, 3], found.q[:, 4])
@@ -324,7 +325,7 @@ class DiscSystem:
         return (sides[0] - sides[1]) / (2 * step)
 
 
-def _nowhere(n: int, names: Sequence[str]) -> _Path:
+def _nowhere(n: int) -> _Path:
     """No motion at all."""
     nothing = np.full((2, n, 6), np.nan)
     return _Path(nothing, nothing, (), np.zeros((n, 6, 0)))

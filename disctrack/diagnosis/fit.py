@@ -98,9 +98,9 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
     x = np.asarray(np.linalg.lstsq(scaled, right, rcond=1e-12)[0] * scale, float)
     if bool(np.all((x >= lower) & (x <= upper))):
         return x
-    with np.errstate(invalid="ignore"):
-        bounds = (lower / scale, upper / scale)
-    return np.asarray(lsq_linear(scaled, right, bounds, tol=1e-12).x * scale, float)
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
+        found = np.asarray(lsq_linear(scaled, right, (lower / scale, upper / scale), tol=1e-12).x * scale, float)
+    return found if np.isfinite(found).all() else np.clip(x, lower, upper)
 
 
 def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:

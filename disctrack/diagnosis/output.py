@@ -157,11 +157,14 @@ def as_json(result: DiscDiagnosis) -> dict[str, Any]:
     diagnosis = result.diagnosis
     apart = result.separated_by
     effects = [effect_json(f, diagnosis.after, apart.get(f.candidate.name)) for f in diagnosis.found]
+    rows = result.system.rows
     return {
         "verdict": diagnosis.verdict,
         "sentence": result.sentence,
         "reason": diagnosis.reason,
         "model": result.model,
+        "notes": list(result.notes),
+        "frames": [int(result.system.trajectory.frame[i]) for i in (rows.start, rows.stop - 1)],
         "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
         "before": (_errors(result.before) or {}) | {"parameters": _declared(diagnosis.before)},
         "after": (_errors(result.after) or {}) | {"parameters": _declared(result.after_fit)},
@@ -209,6 +212,7 @@ def lines(result: DiscDiagnosis) -> list[str]:
     """Some lines for the terminal."""
     before, after = result.before, result.after
     found = [f"{'verdict':<13} {result.diagnosis.verdict}", f"{'':<13} {result.sentence}"]
+    found += [f"{'note':<13} {text}" for text in result.notes]
     if before is None or after is None:
         return found
     found += [

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from disctrack.diagnosis.disc_stretch import MIN_FRAMES, Stretch
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.fit import Fit
 from disctrack.diagnosis.score import Linearisation, angle
 from disctrack.diagnosis.system import Candidate
-from disctrack.errors import DiscTrackError
+from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import State, simulate, steady_precession
 from disctrack.trajectory import MarkerStatus
@@ -104,6 +105,8 @@ def planned_recording(
     values = {k: v for k, v in fit.values.items() if not k.startswith("state.")}
     motion = simulate(system.model_with(values), start, duration, rate=old.frame_rate)
     n, m = len(motion), system.disc.n_markers
+    if n < MIN_FRAMES:
+        raise AnalysisError(f"the motion is over after {n} frames")
     R = rotation_from_euler(*motion.q[:, 3:].T)
     pixels = system.rig.project(system.disc.marker_centres_body @ np.swapaxes(R, 1, 2) + motion.q[:, None, :3])
     pixels = np.moveaxis(pixels, -3, 1)
@@ -125,4 +128,4 @@ def planned_recording(
         markers_residual_px=np.zeros((n, 2, m, 2)),
         marker_status=np.where(inside, MarkerStatus.MEASURED, MarkerStatus.OUTSIDE).astype(np.uint8),
     )
-    return DiscSystem(trajectory, system.model, tuple(candidates))
+    return DiscSystem(trajectory, system.model, tuple(candidates), stretch=Stretch(slice(0, n)))

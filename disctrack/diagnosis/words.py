@@ -28,7 +28,7 @@ def quantity_text(value: float, sigma: float, unit: str) -> str:
     if not sigma > 0:
         return f"{value:.4g}{unit}"
     digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    if digits > 6 or abs(value) >= 1e6:
+    if digits > 9 or abs(value) >= 1e6:
         return f"({value:.5g} +- {sigma:.2g}){unit}"
     return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
 
@@ -44,7 +44,8 @@ def shown(q: Quantity, fit: Fit) -> tuple[str, float, float]:
 def effect_text(found: Found, diagnosis: Diagnosis) -> str:
     """One effect with its size and what it cannot be told from."""
     fit = diagnosis.after
-    amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities]
+    # a free velocity at the first instant says nothing to people that the remark on slip does not
+    amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities if not q.name.startswith("state.")]
     sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
     text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}"
     if found.cannot_be_told_from:

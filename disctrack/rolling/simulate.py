@@ -130,9 +130,7 @@ class Path:
     end_state: NDArray[Any]
 
 
-def follow(
-    assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_switches: int = MAX_SWITCHES
-) -> Path:
+def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_switches: int = MAX_SWITCHES) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
     t: Any = grid[0] * y.dtype.type(1.0)
