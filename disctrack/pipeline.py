@@ -19,6 +19,7 @@ from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
+from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording import Recording
 from disctrack.storage import Provenance
 from disctrack.tracking import TrackingSettings, prepare, track
@@ -82,6 +83,7 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     )
     warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
     check_pair(left, right)
+    warnings += check_time_stamps(left, right, recording.frame_rate)
     start, stop, _ = slice(*frames).indices(len(left))
     if stop <= start:
         raise RecordingError(
@@ -123,7 +125,7 @@ def measure(
             unreadable.extend(block.unreadable)
             yield block
 
-    stamps = pairs.left.timestamps
+    stamps = usable_times(pairs.left, rate)
     prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
     began = time.perf_counter()
     span = _span(pairs, rate, settings, threads)

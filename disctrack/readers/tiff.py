@@ -156,7 +156,11 @@ class TiffPages:
     def _decoded(self, index: int, where: str) -> Frame:
         page = self._pages[index]
         check_frame_size(page.width, page.height, where)
-        return as_grey(_decoded_page(self._tiffs[page.file], page.directory, where), where)
+        try:
+            return as_grey(_decoded_page(self._tiffs[page.file], page.directory, where), where)
+        except RecordingError as error:
+            text = str(error)
+            raise RecordingError(text if text.startswith(where) else f"{where}: {text}") from error
 
     def _first_readable(self) -> Frame:
         problem: RecordingError | None = None

@@ -109,7 +109,10 @@ class VideoFile:
         raise RecordingError(f"none of the {len(self)} {self.camera} frames can be read; the first: {problem}")
 
     def _decoded(self, index: int, where: str) -> Any:
-        cursor = self._cursor_near(index)
+        try:
+            cursor = self._cursor_near(index)
+        except RecordingError as error:  # the file is opened anew to go back
+            raise RecordingError(f"{where}: {error}") from error
         return cursor.frame(index, where)
 
     def _cursor_near(self, index: int) -> _Cursor:
