@@ -42,7 +42,7 @@ class AsBuilt:
     rig: StereoRig  # with the covariance that remains
     disc: Disc
     marker_shift: Array  # (m, 3) [m] refined minus declared, body axes; third component 0
-    marker_shift_sigma: Array  # (m, 2) [m]
+    marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
     rig_shift_sigmas: Array  # (30,) change of the rig's parameters in units of their prior sigma; 0 where fixed
     reduced_chi_square_before: float
     reduced_chi_square_after: float
@@ -109,11 +109,12 @@ def refine_as_built(
             break
     remaining = np.zeros((len(shift), len(shift)))
     remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
+    sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
     rig_covariance = remaining[:N_RIG, :N_RIG] if refine_rig else rig.covariance
     if refine_markers and not refine_rig and np.sqrt(np.mean(shift[N_RIG:] ** 2)) < MIN_MARKER_SHIFT:
         return replace(
             unchanged,
-            marker_shift_sigma=np.sqrt(np.diag(remaining)[N_RIG:]).reshape(m, 2),
+            marker_shift_sigma=sigma,
             reduced_chi_square_before=before,
             reduced_chi_square_after=before,
         )
@@ -125,7 +126,7 @@ def refine_as_built(
         rig=replace(current_rig, covariance=rig_covariance),
         disc=current_disc,
         marker_shift=kept,
-        marker_shift_sigma=np.sqrt(np.diag(remaining)[N_RIG:]).reshape(m, 2),
+        marker_shift_sigma=sigma,
         rig_shift_sigmas=in_sigmas,
         reduced_chi_square_before=before,
         reduced_chi_square_after=after,
@@ -157,11 +158,7 @@ def declared_places_kept(disc: Disc, shift: Array) -> Array:
 
     Of all these the one with the smallest sum of lengths: as many dots as possible stay where they were declared.
     """
-    x, y = disc.marker_centres_body[:, :2].T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)  # (m, 2, 3)
-    scale = np.sqrt(np.mean(x * x + y * y))
-    motions[..., 2] /= scale
+    motions = _pattern_motions(disc)
     rest = shift
     for _ in range(100):  # iteratively reweighted least squares; 1 nm keeps the weights finite
         weight = 1.0 / np.maximum(np.linalg.norm(rest, axis=1), 1e-9)
@@ -173,6 +170,22 @@ def declared_places_kept(disc: Disc, shift: Array) -> Array:
         if done:
             break
     return np.column_stack([rest, np.zeros(len(rest))])
+
+
+def places_sigma(disc: Disc, covariance: Array) -> Array:
+    """Standard deviations (m, 2) of displacements of covariance (2m, 2m), the motion of the whole pattern left out."""
+    motions = _pattern_motions(disc).reshape(len(covariance), 3)
+    keep = np.eye(len(covariance)) - motions @ np.linalg.pinv(motions)
+    return np.sqrt(np.diag(keep @ covariance @ keep)).reshape(-1, 2)
+
+
+def _pattern_motions(disc: Disc) -> Array:
+    """Displacement (m, 2, 3) of the dots by a unit displacement and turn of the whole pattern."""
+    x, y = disc.marker_centres_body[:, :2].T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)
+    motions[..., 2] /= np.sqrt(np.mean(x * x + y * y))
+    return motions
 
 
 def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, StereoRig
-from disctrack.as_built import DOT_SIGMA, declared_places_kept, shared_normal_equations
+from disctrack.as_built import DOT_SIGMA, declared_places_kept, places_sigma, shared_normal_equations
 from disctrack.disc import Disc
 from disctrack.pose import PoseFits, fit_poses
 
@@ -35,7 +35,7 @@ class SharedFaults:
 
     reduced_chi_square: float  # of the dots about the poses, without the twentieth of the frames that fits worst
     marker_shift: Array  # (m, 3) [m] from the declared places, body axes
-    marker_shift_sigma: Array  # (m, 2) [m]
+    marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
     delay: float  # [frame periods] of the right camera against the left
     n_frames: int
 
@@ -94,13 +94,14 @@ def without_shared_faults(
         matrix = normal * np.outer(unit, unit) / noise + np.eye(len(unit))
         rhs = gradient * unit / noise - shift[free] / unit
         shift[free] += unit * np.linalg.solve(matrix, rhs)
-    sigma = unit * np.sqrt(np.diag(np.linalg.inv(matrix)))
+    dots = slice(-2 * m - 1, -1)
+    places = np.linalg.inv(matrix)[dots, dots] * np.outer(unit[dots], unit[dots])
     reduced = trimmed_reduced_chi_square(fits)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     return SharedFaults(
         reduced_chi_square=reduced * spent / max(spent - int(free.sum()), 1),
         marker_shift=declared_places_kept(disc, shift[N_RIG:-1].reshape(m, 2)),
-        marker_shift_sigma=sigma[-2 * m - 1 : -1].reshape(m, 2),
+        marker_shift_sigma=places_sigma(disc, places),
         delay=float(shift[-1]),
         n_frames=len(rows),
     )
