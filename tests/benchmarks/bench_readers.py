@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,7 +24,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 from disctrack.readers import FrameReader, open_frames
+from tests.oracles import camera_files
 
 Frames = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -241,6 +245,42 @@ FORMATS += [
         ("FFV1 MKV 12 bit", 12, "mkv", "ffv1", "gray12le"),
     )
 ]
+
+# -- cameras' own files ------------------------------------------------------------------------------------------------
+
+
+def mraw_writer(bits: int) -> Callable[[Path, Frames], str]:
+    def write(folder: Path, frames: Frames) -> str:
+        return camera_files.write_mraw(folder / "frames", frames, bits).name
+
+    return write
+
+
+def cine_writer(bits: int, packed: bool) -> Callable[[Path, Frames], str]:
+    def write(folder: Path, frames: Frames) -> str:
+        return camera_files.write_cine(folder / "frames.cine", frames, bits, packed_pixels=packed).name
+
+    return write
+
+
+def plain_map(folder: Path, pattern: str, out: Frames) -> None:
+    """The bytes of the frames as they are stored, packed ones not unpacked: what memory alone would take."""
+    size = min(max(file.stat().st_size for file in folder.iterdir()) // len(out), out[0].nbytes)
+    (file,) = (file for file in folder.iterdir() if file.suffix in (".mraw", ".cine"))
+    mapped = np.memmap(file, np.uint8, "r")
+    for i, image in enumerate(out):
+        image.reshape(-1).view(np.uint8)[:size] = mapped[i * size : i * size + size]
+
+
+for name, bits, write in (
+    ("MRAW 8 bit", 8, mraw_writer(8)),
+    ("MRAW 12 bit packed", 12, mraw_writer(12)),
+    ("MRAW 16 bit", 16, mraw_writer(16)),
+    ("cine 8 bit", 8, cine_writer(8, packed=False)),
+    ("cine 12 bit packed", 12, cine_writer(12, packed=True)),
+    ("cine 16 bit", 16, cine_writer(16, packed=False)),
+):
+    FORMATS.append(Format(name, bits, write, "copy of np.memmap, bytes as stored", plain_map))
 
 
 if __name__ == "__main__":

@@ -47,8 +47,8 @@ CIHX = """<?xml version="1.0" encoding="utf-8"?>
 
 def packed(values: np.ndarray, bits: int) -> bytes:
     """Values one after the other as one large binary number, most significant bit first."""
-    digits = "".join(f"{int(value):0{bits}b}" for value in values.ravel())
-    return int(digits, 2).to_bytes(len(digits) // 8, "big")
+    digits = np.unpackbits(values.astype(">u2").view(np.uint8).reshape(-1, 2), axis=1)[:, 16 - bits :]
+    return np.packbits(digits).tobytes()
 
 
 def write_mraw(stem: Path, images: np.ndarray, bits: int, *, kind: str = "cih", depth: int = 0, **entries: str) -> Path:
