@@ -13,40 +13,94 @@ from calibration import Board, CalibrationSettings, StereoCalibration, calibrate
 from calibration.stereo import Progress
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
+from disctrack.readers import IMAGE_SUFFIXES, FrameReader, open_frames, split_member
 from disctrack.readers.files import file_number, match_files
 from disctrack.readers.images import decode
 from disctrack.recording import Recording
 
+MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """A view that is one frame of a file that holds many."""
+
+    file: Path
+    reader: FrameReader
+    index: int
+
+    def __str__(self) -> str:
+        return self.reader.describe(self.index)
+
+    @property
+    def name(self) -> str:
+        """The frame, for messages that name the file apart."""
+        return f"frame {self.index}"
+
+
+View = Path | FrameView
+
 
 @dataclass(frozen=True)
 class ChessboardImages:
-    """Files of synchronised views; file i of the left and of the right show the board in the same place."""
+    """Synchronised views; number i of the left and of the right show the board in the same place."""
 
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
+    left: tuple[View, ...]
+    right: tuple[View, ...]
 
     def __len__(self) -> int:
         return len(self.left)
 
+    @property
+    def place(self) -> Path:
+        """Where the left views lie, for messages."""
+        first = self.left[0]
+        return first.file if isinstance(first, FrameView) else first.parent
+
     def sha256(self) -> str:
-        """SHA-256 (hex) of all files' content, in order."""
+        """SHA-256 (hex) of all views' content, in order."""
         digest = hashlib.sha256()
-        for file in (*self.left, *self.right):
-            digest.update(hashlib.sha256(_content(file)).digest())
+        for side in (self.left, self.right):
+            for view in side:
+                if not isinstance(view, FrameView):
+                    digest.update(hashlib.sha256(_content(view)).digest())
+                elif view.index == 0:
+                    digest.update(view.reader.content_sha256(0, len(side)).encode())
         return digest.hexdigest()
 
 
 def find_views(left: str, right: str, folder: Path) -> ChessboardImages:
-    """Files that the two patterns match, paired by their order. Raises RecordingError if they do not pair up."""
-    files = [match_files(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
-    numbers = [[file_number(file) for file in side] for side in files]
-    if numbers[0] != numbers[1] or len(files[0]) != len(files[1]):
-        _refuse_unpaired(files, numbers)
-    return ChessboardImages(tuple(files[0]), tuple(files[1]))
+    """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
+
+    Raises RecordingError if they do not pair up.
+    """
+    sides = [_views_of(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
+    views = ChessboardImages(*sides)
+    numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
+    if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
+        _refuse_unpaired(views, numbers)
+    return views
 
 
-def _refuse_unpaired(files: Sequence[Sequence[Path]], numbers: Sequence[Sequence[int | None]]) -> None:
+def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
+    files = match_files(split_member(pattern)[0], folder, camera)
+    suffix = files[0].suffix.lower()
+    if suffix in IMAGE_SUFFIXES and not (len(files) == 1 and suffix in (".tif", ".tiff")):
+        return tuple(files)
+    reader = open_frames(pattern, folder, camera)
+    if suffix in IMAGE_SUFFIXES and len(reader) == 1:
+        return tuple(files)
+    if len(reader) > MOST_VIEWS:
+        raise RecordingError(
+            f"{files[0]}: {len(reader)} frames for the {camera} camera, and every frame is a view of the chessboard. "
+            f"Export at most {MOST_VIEWS} of them; 20 to 40 in different places are enough."
+        )
+    return tuple(FrameView(files[0], reader, index) for index in range(len(reader)))
+
+
+def _refuse_unpaired(views: ChessboardImages, numbers: Sequence[Sequence[int | None]]) -> None:
     """Different counts are an error; equal counts are, too, where the numbers overlap but for a few."""
+    files = views.left, views.right
     alone = [
         [file for file, number in zip(files[c], numbers[c], strict=True) if number not in numbers[1 - c]]
         for c in (0, 1)
@@ -55,7 +109,7 @@ def _refuse_unpaired(files: Sequence[Sequence[Path]], numbers: Sequence[Sequence
         return  # no number in common: the two cameras count from different starts
     odd = [f"{CAMERAS[c]} {', '.join(file.name for file in alone[c][:3])}" for c in (0, 1) if alone[c]]
     raise RecordingError(
-        f"{files[0][0].parent}: {len(files[0])} left and {len(files[1])} right calibration views do not pair up"
+        f"{views.place}: {len(files[0])} left and {len(files[1])} right calibration views do not pair up"
         + (f": without a partner are {' and '.join(odd)}" if odd else "")
         + ". Views are pairs, one image of each camera: add the missing ones, or move these away."
     )
@@ -91,14 +145,14 @@ def calibrate_views(
     """
     if table_view is not None and table_view >= len(views):
         raise RecordingError(
-            f"{views.left[0].parent}: [table] view = {table_view}, but there are {len(views)} calibration views, "
+            f"{views.place}: [table] view = {table_view}, but there are {len(views)} calibration views, "
             "counted from 0. Name the view whose board lies flat on the table."
         )
     images: tuple[list[NDArray], list[NDArray]] = ([], [])
     used, problems = [], []
     for i, pair in enumerate(zip(views.left, views.right, strict=True)):
         try:
-            left, right = (decode(_content(file), f"{file} (calibration view {i})") for file in pair)
+            left, right = (_pixels(view, f"{view} (calibration view {i})") for view in pair)
         except RecordingError as error:
             if i == table_view:
                 raise RecordingError(f"{error} It is the table view: without it there is no lab frame.") from error
@@ -111,6 +165,11 @@ def calibrate_views(
     position = None if table_view is None else used.index(table_view)
     found = calibrate_stereo(*images, board, settings, position, board_thickness, names, progress)
     return found, tuple(problems)
+
+
+def _pixels(view: View, where: str) -> NDArray:
+    """Grey values or colours of a view. Raises RecordingError, which begins with `where` or names the frame."""
+    return view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), where)
 
 
 def _content(file: Path) -> bytes:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from calibration.rig_file import read_rig
+from disctrack.chessboard_views import find_views
 from disctrack.cli import main
+from disctrack.errors import RecordingError
 from disctrack.storage import read_findings, read_trajectory
 from tests.oracles.camera_files import write_cine, write_mraw
 
@@ -82,6 +85,31 @@ def test_poses_and_times_from_cine_are_those_from_png(recording, from_png, bits)
         assert_allclose(trajectory.q, from_png.q, atol=0.05 * from_png.coordinate_sigma.min())
     assert_allclose(trajectory.time, from_png.time, atol=2**-29)  # stamps have 2**-30 s
     assert read_findings(found)["camera_headers"]["left"]["first_frame"] == -5
+
+
+def test_calibration_views_may_be_frames_of_one_file(short_recording, tmp_path, rig_file):
+    """The same views as PNG files and as MRAW give the same rig."""
+    text = (short_recording / "recording.toml").read_text()
+    for name in ("left", "right"):
+        write_mraw(tmp_path / name, grey_values(short_recording / "calibration" / name), 8)
+        text = text.replace(f"calibration/{name}/*.png", f"{name}.cih")
+    (tmp_path / "recording.toml").write_text(text)
+    model = ["--distortion", "k1 k2 p1 p2", "--board", "flat", "--no-figures"]
+    assert main(["calibrate", str(tmp_path), "-o", str(tmp_path / "rig.h5"), *model]) == 0
+    for ours, theirs in zip(read_rig(tmp_path / "rig.h5").cameras, read_rig(rig_file).cameras, strict=True):
+        # round-off: sums run in an order that depends on where arrays lie in memory
+        assert_allclose(ours.parameters, theirs.parameters, rtol=1e-9, atol=1e-9)
+
+
+def test_views_of_two_files_must_pair_up_and_not_be_a_whole_recording(tmp_path, rng):
+    images = rng.integers(0, 256, (501, 8, 8), dtype=np.uint8)
+    write_mraw(tmp_path / "left", images[:20], 8)
+    write_mraw(tmp_path / "right", images[:19], 8)
+    with pytest.raises(RecordingError, match=r"20 left and 19 right.*left frame 19"):
+        find_views("left.cih", "right.cih", tmp_path)
+    write_mraw(tmp_path / "right", images, 8)
+    with pytest.raises(RecordingError, match="501 frames for the right camera, and every frame is a view"):
+        find_views("left.cih", "right.cih", tmp_path)
 
 
 def test_headers_that_contradict_the_recording_stop_it_before_any_work(recording, capsys):
