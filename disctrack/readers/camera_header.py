@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-import numpy as np
-
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
 SAME_EXPOSURE = 0.01  # relative; the two cameras' clocks round to different ticks
-SAME_INSTANT = 0.05  # of a frame period
 SAME_TAKE_S = 600.0  # computers' clocks, and the time that saving one camera after the other takes
 
 
@@ -81,8 +78,9 @@ def check_headers(left: FrameReader, right: FrameReader, frame_rate: float, decl
     if ours is None or theirs is None:
         return warnings
     _check_same_rate(ours, theirs)
-    doubts = (*_first_frames(ours, theirs), *_exposures(ours, theirs), *_takes(ours, theirs))
-    return (*warnings, *doubts, *_instants(left, right, ours, theirs))
+    doubts = _first_frames(ours, theirs)
+    _check_start(ours, theirs)
+    return (*warnings, *doubts, *_exposures(ours, theirs), *_takes(ours, theirs))
 
 
 def _check_rate(header: CameraHeader, camera: str, frame_rate: float, declared_in: str) -> None:
@@ -154,33 +152,24 @@ def _takes(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
     )
 
 
-def _instants(left: FrameReader, right: FrameReader, ours: CameraHeader, theirs: CameraHeader) -> tuple[str, ...]:
-    """Compare the times of the frames: from each camera's trigger, or as they are where both clocks are locked."""
-    if ours.first_time is None or theirs.first_time is None or left.timestamps is None or right.timestamps is None:
-        return ()
-    n = min(len(left.timestamps), len(right.timestamps))
-    later = (theirs.first_time - ours.first_time) + (right.timestamps[:n] - left.timestamps[:n])
-    since = "the trigger"
-    if ours.locked_clock and theirs.locked_clock and ours.trigger_time and theirs.trigger_time:
-        later += theirs.trigger_time - ours.trigger_time
-        since = "the common clock"
-    period = 1.0 / ours.frame_rate
-    middle, spread = float(np.median(later)), float(np.ptp(later))
-    if abs(middle) > 0.5 * period:
+def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] | None:
+    """How much later [s] the right camera took its frame 0, and since when that is counted; None if not told.
+
+    Absolute where both clocks follow a common time signal, otherwise from each camera's own trigger.
+    """
+    if left.first_time is None or right.first_time is None:
+        return None
+    later = right.first_time - left.first_time
+    if left.locked_clock and right.locked_clock and left.trigger_time and right.trigger_time:
+        return later + (right.trigger_time - left.trigger_time), "the common clock's zero"
+    return later, "the trigger"
+
+
+def _check_start(left: CameraHeader, right: CameraHeader) -> None:
+    offset, period = start_offset(left, right), 1.0 / left.frame_rate
+    if offset is not None and abs(offset[0]) > 0.5 * period:
         raise RecordingError(
-            f"by the time stamps, counted from {since}, frame i of the right camera ({theirs.file}) was taken "
-            f"{1e6 * middle:.4g} us after frame i of the left one ({ours.file}); a frame lasts {1e6 * period:.4g} us. "
+            f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was "
+            f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s. "
             "Export the frames of the same instants, of the same take."
         )
-    warnings = []
-    if abs(middle) > SAME_INSTANT * period:
-        warnings.append(
-            f"by the time stamps, the right camera's frames were taken {1e6 * middle:.3g} us after the left one's: the "
-            "cameras were not synchronised. The motion in between is in every pose"
-        )
-    if spread > SAME_INSTANT * period:
-        warnings.append(
-            f"by the time stamps, the time between a left frame and its right one changes by {1e6 * spread:.3g} us in "
-            "the recording: a camera lost frames, or each ran on a clock of its own"
-        )
-    return tuple(warnings)

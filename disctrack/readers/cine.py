@@ -236,9 +236,7 @@ def _times(cine: _Cine) -> tuple[NDArray[np.float64] | None, list[str]]:
     steps, rate = np.diff(times), float(cine.field("FrameRate") or 0)
     if len(steps) and not ((steps > 0).all() and abs(float(np.median(steps)) * rate - 1) < 0.01):
         return None, [f"the time stamps do not belong to a recording with {rate:g} Hz; they are not used"]
-    gaps = np.flatnonzero(steps * rate > 1.5)
-    where = ", ".join(f"{gap}" for gap in gaps[:3]) + (", ..." if len(gaps) > 3 else "")
-    return times, [f"by the time stamps, frames are missing after frame {where}"] if len(gaps) else []
+    return times, []
 
 
 def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:

@@ -1,7 +1,6 @@
 """Time stamps that a file keeps for its frames: can they be used, and do both cameras tell the same times?
 
-A camera's own formats carry headers with a known meaning (`camera_header`); here are the stamps of files that other
-programs wrote, so doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
+Doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
-from disctrack.readers.camera_header import header_of
+from disctrack.readers.camera_header import header_of, start_offset
 
 Array = NDArray[np.float64]
 
@@ -30,12 +29,13 @@ def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
 def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) -> tuple[str, ...]:
     """Warnings: stamps that are not used and why, frames lost by each camera, and cameras that do not run together.
 
-    frame_rate [Hz] as declared. Cameras' own formats are left to `camera_header`.
+    frame_rate [Hz] as declared. Times count from frame 0 where the file has a camera's header, which tells how they lie
+    to the other camera's.
     """
     warnings: list[str] = []
     usable: list[Array] = []
     for camera, reader in zip(CAMERAS, (left, right), strict=True):
-        if reader.timestamps is None or header_of(reader) is not None:
+        if reader.timestamps is None:
             continue
         fault = _fault(reader.timestamps, frame_rate)
         if fault:
@@ -43,8 +43,10 @@ def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) 
         else:
             usable.append(reader.timestamps)
             warnings += _lost_frames(camera, reader.timestamps, frame_rate)
-    if len(usable) == 2 and len(usable[0]) == len(usable[1]):
-        warnings += _between_cameras(usable[0], usable[1], 1.0 / frame_rate)
+    ours, theirs = header_of(left), header_of(right)
+    offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
+    if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
+        warnings += _between_cameras(usable[0], usable[1] + (0.0 if offset is None else offset[0]), 1.0 / frame_rate)
     return tuple(warnings)
 
 
