@@ -17,12 +17,12 @@ from disctrack.errors import RecordingError
 from disctrack.first_pass import MotionSpan, find_motion
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader, open_frames
-from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, iter_pair_blocks
+from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
 from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording import Recording
 from disctrack.storage import Provenance
-from disctrack.tracking import TrackingSettings, prepare, track
+from disctrack.tracking import TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -120,27 +120,34 @@ def measure(
     unreadable: list[Unreadable] = []
     rate = recording.frame_rate
 
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=threads):
-            unreadable.extend(block.unreadable)
-            yield block
-
     stamps = usable_times(pairs.left, rate)
     prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
     began = time.perf_counter()
     span = _span(pairs, rate, settings, threads)
     progress(len(pairs) - (span.stop - span.start))
+    tracked = range(span.start, span.stop)
+    edges = stretch_edges(tracked, recording.disc)
+    workers = _workers(pairs, len(edges) - 1, threads)
+    readers = max(1, (threads or default_threads()) // workers)
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers, breaks=edges):
+            unreadable.extend(block.unreadable)
+            yield block
+
     tracking = track(
         read_blocks,
-        range(span.start, span.stop),
+        tracked,
         rig,
         recording.disc,
         rate,
         gravity=recording.gravity,
         settings=settings,
         timestamps=None if stamps is None else stamps[span.start : span.stop],
+        workers=workers,
         progress=progress,
     )
+    unreadable.sort(key=lambda image: (image.frame, image.camera))
     seconds = time.perf_counter() - began
     findings = {
         "notes": list(pairs.notes),
@@ -160,6 +167,13 @@ def measure(
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     return Measurement(trajectory, tuple(unreadable), findings, seconds)
+
+
+def _workers(pairs: ImagePairs, stretches: int, threads: int | None) -> int:
+    """Stretches of the recording that are followed side by side: one per core, where frames can be read anywhere."""
+    if not (pairs.left.random_access and pairs.right.random_access):
+        return 1
+    return max(1, min(threads or default_threads(), stretches))
 
 
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:

@@ -7,10 +7,12 @@ none.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
+from threading import Event
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +26,7 @@ from disctrack.acquisition import acquire, symmetry_order
 from disctrack.as_built import MIN_MARKER_SHIFT, AsBuilt, refine_as_built
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
+from disctrack.first_pass import StillScene
 from disctrack.markers import (
     TYPICAL_BLUR_PX,
     DotCentres,
@@ -64,8 +67,11 @@ MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
 MIN_GOOD_DOT_IMAGES = 6
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
-MIN_PAIRS_PER_WORKER = 200  # a stretch must outweigh its own search for the disc
 FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
+SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
+MOST_STRETCHES = 16
+MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
+SEARCH_AGAIN = 50  # frames after which a disc that was not found is searched for though the scene has not changed
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
 
@@ -109,9 +115,12 @@ class _Tables:
     frame_status: NDArray[np.uint8]  # (n,)
 
 
+Law = tuple[list[NoiseModel], list[float]]  # noise and blur [px] of the left and the right camera
+
+
 @dataclass
 class _Follower:
-    """The state of the compiled loop between blocks."""
+    """The state of the compiled loop between blocks, in one stretch of the recording."""
 
     rig: StereoRig
     disc: Disc
@@ -127,6 +136,19 @@ class _Follower:
     acquisitions: int = 0
     first_reason: str = ""
     saturated: tuple[int | None, int | None] = (None, None)  # grey value at which the dots' background is clipped
+    given: Callable[[], Law | None] = lambda: None  # noise and blur that an earlier stretch has measured
+    law: Future[Law | None] = field(default_factory=Future)  # what this stretch measured; None if it did not
+    seen: _Seen | None = None  # what the images showed where the disc was last not found
+
+    def keep_law(self) -> None:
+        """Keep noise and blur as they are, and let later stretches have them."""
+        self.measured = True
+        self.law.set_result((list(self.noise), list(self.blur)))
+
+    def finish(self) -> None:
+        """Let nobody wait for a law that was never measured."""
+        if not self.law.done():
+            self.law.set_result(None)
 
     def run(self, images: Images, readable: NDArray[np.bool_], tables: _Tables, at: slice) -> int:
         """Follow the disc through images; returns the number of frames before it was lost."""
@@ -182,9 +204,9 @@ def track(
     """Measure the disc's pose in every pair of a recording.
 
     read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; pairs: which to measure (step 1).
-    frame_rate [Hz]; timestamps (len(pairs),) [s] where the camera wrote them. workers: stretches of the recording
-    followed side by side; more than one pays where frames come at the speed of memory. progress(n) is called when n
-    more pairs are done, from any thread.
+    frame_rate [Hz]; timestamps (len(pairs),) [s] where the camera wrote them. workers: threads that follow stretches
+    of a long recording side by side; the result is the same to the last bit for any number of them, if the reader
+    begins a block at each of `stretch_edges`. progress(n) is called when n more pairs are done, from any thread.
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
     settings = settings or TrackingSettings()
@@ -198,37 +220,72 @@ def track(
         )
     tables = _empty_tables(n, disc.n_markers)
     maps = [normalised_maps(camera) for camera in rig.cameras]
-    follower = _Follower(
-        rig,
-        disc,
-        settings.limits,
-        np.stack([x for x, _ in maps]),
-        np.stack([y for _, y in maps]),
-        [NoiseModel(1.0, 0.02), NoiseModel(1.0, 0.02)],
-        [TYPICAL_BLUR_PX, TYPICAL_BLUR_PX],
-        (np.eye(3), np.zeros(3)),
-        (np.eye(3), np.zeros(3)),
-    )
+    maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
+    edges = stretch_edges(pairs, disc)
+    followers = [
+        _Follower(
+            rig,
+            disc,
+            settings.limits,
+            maps_x,
+            maps_y,
+            [NoiseModel(1.0, 0.02), NoiseModel(1.0, 0.02)],
+            [TYPICAL_BLUR_PX, TYPICAL_BLUR_PX],
+            (np.eye(3), np.zeros(3)),
+            (np.eye(3), np.zeros(3)),
+        )
+        for _ in edges[1:]
+    ]
+    for number, follower in enumerate(followers):
+        follower.given = partial(_first_law, followers[:number])
 
-    def follow(stretch: _Follower, start: int, stop: int) -> _Follower:
+    given_up = Event()
+
+    def follow(share: range) -> None:
+        """Follow the disc through neighbouring stretches."""
+        number = share.start
+        try:
+            for block in read_blocks(edges[share.start], edges[share.stop]):
+                _check_images(block.images, rig)
+                for part in _cut(block, edges):
+                    while part.start >= edges[number + 1]:
+                        followers[number].finish()
+                        number += 1
+                    rows = slice(part.start - int(block.frames[0]), part.stop - int(block.frames[0]))
+                    at = part.start - pairs.start
+                    _follow_block(followers[number], block.images[rows], block.readable[rows], tables, at)
+                progress(len(block.images))
+                if given_up.is_set():
+                    break
+        finally:  # nobody may wait for what will not come
+            for k in share:
+                followers[k].finish()
+
+    def carry_on(before: _Follower, stretch: _Follower, start: int, stop: int) -> None:
+        """Follow a stretch again from where the one before it ended."""
+        stretch.last, stretch.before = ((R.copy(), t.copy()) for R, t in (before.last, before.before))
+        stretch.tracking = True
+        stretch.noise, stretch.blur, stretch.measured = before.noise, before.blur, True
+        _clear(tables, slice(start - pairs.start, stop - pairs.start))
         for block in read_blocks(start, stop):
-            _check_images(block.images, rig)
             _follow_block(stretch, block.images, block.readable, tables, int(block.frames[0]) - pairs.start)
-            progress(len(block.images))
-        return stretch
 
-    workers = max(1, min(workers, n // MIN_PAIRS_PER_WORKER))
-    edges = [pairs.start + k * n // workers for k in range(workers + 1)]
+    workers = max(1, min(workers, len(followers)))
+    shares = [range(k * len(followers) // workers, (k + 1) * len(followers) // workers) for k in range(workers)]
     if workers == 1:
-        followers = [follow(follower, pairs.start, pairs.stop)]
+        follow(shares[0])
     else:
-        with ThreadPoolExecutor(workers) as pool:
-            # every stretch searches for the disc at its own start; each keeps its own blur and noise
-            stretches = [
-                pool.submit(follow, replace(follower, noise=list(follower.noise), blur=list(follower.blur)), a, b)
-                for a, b in pairwise(edges)
-            ]
-            followers = [stretch.result() for stretch in stretches]
+        with ThreadPoolExecutor(workers, thread_name_prefix="track") as pool:
+            running = [pool.submit(follow, share) for share in shares]
+            try:
+                for share in running:
+                    share.result()
+            except BaseException:  # an interrupt must not wait for the end of the recording
+                given_up.set()
+                raise
+    for k in range(1, len(followers)):
+        if _torn(tables, edges[k] - pairs.start):  # another branch of phi was found: go on from the stretch before
+            carry_on(followers[k - 1], followers[k], edges[k], edges[k + 1])
     if not np.isfinite(tables.t).any():
         reason = next((f.first_reason for f in followers if f.first_reason), "no image could be read")
         raise TrackingError(
@@ -237,6 +294,40 @@ def track(
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     return _assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
+
+
+def stretch_edges(pairs: range, disc: Disc) -> list[int]:
+    """First pairs of the stretches that a recording is followed in, and the end of the last.
+
+    They depend on the length alone, so that the result does not depend on who follows them. Where the dots leave phi
+    open by a symmetry, every new start could choose another branch: then there is one stretch.
+    """
+    n, count = len(pairs), 1
+    while n >= SHORTEST_SPLIT * count**2 and count < MOST_STRETCHES and symmetry_order(disc) == 1:
+        count *= 2
+    return [pairs.start + k * n // count for k in range(count + 1)]
+
+
+def _cut(block: PairBlock, edges: Sequence[int]) -> list[range]:
+    """The block's frames without any edge inside."""
+    first, stop = int(block.frames[0]), int(block.frames[-1]) + 1
+    inside = [first, *(edge for edge in edges if first < edge < stop), stop]
+    return [range(a, b) for a, b in pairwise(inside)]
+
+
+def _first_law(earlier: Sequence[_Follower]) -> Law | None:
+    """Noise and blur of the first stretch that could measure them; waits for those that are not done."""
+    return next((law for follower in earlier if (law := follower.law.result()) is not None), None)
+
+
+def _torn(tables: _Tables, edge: int) -> bool:
+    """True where the poses before row `edge` do not lead to its own: two starts took different dots for the same."""
+    rows = slice(edge - 2, edge + 1)
+    if not (tables.frame_status[rows] == FrameStatus.MEASURED).all():
+        return False
+    before, last, here = tables.R[rows]
+    miss = (last @ before.T @ last).T @ here
+    return bool(np.arccos(np.clip((np.trace(miss) - 1) / 2, -1, 1)) > MAX_EDGE_TURN)
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
@@ -275,6 +366,12 @@ def _empty_tables(n: int, m: int) -> _Tables:
     )
 
 
+def _clear(tables: _Tables, rows: slice) -> None:
+    empty = _empty_tables(1, tables.status.shape[2])
+    tables.results[rows], tables.status[rows] = empty.results, empty.status
+    tables.R[rows], tables.t[rows], tables.frame_status[rows] = empty.R, empty.t, empty.frame_status
+
+
 def _check_images(images: Images, rig: StereoRig) -> None:
     height, width = images.shape[-2:]
     for name, camera in zip(frames.CAMERAS, rig.cameras, strict=True):
@@ -297,8 +394,9 @@ def _follow_block(
             i += 1
             continue
         fresh = not follower.tracking
-        if fresh and not _acquire(follower, images[i:], readable[i:]):
+        if fresh and (_as_before(follower, images[i], readable[i]) or not _acquire(follower, images[i:], readable[i:])):
             tables.frame_status[start + i] = FrameStatus.MARKERS_NOT_FOUND
+            _remember(follower, images[i:], readable[i:])
             i += 1
             continue
         done = follower.run(images[i:], readable[i:], tables, slice(start + i, start + n))
@@ -309,7 +407,35 @@ def _follow_block(
             if fresh and done == 0:  # found by its blobs, but its dots are refused: this frame has no answer
                 tables.frame_status[start + i] = FrameStatus.MARKERS_NOT_FOUND
                 follower.first_reason = follower.first_reason or _refusals(tables.status[start + i])
+                _remember(follower, images[i:], readable[i:])
                 i += 1
+
+
+@dataclass
+class _Seen:
+    """A pair in which the disc was not found."""
+
+    scenes: tuple[StillScene, StillScene]
+    good_for: int  # more frames
+
+
+def _remember(follower: _Follower, images: Images, readable: NDArray[np.bool_]) -> None:
+    """Keep the pair in which the disc was not found, with the noise that its neighbour tells."""
+    if follower.seen is None and len(images) > 1 and readable[:2].all():
+        left, right = (StillScene(images[0, camera], images[1, camera]) for camera in (0, 1))
+        follower.seen = _Seen((left, right), SEARCH_AGAIN)
+
+
+def _as_before(follower: _Follower, images: Images, readable: NDArray[np.bool_]) -> bool:
+    """True where a pair shows what it showed when the disc was not found: a search costs fifty times as much."""
+    seen = follower.seen
+    if seen is None:
+        return False
+    seen.good_for -= 1
+    if seen.good_for > 0 and readable.all() and not any(map(StillScene.differs, seen.scenes, images)):
+        return True
+    follower.seen = None
+    return False
 
 
 def _refusals(status: NDArray[np.uint8]) -> str:
@@ -339,6 +465,9 @@ def _acquire(follower: _Follower, images: Images, readable: NDArray[np.bool_]) -
     following = None
     if len(found) == 2 and found[1].R_world_body is not None and found[1].t_world_body is not None:
         following = (found[1].R_world_body, found[1].t_world_body)
+    if not follower.measured and (law := follower.given()) is not None:
+        follower.noise, follower.blur = list(law[0]), list(law[1])
+        follower.keep_law()
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, pose, following)
     follower.start_from(pose, following)
@@ -394,7 +523,7 @@ def _measure_blur_and_noise(
         _saturated(images[:done, 0], trial.results[:done, 0], follower.noise[0]),
         _saturated(images[:done, 1], trial.results[:done, 1], follower.noise[1]),
     )
-    follower.measured = True
+    follower.keep_law()
 
 
 def _saturated(images: Images, results: Array, noise: NoiseModel) -> int | None:
@@ -416,7 +545,7 @@ def _assemble(
     time: Array,
     pairs: range,
 ) -> Tracking:
-    first = followers[0]
+    first = next((follower for follower in followers if follower.measured), followers[0])
     dots = dot_centres(tables.results, tables.status)
     as_built = refine_as_built(
         dots.pixels,

@@ -48,7 +48,7 @@ def add_track_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--csv", action="store_true", help="also write the trajectory as a table (mm, deg)")
     parser.add_argument("--no-figures", action="store_true", help="no pictures")
     parser.add_argument("--no-video", action="store_true", help="no overlay video")
-    parser.add_argument("--threads", type=_positive, help="threads that read images (default: one per core)")
+    parser.add_argument("--threads", type=_positive, help="threads that read and track (default: one per core)")
 
 
 def add_calibration_options(parser: argparse.ArgumentParser) -> None:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +81,11 @@ def iter_pair_blocks(
     stop: int | None = None,
     block: int | None = None,
     threads: int | None = None,
+    breaks: Sequence[int] = (),
 ) -> Iterator[PairBlock]:
     """Pairs start..stop-1 in blocks of `block` pairs, two blocks read ahead while the caller works on a third.
+
+    breaks : pairs that a block begins with, whatever came before
 
     An image that cannot be read is named in the block's `unreadable`; the others are delivered. The default block
     holds BLOCK_BYTES, so that the memory is independent of the recording's length and of the image size.
@@ -92,7 +96,9 @@ def iter_pair_blocks(
     width, height = left.image_size
     dtype = np.uint8 if left.bit_depth == 8 else np.uint16
     block = block or int(np.clip(BLOCK_BYTES // (2 * width * height * np.dtype(dtype).itemsize), 1, 256))
-    starts = range(start, stop, block)
+    parts = [start, *(edge for edge in sorted(breaks) if start < edge < stop), stop]
+    starts = [first for a, b in pairwise(parts) for first in range(a, b, block)]
+    stops = [*starts[1:], stop]
     n_ahead = min(2, max(len(starts) - 1, 0))
     ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]
     pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
@@ -104,12 +110,11 @@ def iter_pair_blocks(
     try:
         for number, first in enumerate(starts):
             for ahead in range(number + len(pending), min(number + n_ahead + 1, len(starts))):
-                begin = starts[ahead]
                 pending.append(
-                    _submit(pools, (left, right), range(begin, min(begin + block, stop)), ring[ahead % len(ring)])
+                    _submit(pools, (left, right), range(starts[ahead], stops[ahead]), ring[ahead % len(ring)])
                 )
             unreadable = [image for future in pending.pop(0) for image in future.result()]
-            frames = np.arange(first, min(first + block, stop))
+            frames = np.arange(first, stops[number])
             yield PairBlock(frames, ring[number % len(ring)][: len(frames)], tuple(unreadable))
     finally:
         for threads_of_one in {pool, *pools}:
