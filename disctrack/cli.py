@@ -16,6 +16,8 @@ from disctrack import __version__
 # The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
 # save. It must stand before numpy is loaded; a user's own setting is kept.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# A damaged image is reported once, in our words with file and frame, not in the decoder's log as well.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 # In the order of the measurement: name -> (module, what it does).
 COMMANDS: dict[str, tuple[str, str]] = {

@@ -13,6 +13,7 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -40,10 +41,15 @@ def is_stack(file: Path) -> bool:
     """True for a TIFF file that holds more than one frame; False also for what is no TIFF file at all."""
     try:
         tiff = _Tiff(RawFile(file))
-        directory, following = tiff.directory(tiff.first)
-        return following != 0 or _imagej_pages(tiff.description(directory)) > 1
+        first, following = tiff.directory(tiff.first)
+        if not following:
+            return _imagej_pages(tiff.description(first)) > 1
     except RecordingError:
         return False
+    try:  # a thumbnail may follow, which is no frame
+        return any(not tiff.value(tags, _SUBFILE, 0) & _REDUCED_IMAGE for _, tags in islice(_chain(tiff), 1, None))
+    except RecordingError:
+        return True  # cut short after the first page
 
 
 def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
@@ -352,7 +358,7 @@ def _raw_offset(tiff: _Tiff, tags: Mapping[int, _Tag], size: int) -> int:
         return -1
     if any(tiff.value(tags, tag, 1) not in allowed for tag, allowed in plain.items()):
         return -1
-    places = tiff.values(tags, _STRIP_OFFSETS)
+    places = [min(place, tiff.file.size) for place in tiff.values(tags, _STRIP_OFFSETS)]  # beyond it nothing lies
     if len(places) == 1:
         return places[0]
     counts = tiff.values(tags, _STRIP_COUNTS)
