@@ -72,12 +72,12 @@ class CameraFrames(RawFrames):
         notes: tuple[str, ...] = (),
         timestamps: NDArray[np.float64] | None = None,
     ) -> None:
-        """Frames whose pixels begin at offsets (n,); those beyond the end of the file are lost frames.
+        """Frames whose pixels begin at offsets (n,), below 0 where the file holds none; beyond its end they are lost.
 
         What n is must have passed `check_present`.
         """
         lost = len(offsets) - count_present(file, layout, offsets)
-        cut = (f"{file.path}: ends before {lost} of {len(offsets)} frames; they are left without an answer",)
+        cut = (f"{file.path}: lacks {lost} of {len(offsets)} frames; they are left without an answer",)
         super().__init__(
             [file],
             np.broadcast_to(np.uint8(0), len(offsets)),
@@ -96,13 +96,16 @@ class CameraFrames(RawFrames):
 
     def read(self, index: int, out: Frame | None = None) -> Frame:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
+        file, offset = self.files[0], int(self.offsets[index])
+        where = f"{file.path} ({self.camera} camera, frame {index})"
+        if offset < 0:
+            raise RecordingError(f"{where}: there is no image of the right size where the file says. Copy it again.")
         if self.layout.is_plain:
             return super().read(index, out)
         stored = getattr(self._scratch, "stored", None)
         if stored is None:
             stored = self._scratch.stored = np.empty(self.frame_bytes, np.uint8)
-        file = self.files[0]
-        file.read_into(stored, int(self.offsets[index]), f"{file.path} ({self.camera} camera, frame {index})")
+        file.read_into(stored, offset, where)
         shape = self.image_size[::-1]
         image = out
         if image is None or image.shape != shape or image.dtype != self.dtype or not image.flags.c_contiguous:

@@ -74,7 +74,6 @@ class _Cine:
     """The headers of one file."""
 
     file: RawFile
-    compression: int  # 0 grey values or interpolated colours, 1 JPEG, 2 colours as the sensor has them
     first_image: int  # relative to the trigger
     n_images: int
     table: int  # offset of the table of images
@@ -107,7 +106,7 @@ def _read_headers(file: RawFile) -> _Cine:
     mark, _, compression, version, _, _, first, n, bitmap_at, setup_at, table, fraction, second = head
     if mark != b"CI" or version > 1:
         raise RecordingError(f"{path}: not a cine file of a known version. Export the recording again.")
-    if compression == 1:
+    if compression == 1:  # 0: as they are; 2: as the sensor has them, which is grey without a colour filter
         raise RecordingError(f"{path}: a compressed cine (JPEG). Save it uncompressed: cine raw.")
     bitmap = _BITMAP_HEADER.unpack(file.bytes_at(bitmap_at, _BITMAP_HEADER.size, f"{path}: bitmap header"))
     _, width, height, _, bits, packing, image_bytes = bitmap
@@ -118,7 +117,6 @@ def _read_headers(file: RawFile) -> _Cine:
         raise RecordingError(f"{path}: no camera setup where the header says. Export the recording again.")
     return _Cine(
         file=file,
-        compression=compression,
         first_image=first,
         n_images=n,
         table=table,

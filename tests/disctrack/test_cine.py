@@ -215,7 +215,7 @@ def test_a_file_cut_short_loses_only_its_end(tmp_path, rng, bits, packed, larges
     os.truncate(file, file.stat().st_size - 2 * each - 1)
     reader = open_frames("left.cine", tmp_path, "left")
     assert len(reader) == 7
-    assert any("ends before 3 of 7 frames" in note for note in reader.notes)
+    assert any("lacks 3 of 7 frames" in note for note in reader.notes)
     assert_array_equal(reader.read(3), grey_of(codes[3], bits, packed))
     for index in (4, 6):
         with pytest.raises(RecordingError, match=rf"left\.cine \(left camera, frame {index}\).*copy it again"):
@@ -223,6 +223,24 @@ def test_a_file_cut_short_loses_only_its_end(tmp_path, rng, bits, packed, larges
     os.truncate(file, file.stat().st_size - 2 * each)
     with pytest.raises(RecordingError, match="cut short"):
         open_frames("left.cine", tmp_path, "left")
+
+
+def test_a_damaged_record_is_one_lost_frame(tmp_path, rng):
+    codes = random_codes(rng, 8)
+    file = write_cine(tmp_path / "left.cine", codes, 8, notes=(8, 12))
+    content = bytearray(file.read_bytes())
+    (table,) = struct.unpack_from("<I", content, 32)
+    (record,) = struct.unpack_from("<q", content, table + 8 * 4)
+    content[record + 4] ^= 1  # the size behind its note of 8 bytes
+    file.write_bytes(content)
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert any("lacks 1 of 7 frames" in note for note in reader.notes)
+    for index in range(7):
+        if index == 4:
+            with pytest.raises(RecordingError, match=r"frame 4\): there is no image of the right size"):
+                reader.read(index)
+        else:
+            assert_array_equal(reader.read(index), codes[index])
 
 
 def pair(folder: Path, rng, left=None, right=None):

@@ -161,7 +161,7 @@ def test_a_file_cut_short_loses_only_its_end(tmp_path, rng, bits):
     os.truncate(file, file.stat().st_size * 5 // 7 - 1)
     reader = open_frames("left.cih", tmp_path, "left")
     assert len(reader) == 7
-    assert any("ends before 3 of 7 frames" in note for note in reader.notes)
+    assert any("lacks 3 of 7 frames" in note for note in reader.notes)
     assert_array_equal(reader.read(3), images[3])
     for index in (4, 6):
         with pytest.raises(RecordingError, match=rf"left\.mraw \(left camera, frame {index}\).*copy it again"):
