@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 _DEPTHS = (8, 10, 12, 14, 16)
+_DEFLATE, _SHUFFLE = 1, 2  # filters by their registered numbers
+_SMALL = 1 << 12  # bytes: what deflate may add to what it cannot compress
 
 
 def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
@@ -129,6 +132,11 @@ def _frames_stored(stack: Any) -> int:
     return int(stack.id.get_num_chunks()) * int(stack.chunks[0])
 
 
+def _filters(stack: Any) -> set[int]:
+    plist = stack.id.get_create_plist()
+    return {int(plist.get_filter(i)[0]) for i in range(plist.get_nfilters())}
+
+
 def _attribute(stack: Any, name: str) -> float | None:
     """A number among the attributes of the data set or of its group."""
     for owner in (stack, stack.parent):
@@ -152,9 +160,11 @@ def _timestamps(stack: Any, n: int, where: str) -> NDArray[np.float64] | None:
 
 
 class Hdf5Frames:
-    """A data set in chunks, with or without compression; see FrameReader. The library reads one thing at a time."""
+    """A data set in chunks, with or without compression; see FrameReader.
 
-    random_access = False
+    The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are, it delivers
+    the compressed bytes only, and frames are inflated side by side.
+    """
 
     def __init__(
         self,
@@ -173,6 +183,10 @@ class Hdf5Frames:
         self.dtype = stack.dtype.newbyteorder("=")
         self.bit_depth = bit_depth or 8 * self.dtype.itemsize
         self.timestamps, self.frame_rate = timestamps, frame_rate
+        self._shuffled = _SHUFFLE in _filters(stack)
+        self.random_access = self._inflated_here = bool(
+            stack.chunks == (1, *stack.shape[1:]) and _DEFLATE in _filters(stack) <= {_SHUFFLE, _DEFLATE}
+        )
         frames_per_chunk = stack.chunks[0] if stack.chunks else 1
         chunk_row = frames_per_chunk * self.image_size[0] * self.image_size[1] * self.dtype.itemsize
         self.notes: tuple[str, ...] = ()
@@ -195,24 +209,47 @@ class Hdf5Frames:
         image = out
         if image is None or image.dtype != self.dtype or not image.flags.c_contiguous:
             image = np.empty(self.image_size[::-1], self.dtype)
+        content = None
         with self._lock:
             try:
-                if self._never_written(index):
+                size = self._stored_size(index)
+                if size == 0:
                     raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
-                self._stack.read_direct(image, np.s_[index])
+                if self._inflated_here and size <= 2 * image.nbytes + _SMALL:
+                    mask, content = self._stack.id.read_direct_chunk((index, 0, 0))
+                    content = None if mask else content  # some filter was left out
+                if content is None:
+                    self._stack.read_direct(image, np.s_[index])
             except (OSError, RuntimeError, ValueError) as error:
                 raise RecordingError(f"{where}: cannot be read ({error}). Copy the file again.") from error
+        if content is not None:
+            self._inflate(content, image, where)
         if out is None or image is out:
             return image
         out[...] = image
         return out
 
-    def _never_written(self, index: int) -> bool:
-        """True where a frame has no chunk: the library would deliver zeros for it without a word."""
+    def _inflate(self, content: bytes, image: Frame, where: str) -> None:
+        """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
+        inflater = zlib.decompressobj()
+        try:
+            raw = np.frombuffer(inflater.decompress(content, image.nbytes), np.uint8)  # never more than announced
+            inflater.decompress(inflater.unconsumed_tail, 1)
+        except zlib.error as error:
+            raise RecordingError(f"{where}: damaged ({error}). Copy the file again.") from error
+        if raw.nbytes != image.nbytes or not inflater.eof:
+            raise RecordingError(f"{where}: damaged ({raw.nbytes} of {image.nbytes} bytes). Copy the file again.")
+        if self._shuffled and self.dtype.itemsize > 1:
+            raw = np.ascontiguousarray(raw.reshape(self.dtype.itemsize, -1).T).reshape(-1)
+        image[...] = raw.view(self._stack.dtype).reshape(image.shape)
+
+    def _stored_size(self, index: int) -> int:
+        """Bytes of the frame's first chunk; 0 where there is none: the library would deliver zeros without a word."""
         if self._stack.chunks is None:
-            return False
+            return 1
         place = (index - index % self._stack.chunks[0], 0, 0)
-        return bool(self._stack.id.get_chunk_info_by_coord(place).byte_offset is None)
+        info = self._stack.id.get_chunk_info_by_coord(place)
+        return 0 if info.byte_offset is None else int(info.size)
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of size, type and grey values of frames start..stop-1."""

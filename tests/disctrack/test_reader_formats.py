@@ -88,6 +88,8 @@ FORMATS = [
     *(Format("tiff", bits, write_pages_by_opencv, {"compression": c}) for bits in (8, 16) for c in (1, 5, 8, 32773)),
     Format("h5", 8, write_hdf5, {}),
     Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}),
+    Format("h5", 8, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip"}),
+    Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "fletcher32": True}),
     Format("h5", 8, write_hdf5, {"chunks": (7, 10, WIDTH), "compression": "lzf", "fletcher32": True}),
     *(
         Format(suffix, bits, write_video, {"pixels": pixels, "codec": codec, **options})
@@ -195,6 +197,17 @@ def test_hdf5_frames_that_were_never_written_are_not_taken_for_black(tmp_path):
         open_frames("stack.h5:/huge", tmp_path, "left")
     with pytest.raises(RecordingError, match="without frames"):
         open_frames("stack.h5:/empty", tmp_path, "left")
+
+
+@pytest.mark.parametrize("options", [{}, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}])
+@pytest.mark.parametrize("dtype", ["<u2", ">u2"])
+def test_hdf5_of_any_byte_order_behind_a_user_block(tmp_path, options, dtype):
+    frames = frames_of(16)
+    with h5py.File(tmp_path / "left.h5", "w", userblock_size=1024) as file:
+        file.create_dataset("frames", data=frames.astype(dtype), **options)
+    reader = open_frames("left.h5", tmp_path, "left")
+    for index in (0, 7, N - 1):
+        assert_array_equal(reader.read(index), frames[index])
 
 
 def test_luma_of_limited_range_is_not_stretched(tmp_path):
