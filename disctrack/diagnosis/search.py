@@ -16,6 +16,7 @@ from scipy import stats
 
 from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
+from disctrack.diagnosis.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.diagnosis.score import Linearisation, Score, angle, score_all, score_pairs
 from disctrack.diagnosis.system import Candidate, Quantity, System, Values
 
@@ -107,21 +108,27 @@ def diagnose(
     start : values of the base quantities from which Gauss-Newton converges
     rows : (n,) samples of the fits that are judged by the others; the first part of the time, if not given
     """
-    return _Search(system, settings or Settings(), rows).run(start)
+    settings = settings or Settings()
+    base = fit(system, system.base, start)
+    if not base.converged:
+        return _refusal(base, settings)
+    modes = common_modes(system, base) if settings.noise is None else None
+    answer = _Search(whitened(system, modes), settings, rows).run(base)
+    if modes is not None and answer.found:  # a large effect that moves fast looks like scatter of the frames
+        again = common_modes(system, answer.after)
+        if again is None or again[1].size < modes[1].size:
+            answer = _Search(whitened(system, again), settings, rows).run(base)
+    return answer
 
 
 def noise_variance(system: System, fit_: Fit) -> float:
     """Variance of the fast part of the residual over that stated, from third differences in time.
 
-    Whatever is missing in a model of a motion that is sampled well moves slowly from sample to sample; differences of
-    third order pass white noise (variance 20) and stop the rest. 1 where there are too few samples for that.
+    1 where there are too few samples for that.
     """
-    residual, _ = system.linearise(fit_.values, [])
-    present = system.weights > 0
-    rows = np.flatnonzero(present[3:] & present[2:-1] & present[1:-2] & present[:-3])
+    difference, rows = third_differences(system, fit_)
     if len(rows) < 20:
         return 1.0
-    difference = np.diff(residual, 3, axis=0)[rows]
     return float(np.sum(difference**2) / 20.0 / np.sum(system.weights[rows]))
 
 
@@ -131,13 +138,17 @@ class _Search:
         self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
         self.noise = 1.0
         self.refits: dict[str, Trial] = {}
+        self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
+        self.free_runs: list[tuple[Fit, HeldOut]] = []
 
-    def run(self, start: Values) -> Diagnosis:
-        base = fit(self.system, self.system.base, start)
-        if not base.converged:
-            return self._refusal(base)
-        stated = self.settings.noise
-        self.noise = max(noise_variance(self.system, base) if stated is None else stated, 1e-12)
+    def run(self, start: Fit) -> Diagnosis:
+        base = start
+        if isinstance(self.system, RowWhitened):
+            base = fit(self.system, self.system.base, start.values)
+            if not base.converged:
+                return _refusal(base, self.settings)
+        self.fits[frozenset()] = base
+        self.noise = self._noise(base)
         current = Trial((), base, 0.0, self._held_out(base), 0.0)
         before = current
         linear = Linearisation(self.system, base, self.system.candidates)
@@ -147,12 +158,18 @@ class _Search:
             if better is None:
                 break
             current = self._pruned(better)
+            # a large effect reaches into the fast part of the residual: with it in the model, the noise is seen better
+            self.noise = min(self.noise, self._noise(current.fit))
             linear = Linearisation(self.system, current.fit, self.system.candidates)
         if current.candidates and not self._worth_naming(before, current):
             return self._answer(before, before, (), scores, partial=current)
         current, rivals = self._settled(current)
         found = tuple(self._found(current, c, rivals[c.name]) for c in current.candidates)
         return self._answer(before, current, found, scores)
+
+    def _noise(self, fit_: Fit) -> float:
+        stated = self.settings.noise
+        return max(noise_variance(self.system, fit_) if stated is None else stated, 1e-12)
 
     def _worth_naming(self, before: Trial, after: Trial) -> bool:
         """Does what was found explain the residual, if not to noise then nearly all of it, in the free run too?
@@ -183,14 +200,24 @@ class _Search:
         return tuple(q for q in self.system.base if q.name not in new) + tuple(new.values())
 
     def _held_out(self, fit_: Fit) -> HeldOut:
-        return held_out(self.system, fit_.quantities, fit_.values, self.rows)
+        known = next((held for of, held in self.free_runs if of is fit_), None)
+        if known is None:
+            known = held_out(self.system, fit_.quantities, fit_.values, self.rows)
+            self.free_runs.append((fit_, known))
+        return known
 
     def _fit(self, candidates: Sequence[Candidate], start: Values) -> Fit:
+        key = frozenset(c.name for c in candidates)
+        if key in self.fits:
+            return self.fits[key]
         values = dict(start)
         for c in candidates:
             for name, value in zip(c.names, c.start, strict=False):
                 values.setdefault(name, value)
-        return fit(self.system, self._quantities(candidates), values)
+        found = fit(self.system, self._quantities(candidates), values)
+        if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
+            self.fits[key] = found
+        return found
 
     def _best_fit(self, current: Trial, extra: Sequence[Candidate]) -> Fit:
         """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
@@ -265,7 +292,9 @@ class _Search:
 
     def _at_noise(self, fit_: Fit, gain: float = 0.0) -> bool:
         left = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1)
-        return left <= self.settings.at_noise * self.noise
+        # in a short recording both numbers scatter
+        scatter = np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))
+        return bool(left <= max(self.settings.at_noise, 1.0 + 4.0 * scatter) * self.noise)
 
     def _criterion(self, trial: Trial) -> float:
         return self._cost(trial.fit) + self._price(trial.candidates)
@@ -340,14 +369,6 @@ class _Search:
         gain = self._cost(without) - self._cost(trial.fit)
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(rivals))
 
-    def _refusal(self, base: Fit) -> Diagnosis:
-        reason = (
-            f"the base fit has not converged (chi-square {base.reduced_chi_square:.3g} per degree of freedom after "
-            f"{base.n_iterations} iterations): before it has, every candidate seems to help, so "
-            "that nothing is attributed"
-        )
-        return Diagnosis("unexplained", reason, (), base, base, None, None, np.nan, (), self.settings)
-
     def _answer(
         self,
         before: Trial,
@@ -410,6 +431,15 @@ class _Search:
         if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
             return "the free run over held-out data does not improve"
         return f"gains {gain:.4g}, less than what was chosen"
+
+
+def _refusal(base: Fit, settings: Settings) -> Diagnosis:
+    reason = (
+        f"the base fit has not converged (chi-square {base.reduced_chi_square:.3g} per degree of freedom after "
+        f"{base.n_iterations} iterations): before it has, every candidate seems to help, so "
+        "that nothing is attributed"
+    )
+    return Diagnosis("unexplained", reason, (), base, base, None, None, np.nan, (), settings)
 
 
 def _surprise(candidate: Candidate, fit_: Fit) -> float:

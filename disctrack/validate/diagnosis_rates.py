@@ -31,7 +31,7 @@ from disctrack.validate.hidden import Unseen, measured
 from disctrack.validate.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted, hidden_effect
 from disctrack.whole_files import write_whole
 
-FRAME_RATE = 1000.0
+FRAME_RATE = 1000.0  # [Hz] of the reference recordings
 DURATION = (0.4, 0.9)  # [s]
 THETA_DEG = (3.0, 15.0)
 NUTATION_SHARE = (0.02, 0.1)  # of the nutation angle
@@ -55,6 +55,7 @@ class Recording:
     nutation_deg: float
     omega3: float
     k_m: float
+    rate: float  # [Hz]
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Verdict:
         return self.named and abs(self.pull) <= ENOUGH
 
 
-def draw(seed: int, planted: Planted) -> Recording:
+def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Recording:
     """A motion that lasts as long as it is filmed, whatever is planted in it."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
@@ -97,11 +98,12 @@ def draw(seed: int, planted: Planted) -> Recording:
         theta = float(rng.uniform(*THETA_DEG))
         recording = Recording(
             seed,
-            int(FRAME_RATE * rng.uniform(*DURATION)),
+            int(rate * rng.uniform(*DURATION)),
             theta,
             theta * float(rng.uniform(*NUTATION_SHARE)),
             float(rng.uniform(*OMEGA3)),
             float(rng.uniform(*K_M)),
+            rate,
         )
         model = Model(disc).with_values({"km.k_m": recording.k_m} | dict(planted.effects))
         try:
@@ -111,7 +113,7 @@ def draw(seed: int, planted: Planted) -> Recording:
                 omega3=recording.omega3,
                 nutation_amplitude=np.radians(recording.nutation_deg),
             )
-            motion = simulate(model, start, duration=1.03 * recording.n / FRAME_RATE + 0.01, rate=FRAME_RATE)
+            motion = simulate(model, start, duration=1.03 * recording.n / rate + 0.01, rate=rate)
         except DiscTrackError:  # no such precession
             continue
         if len(motion) > 1.02 * recording.n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
@@ -144,17 +146,17 @@ def trajectory_of(recording: Recording, planted: Planted, n: int | None = None) 
         theta_deg=recording.theta_deg,
         nutation_deg=recording.nutation_deg,
         omega3=recording.omega3,
-        declared_rate=FRAME_RATE,
+        declared_rate=recording.rate,
         base={"km.k_m": recording.k_m},
     )
 
 
-def trial(effects: Sequence[HiddenEffect], sizes: Sequence[float], seed: int) -> Verdict:
+def trial(effects: Sequence[HiddenEffect], sizes: Sequence[float], seed: int, rate: float = FRAME_RATE) -> Verdict:
     """Hide, diagnose, compare."""
     rng: Generator = np.random.default_rng([seed, 32])
     parts = [e.plant(size, rng) for e, size in zip(effects, sizes, strict=True)]
     planted = together(parts)
-    recording = draw(seed, planted)
+    recording = draw(seed, planted, rate)
     trajectory = trajectory_of(recording, planted)
     began = time.perf_counter()
     result = diagnose_trajectory(trajectory, separate=False)
@@ -217,9 +219,11 @@ class Rates:
     verdicts: tuple[Verdict, ...]
 
 
-def rates(effects: Sequence[HiddenEffect], sizes: Sequence[float], seeds: Sequence[int]) -> Rates:
+def rates(
+    effects: Sequence[HiddenEffect], sizes: Sequence[float], seeds: Sequence[int], rate: float = FRAME_RATE
+) -> Rates:
     """Over several recordings."""
-    verdicts = tuple(trial(effects, sizes, seed) for seed in seeds)
+    verdicts = tuple(trial(effects, sizes, seed, rate) for seed in seeds)
     return Rates(
         tuple(e.name for e in effects),
         tuple(sizes),
@@ -233,11 +237,11 @@ def rates(effects: Sequence[HiddenEffect], sizes: Sequence[float], seeds: Sequen
     )
 
 
-def smallest(effect: HiddenEffect, seeds: Sequence[int], begin: float | None = None) -> Iterator[Rates]:
+def smallest(effect: HiddenEffect, seeds: Sequence[int], begin: float, rate: float = FRAME_RATE) -> Iterator[Rates]:
     """Rates at halved sizes down to the first that is found in fewer than nine recordings of ten."""
-    size = effect.size if begin is None else begin
+    size = begin
     while True:
-        there = rates([effect], [size], seeds)
+        there = rates([effect], [size], seeds, rate)
         yield there
         if there.named < FOUND_SHARE * there.n:
             return
@@ -267,6 +271,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--first-seed", type=int, default=1, help="the others count up from it")
     parser.add_argument("--controls", type=int, default=0, help="recordings in which nothing is hidden")
     parser.add_argument("--pairs", type=int, default=0, help="recordings in which two effects are hidden")
+    parser.add_argument("--frame-rate", type=float, default=FRAME_RATE, help="in Hz (%(default)s)")
     parser.add_argument("--factor", type=float, default=1.0, help="on all sizes")
     parser.add_argument("--smallest", action="store_true", help="go down to the smallest size found in 9 of 10")
     parser.add_argument("-v", "--verbose", action="store_true", help="say what was claimed where something was wrong")
@@ -285,17 +290,17 @@ def _jobs(a: argparse.Namespace) -> Iterator[Rates]:
     seeds = range(a.first_seed, a.first_seed + a.seeds)
     effects = [hidden_effect(name) for name in a.effects] or list(HIDDEN_EFFECTS)
     if a.controls:
-        yield rates([], [], range(a.first_seed, a.first_seed + a.controls))
+        yield rates([], [], range(a.first_seed, a.first_seed + a.controls), a.frame_rate)
     if a.pairs:
         visible = [e for e in effects if e.visible]
         for number, pair in enumerate(_pairs(visible, a.pairs, a.first_seed)):
-            yield rates(pair, [a.factor * e.size for e in pair], [a.first_seed + number])
+            yield rates(pair, [a.factor * e.size for e in pair], [a.first_seed + number], a.frame_rate)
     if not (a.controls or a.pairs) or a.effects:
         for effect in effects if not a.pairs else ():
             if a.smallest:
-                yield from smallest(effect, seeds, a.factor * effect.size)
+                yield from smallest(effect, seeds, a.factor * effect.size, a.frame_rate)
             else:
-                yield rates([effect], [a.factor * effect.size], seeds)
+                yield rates([effect], [a.factor * effect.size], seeds, a.frame_rate)
 
 
 def _wrong(v: Verdict) -> bool:

@@ -51,6 +51,7 @@ class Unseen:
     pattern_height: float = 0.0  # [m] of the dots above half the thickness
     table_turn: tuple[float, float] = (0.0, 0.0)  # [rad] rotation vector of the true table in the calibrated axes
     table_height: float = 0.0  # [m] of the true table in the calibrated axes
+    clock: float = 0.0  # relative change of the frame rate
     exposure: float = 0.0  # [s] both cameras; a dot's image is averaged over it
     image_centres: bool = False  # the centre of a dot's image is taken for the image of its centre
 
@@ -109,7 +110,7 @@ def measured(
     if motion is None:
         laws = dict({"km.k_m": K_M} if base is None else base) | dict(effects or {})
         motion = _rolling(Model(disc).with_values(laws), theta_deg, nutation_deg, omega3, rng)
-    true_times = np.arange(n) / (f.frame_rate_hz or declared_rate) + STATION
+    true_times = np.arange(n) / ((f.frame_rate_hz or declared_rate) * (1.0 + u.clock)) + STATION
     centres = _true_centres(disc, f, u)
     views = [
         _exposed(motion, true_times + delay, u, true_rig, centres, disc)[:, camera]

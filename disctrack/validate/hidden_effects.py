@@ -77,7 +77,7 @@ def _delay(size: float, rng: Generator) -> Planted:
 
 def _clock(size: float, rng: Generator) -> Planted:
     value = size * _sign(rng)
-    return Planted({"frame_rate.change": value}, faults=Faults(frame_rate_hz=1000.0 * (1 + value)))
+    return Planted({"frame_rate.change": value}, unseen=Unseen(clock=value))
 
 
 def _camera(keys: tuple[str, ...], fault: Callable[[tuple[float, ...]], CameraFault]) -> Callable[..., Planted]:

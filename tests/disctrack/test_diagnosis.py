@@ -94,18 +94,6 @@ def test_a_wrong_effect_offered_alone_is_refused():
     assert answer.after.reduced_chi_square > 1.1
 
 
-def test_before_the_base_fit_has_converged_nothing_is_attributed():
-    system = system_of(measured(seed=11, n=200))
-    start = system.start()
-    start |= {"state.omega2": 0.3 * start["state.omega2"], "state.theta": 0.5}  # not this motion at all
-    answer = diagnose(system, start)
-    if not answer.before.converged:
-        assert answer.verdict == "unexplained"
-        assert not answer.found
-    else:  # it found its way back
-        assert answer.before.reduced_chi_square < 1.1
-
-
 def test_derivatives_agree_with_differences_of_the_prediction():
     system = system_of(measured({"kz.k_z": 2e-5}, seed=12, n=80))
     base = fit(system, system.base, system.start())

@@ -130,13 +130,13 @@ def rate(disc, state, regime):
     return np.concatenate([now.v, spin, a, omegadot, [now.psidot, now.phidot]])
 
 
-def follow(disc, state, times, regime="rolling", rtol=1e-11, atol=1e-12, events=None):
+def follow(disc, state, times, regime="rolling", rtol=1e-11, atol=1e-12, events=None, method="DOP853"):
     """solve_ivp over the times; returns its result."""
     return solve_ivp(
         lambda t, s: rate(disc, s, regime),
         (times[0], times[-1]),
         state,
-        "DOP853",
+        method,
         times,
         rtol=rtol,
         atol=atol,

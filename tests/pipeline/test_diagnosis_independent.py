@@ -1,0 +1,105 @@
+"""Diagnosis of recordings whose motion comes from another formulation of the dynamics, through pixels and calibration.
+
+Nothing of the product's equations has a part in the motion: a wrong term that simulation and diagnosis share cannot
+hide here. The diagnosis sees the folder of the recording alone.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from disctrack.cli import main
+from disctrack.scene import Faults
+from tests.oracles import newton_euler
+from tests.oracles.hidden_recording import body_of, full_scene, hide, small_scene
+
+G = 9.81
+CALIBRATION = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
+
+
+def diagnosis_of(recording):
+    out = recording.parent / "out"
+    assert main(["run", str(recording), "-o", str(out), "--no-figures", "--no-video", *CALIBRATION]) == 0
+    assert main(["diagnose", str(out / "trajectory.h5"), "-o", str(out / "diagnosis")]) == 0
+    return json.loads((out / "diagnosis" / "diagnosis.json").read_text())
+
+
+def sizes(document, name):
+    """{parameter: (value, sigma)} of the effect as it is claimed, or as it would be in the place of a twin."""
+    (account,) = [a for e in document["effects"] for a in (e, *e["class"]) if a["name"] == name]
+    return {p["name"]: (p["value"], p["sigma"]) for p in account["parameters"]}
+
+
+def assert_found(document, hidden):
+    """Each hidden effect {name: {parameter: value}}, no other, at its size, and noise is left."""
+    assert document["verdict"] == "found", document["sentence"]
+    assert len(document["effects"]) == len(hidden), document["sentence"]
+    for name, truth in hidden.items():
+        for parameter, (value, sigma) in sizes(document, name).items():
+            # three sigma, and 1 % for what small images add: edges of dots on 1/800 px
+            assert abs(value - truth[parameter]) < 3 * sigma + 0.01 * np.linalg.norm(list(truth.values())), parameter
+    assert document["after"]["reduced_chi_square"] < 1.1
+    assert document["after"]["held_out"]["ratio_to_noise_floor"] < 1.2
+
+
+def tilted(slope, direction):
+    """Gravity in the axes of a table that descends by `slope` towards `direction`."""
+    x, y = slope * np.cos(direction), slope * np.sin(direction)
+    return {"gravity": (G * x, G * y, -G * np.sqrt(1 - slope**2))}, {"table_tilt": {"tilt_x": x, "tilt_y": y}}
+
+
+def test_a_tilted_table_in_images_of_an_independent_motion_is_found_and_sized(tmp_path):
+    scene = small_scene(41, 70, 300.0)
+    changes, truth = tilted(0.0061, 2.0)
+    document = diagnosis_of(hide(tmp_path, scene=scene, body=body_of(scene, **changes), note="table tilt"))
+    assert_found(document, truth)
+    assert document["before"]["reduced_chi_square"] > 10
+
+
+@pytest.mark.slow
+def test_nothing_is_found_in_images_of_an_independent_motion_without_an_effect(tmp_path):
+    scene = full_scene(42, 200, 500.0)
+    document = diagnosis_of(hide(tmp_path, scene=scene, body=body_of(scene)))
+    assert document["verdict"] == "nothing missing", document["sentence"]
+    assert document["effects"] == []
+    assert document["after"]["reduced_chi_square"] < 1.1
+
+
+CASES = {
+    "pivoting friction": (
+        {"laws": (newton_euler.pivoting_friction(6e-5),)},
+        Faults(),
+        {"kz": {"k_z": 6e-5}},
+    ),
+    "rolling moment": (
+        {"laws": (newton_euler.classical_rolling_friction(2e-4),)},
+        Faults(),
+        {"rolling_classical": {"delta": 2e-4}},
+    ),
+    "centre of mass": (
+        {"com_body": (7e-5, -7e-5, 0.0)},
+        Faults(),
+        {"centre_of_mass": {"c_1": 7e-5, "c_2": -7e-5}},
+    ),
+    "frame rate": ({}, Faults(frame_rate_hz=506.0), {"frame_rate": {"change": 0.012}}),
+    "tilt and a late camera": (
+        tilted(0.002, -1.0)[0],
+        Faults(right_delay_s=2e-4),
+        tilted(0.002, -1.0)[1] | {"time_offset": {"delay": 2e-4}},
+    ),
+    "pivoting friction and an unbalanced disc": (
+        {"laws": (newton_euler.pivoting_friction(3e-5),), "com_body": (5e-5, 3e-5, 0.0)},
+        Faults(),
+        {"kz": {"k_z": 3e-5}, "centre_of_mass": {"c_1": 5e-5, "c_2": 3e-5}},
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_hidden_in_images_of_an_independent_motion_is_found(name, tmp_path):
+    changes, faults, truth = CASES[name]
+    scene = full_scene(50 + len(name), 250, 500.0)
+    recording = hide(tmp_path, scene=scene, body=body_of(scene, **changes), faults=faults, note=name)
+    assert_found(diagnosis_of(recording), truth)
