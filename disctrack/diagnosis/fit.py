@@ -98,10 +98,9 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
     x = np.asarray(np.linalg.lstsq(scaled, right, rcond=1e-12)[0] * scale, float)
     if bool(np.all((x >= lower) & (x <= upper))):
         return x
-    # active sets end exactly at a bound; interior points never get there, and stumble over infinite ones
     with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
         bounds = (lower / scale, upper / scale)
-        found = np.asarray(lsq_linear(scaled, right, bounds, method="bvls", tol=1e-12).x * scale, float)
+        found = np.asarray(lsq_linear(scaled, right, bounds, tol=1e-12).x * scale, float)
     return found if np.isfinite(found).all() else np.clip(x, lower, upper)
 
 

@@ -292,9 +292,10 @@ class _Search:
 
     def _at_noise(self, fit_: Fit, gain: float = 0.0) -> bool:
         left = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1)
-        # in a short recording both numbers scatter
-        scatter = np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))
-        return bool(left <= max(self.settings.at_noise, 1.0 + 4.0 * scatter) * self.noise)
+        limit = self.settings.at_noise
+        if self.settings.noise is None:  # in a short recording both chi-square and the noise found in it scatter
+            limit = max(limit, 1.0 + 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))))
+        return left <= limit * self.noise
 
     def _criterion(self, trial: Trial) -> float:
         return self._cost(trial.fit) + self._price(trial.candidates)
