@@ -24,6 +24,7 @@ from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
+_LARGEST_CHUNK = 512 << 20  # bytes: what the library takes at once, whatever the file's size
 _DEPTHS = (8, 10, 12, 14, 16)
 _DEFLATE, _SHUFFLE = 1, 2  # filters by their registered numbers
 _SMALL = 1 << 12  # bytes: what deflate may add to what it cannot compress
@@ -97,6 +98,11 @@ def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
     n, height, width = stack.shape
     where = f"{file}:{stack.name}"
     check_frame_size(width, height, where)
+    if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > _LARGEST_CHUNK:
+        raise RecordingError(
+            f"{where}: one chunk {stack.chunks} holds more than {_LARGEST_CHUNK >> 20} MB, all of which is read for "
+            "any frame in it. Write it again with chunks of one frame."
+        )
     stored = _frames_stored(stack)
     if n == 0 or stored == 0:
         raise RecordingError(f"{where}: a stack without frames.")

@@ -12,14 +12,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
 from disctrack.readers import Frame, FrameReader
 from disctrack.readers._png import PngHeader, decode_plain_grey
 from disctrack.readers.files import with_gaps
+from disctrack.readers.raw import MOST_PIXELS
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# A header may claim any size; no camera of this kind has more pixels, and decoding one must not exhaust the memory.
-_MOST_PIXELS = 1 << 27
+# A header may claim any size, and decoding must not exhaust the memory. Even a black image does not shrink by more than
+# this when compressed (deflate: 1032); small ones are let pass.
+_MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
 
 
 def open_images(files: Sequence[Path], camera: str) -> FrameReader:
@@ -58,7 +61,9 @@ def _depth_notes(stored: NDArray, grey: Frame) -> list[str]:
     if stored.ndim == 3:
         notes.append(f"images are stored with {stored.shape[2]} channels of equal value; one is used, without loss")
     if grey.dtype == np.uint16:
-        notes.append(f"images have 16 bits per pixel (first frame: up to {grey.max()}); used as they are")
+        step, top = level_step(grey), full_scale(grey)
+        used = f"{(top // step).bit_length()} of them in use, in steps of {step}; first frame: up to {grey.max()}"
+        notes.append(f"images have 16 bits per pixel ({used}); used as they are")
     return notes
 
 
@@ -183,15 +188,35 @@ def _checked_container(content: bytes) -> PngHeader | None:
         raise _Damaged("the file is empty")
     if content.startswith(_PNG_SIGNATURE):
         return _checked_png(content)
-    if content.startswith(b"\xff\xd8") and b"\xff\xd9" not in content[-1024:]:
-        raise _Damaged("the JPEG file is truncated (no end marker)")
+    if content.startswith(b"\xff\xd8"):
+        if b"\xff\xd9" not in content[-1024:]:
+            raise _Damaged("the JPEG file is truncated (no end marker)")
+        _check_size(*_jpeg_size(content), len(content))
     if content.startswith(b"BM") and len(content) >= 26:
         declared = struct.unpack_from("<I", content, 2)[0]
         if declared > len(content):
             raise _Damaged(f"the BMP file ends after {len(content)} of {declared} bytes")
         width, height = struct.unpack_from("<ii", content, 18)
-        _check_size(abs(width), abs(height))
+        _check_size(abs(width), abs(height), len(content))
+    if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        from disctrack.readers.tiff import size_of_first_page
+
+        _check_size(*size_of_first_page(content), len(content))
     return None
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int]:
+    """Width and height by the frame header (ITU-T T.81, B.2.2); 0 where there is none before the scan."""
+    position = 2
+    while position + 9 <= len(content) and content[position] == 0xFF:
+        marker, length = content[position + 1], int.from_bytes(content[position + 2 : position + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", content, position + 5)
+            return width, height
+        if marker == 0xDA:
+            break
+        position += 2 + length if marker != 0xFF else 1
+    return 0, 0
 
 
 def _checked_png(content: bytes) -> PngHeader:
@@ -209,7 +234,7 @@ def _checked_png(content: bytes) -> PngHeader:
             raise _Damaged(f"the PNG is damaged: wrong checksum of chunk {kind.decode('latin-1')!r} at byte {position}")
         if kind == b"IHDR" and length == 13:
             ihdr = struct.unpack_from(">IIBBBBB", content, start)
-            _check_size(ihdr[0], ihdr[1])
+            _check_size(ihdr[0], ihdr[1], end)
         elif kind == b"IDAT":
             data.append((start, stop))
         elif kind == b"tRNS":
@@ -220,6 +245,7 @@ def _checked_png(content: bytes) -> PngHeader:
     raise _Damaged(f"the PNG file is truncated after {end} bytes (no end chunk)")
 
 
-def _check_size(width: int, height: int) -> None:
-    if width * height > _MOST_PIXELS:
-        raise _Damaged(f"the header claims {width} x {height} px, more than any such camera has")
+def _check_size(width: int, height: int, n_bytes: int) -> None:
+    """Refuse a size that the file's n_bytes cannot hold."""
+    if width * height > min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes)):
+        raise _Damaged(f"the header claims {width} x {height} px, more than any such camera has or the file can hold")

@@ -52,12 +52,35 @@ def is_stack(file: Path) -> bool:
         return True  # cut short after the first page
 
 
+def size_of_first_page(content: bytes) -> tuple[int, int]:
+    """Width and height that the first page of a TIFF file's content claims; 0 where none can be read."""
+    try:
+        tiff = _Tiff(_Bytes(content))
+        tags, _ = tiff.directory(tiff.first)
+        return tiff.value(tags, _WIDTH), tiff.value(tags, _HEIGHT)
+    except RecordingError:
+        return 0, 0
+
+
+class _Bytes:
+    """A file's content that was read already, with the part of RawFile that directories need."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content, self.size, self.path = content, len(content), Path("TIFF content")
+
+    def bytes_at(self, offset: int, size: int, where: str) -> bytes:
+        if offset < 0 or size < 0 or offset + size > self.size:
+            raise RecordingError(f"{where}: {size} bytes at byte {offset} are announced, but there are {self.size}.")
+        return self._content[offset : offset + size]
+
+
 def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     """Frames of all pages of the files, in order. Raises RecordingError if no page can be read.
 
     The frame rate is taken from the notes of ImageJ or OME in the first page, time stamps from those of OME.
     """
-    tiffs = [_Tiff(RawFile(file)) for file in files]
+    raw_files = [RawFile(file) for file in files]
+    tiffs = [_Tiff(file) for file in raw_files]
     pages, notes = [], []
     for number, tiff in enumerate(tiffs):
         found, note = _pages(tiff, number)
@@ -70,7 +93,7 @@ def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     check_frame_size(first.width, first.height, str(files[0]))
     if all(page.raw_offset >= 0 and page.layout == first.layout for page in pages):
         return RawFrames(
-            [tiff.file for tiff in tiffs],
+            raw_files,
             np.array([page.file for page in pages]),
             np.array([page.raw_offset for page in pages], np.int64),
             (first.width, first.height),
@@ -194,7 +217,7 @@ class _Tag:
 class _Tiff:
     """The directories of one file. Raises RecordingError if it is no TIFF file."""
 
-    def __init__(self, file: RawFile) -> None:
+    def __init__(self, file: RawFile | _Bytes) -> None:
         self.file, self._where = file, str(file.path)
         head = file.bytes_at(0, min(16, file.size), self._where)
         magic = {b"II*\0": ("<", False), b"MM\0*": (">", False), b"II+\0": ("<", True), b"MM\0+": (">", True)}

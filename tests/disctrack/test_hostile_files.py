@@ -4,6 +4,7 @@ import contextlib
 import os
 import struct
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ import pytest
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.readers import open_frames
 from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.images import decode
 
 N, HEIGHT, WIDTH = 6, 18, 22
 FRAMES = np.random.default_rng(8).integers(0, 256, (N, HEIGHT, WIDTH), dtype=np.uint8)
@@ -142,6 +144,39 @@ def test_tiff_headers_that_announce_what_cannot_be_are_refused(tmp_path, content
     (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(RecordingError, match=reason):
         open_stack([tmp_path / "a.tif"], "left").read(0)
+
+
+def _claiming(suffix: str, width: int, height: int) -> bytes:
+    """A good image of 22 x 18 px whose header claims another size."""
+    data = bytearray(cv2.imencode(f".{suffix}", FRAMES[0])[1].tobytes())
+    if suffix == "bmp":
+        struct.pack_into("<ii", data, 18, width, height)
+    elif suffix == "jpg":
+        struct.pack_into(">HH", data, data.index(b"\xff\xc0") + 5, height, width)
+    elif suffix == "png":
+        struct.pack_into(">II", data, 16, width, height)
+        struct.pack_into(">I", data, 29, zlib.crc32(data[12:29]))
+    else:
+        (start,) = struct.unpack_from("<I", data, 4)
+        for i in range(struct.unpack_from("<H", data, start)[0]):
+            (tag,) = struct.unpack_from("<H", data, start + 2 + 12 * i)
+            if tag in (256, 257):
+                struct.pack_into("<HII", data, start + 4 + 12 * i, 4, 1, width if tag == 256 else height)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tiff", "jpg"])
+def test_an_image_cannot_claim_more_than_its_bytes_can_hold(suffix):
+    assert decode(_claiming(suffix, WIDTH, HEIGHT), "file").shape == (HEIGHT, WIDTH)
+    with pytest.raises(RecordingError, match="claims 30000 x 4000"):
+        decode(_claiming(suffix, 30000, 4000), "file")
+
+
+def test_hdf5_chunks_that_no_memory_holds_are_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (4000, 1000, 1000), np.uint8, chunks=(1000, 1000, 1000), compression="gzip")
+    with pytest.raises(RecordingError, match=r"one chunk .* holds more than 512 MB"):
+        open_frames("a.h5", tmp_path, "left")
 
 
 def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path):
