@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 
 from disctrack.errors import DiscTrackError
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def reason_of(error: BaseException) -> str:
@@ -14,7 +17,10 @@ def reason_of(error: BaseException) -> str:
     elif isinstance(error, MemoryError):
         text = "out of memory. Run fewer side by side with -j, or give the machine more memory."
     elif isinstance(error, OSError) and error.strerror:
-        text = f"{error.filename}: {error.strerror}." if error.filename else f"{error.strerror}."
+        where = f"{error.filename}: " if error.filename else ""
+        text = f"{where}{error.strerror}."
+        if error.errno in _NO_ROOM:
+            text += " Free some space, or choose another place with -o."
     else:
         text = f"internal error ({type(error).__name__}: {error}); please report it."
     return " ".join(text.split())

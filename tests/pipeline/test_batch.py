@@ -1,8 +1,11 @@
 """Many recordings: each is measured once, none takes another down, and the summary tells of all."""
 
+import contextlib
 import csv
+import ctypes
 import json
 import os
+import resource
 import shutil
 from pathlib import Path
 
@@ -11,12 +14,14 @@ import h5py
 import numpy as np
 import pytest
 
+from disctrack.analyse import CIRCLE_DURATION, WINDOW
 from disctrack.batch import BatchOptions, find_recordings, read_summary, run_batch
 from disctrack.batch import measure as stage
 from disctrack.batch.plan import Places, make_plan
 from disctrack.batch.records import read_record
 from disctrack.cli import main
 from disctrack.storage import read_trajectory
+from disctrack.tracking import prepare
 from disctrack.whole_files import output_error
 
 FAST = ["--no-report"]
@@ -263,3 +268,77 @@ def test_results_may_go_elsewhere_and_the_recordings_stay_as_they_are(recording,
     assert sorted(root.rglob("*")) == before
     assert (output / "x" / "a" / "trajectory.h5").is_file()
     assert json.loads((output / "summary.json").read_text())["counts"]["measured"] == 1
+
+
+def test_the_defaults_are_those_of_the_analysis():
+    assert (BatchOptions().window, BatchOptions().circle) == (WINDOW, CIRCLE_DURATION)
+
+
+@contextlib.contextmanager
+def largest_file(n: int):
+    """Files of this process may not grow beyond n bytes, as on a disk that has no more room."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("room", [300, 20_000])  # not even a record, no trajectory
+def test_without_room_there_is_a_reason_and_nothing_half_written(room, one, recording):
+    results = recording / "results"
+    prepare()  # what is compiled is kept in files, too
+    with largest_file(room):
+        result = stage.do(one)
+    assert result.status == "failed"
+    assert "would exceed the size limit" in result.record.reason
+    assert [file.name for file in results.iterdir()] == (["batch.json"] if room > 1000 else [])
+
+
+def test_without_room_for_the_summary_the_results_stay_and_the_line_says_so(recording, capsys, in_this_process):
+    assert main(["batch", str(recording), *FAST]) == 0
+    summary = recording / "batch_results" / "summary.json"
+    before = summary.read_bytes()
+    capsys.readouterr()
+    with largest_file(1000):
+        assert main(["batch", str(recording), *FAST]) == 1
+    said, errors = capsys.readouterr()
+    assert said.startswith("skipped")
+    assert "summary.json: cannot be written" in errors
+    assert summary.read_bytes() == before
+
+
+CAP_DAC_OVERRIDE = 1
+
+
+@contextlib.contextmanager
+def subject_to_permissions():
+    """The administrator may write anywhere; not here. Without effect for everybody else."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # version 3 of the interface, this thread
+    before, reduced = (ctypes.c_uint32 * 6)(), (ctypes.c_uint32 * 6)()
+    for sets in (before, reduced):
+        assert libc.capget(header, sets) == 0
+    reduced[0] &= ~(1 << CAP_DAC_OVERRIDE)  # of the effective set; the permitted one keeps it
+    assert libc.capset(header, reduced) == 0
+    try:
+        yield
+    finally:
+        assert libc.capset(header, before) == 0
+
+
+def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(recording, tmp_path, capsys, in_this_process):
+    recording.chmod(0o555)
+    try:
+        with subject_to_permissions():
+            assert main(["batch", str(recording), *FAST]) == 1
+            said, errors = capsys.readouterr()
+            assert said == ""
+            assert "batch_results: cannot be written: no permission" in errors
+            assert "-o" in errors
+            assert "another place with -o" in stage.do(jobs_of(recording)[0]).record.reason
+            assert main(["batch", str(recording), "-o", str(tmp_path / "out"), *FAST]) == 0
+    finally:
+        recording.chmod(0o755)
+    assert not (recording / "results").exists()

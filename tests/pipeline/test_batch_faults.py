@@ -1,11 +1,13 @@
 """What may go wrong with the processes of a batch: killed, interrupted, doubled, lost with their machine."""
 
+import contextlib
 import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -13,11 +15,13 @@ import h5py
 import numpy as np
 import pytest
 
-from disctrack.batch import BatchOptions, find_recordings, processes, run_batch
+from disctrack.batch import BatchOptions, cluster, find_recordings, processes, run_batch
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import Places, make_plan
 from disctrack.batch.records import MEASURED, is_done, read_record
+from disctrack.cli import main
+from disctrack.errors import ClusterError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAMES = ("a", "b")
@@ -186,3 +190,69 @@ def test_two_batches_on_one_folder_measure_each_recording_once(day):
     words = [line.split()[:2] for output, _ in said for line in output.splitlines()[: len(NAMES)]]
     assert sorted(words) == [["measured", "a"], ["measured", "b"], ["skipped", "a"], ["skipped", "b"]]
     assert json.loads((day / "batch_results" / "summary.json").read_text())["counts"]["failed"] == 0
+
+
+@pytest.fixture
+def dask_cluster(tmp_path):
+    """A scheduler and two workers, each a process of this machine; its address, and the workers' processes."""
+    file, search = tmp_path / "scheduler.json", os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])
+    words = {
+        "dask_scheduler": ["--port", "0", "--no-dashboard", "--scheduler-file", str(file)],
+        "dask_worker": ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--scheduler-file", str(file)],
+    }
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.{program}", *words[program]],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": search},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for program in ("dask_scheduler", "dask_worker", "dask_worker")
+    ]
+    wait_until(lambda: file.exists() and file.read_text().endswith("}"))
+    yield json.loads(file.read_text())["address"], processes[1:]
+    for process in reversed(processes):
+        process.kill()
+        process.wait()
+
+
+def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(dask_cluster, day, monkeypatch):
+    address, workers = dask_cluster
+    wait_for_workers, submitted = cluster.connect, []
+
+    def connect_to_both(address):
+        wait_until(lambda: has_workers(address, len(workers)))
+        return wait_for_workers(address)
+
+    def kill_one():
+        wait_until(lambda: all((day / name / "results" / LOCK).exists() for name in NAMES))
+        workers[0].kill()  # both recordings are being measured, so one of them is lost with it
+        submitted.append(time.monotonic())
+
+    monkeypatch.setattr("disctrack.batch.run.connect", connect_to_both)
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    outcome = run_batch([day], BatchOptions(report=False), cluster=address)
+    killer.join()
+    assert submitted
+    assert [row["status"] for row in outcome.rows] == ["measured", "measured"]
+    ours = [numbers(day / name / "results" / "trajectory.h5") for name in NAMES]
+    for key, values in ours[0].items():
+        np.testing.assert_array_equal(values, ours[1][key], err_msg=key)
+
+
+def has_workers(address: str, n: int) -> bool:
+    with contextlib.suppress(ClusterError), contextlib.closing(cluster.connect(address)) as client:
+        return len(client.scheduler_info()["workers"]) == n
+    return False
+
+
+def test_a_dead_address_and_a_missing_extra_are_told_before_anything_is_done(day, monkeypatch, capsys):
+    monkeypatch.setattr(cluster, "CONNECT", 0.5)
+    assert main(["batch", str(day), "--cluster", "tcp://127.0.0.1:9"]) == 1
+    assert "no scheduler answers" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["batch", str(day), "--cluster", "tcp://127.0.0.1:9"]) == 1
+    assert "disctrack[cluster]" in capsys.readouterr().err
+    assert not list(day.rglob("*results"))

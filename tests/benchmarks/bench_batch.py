@@ -1,0 +1,146 @@
+"""Speed of a batch: one process against two, beside two independent ones, and beside blocks of frames in one process.
+
+    python tests/benchmarks/bench_batch.py RECORDING [--rig RIG] [--copies N] [--report] [--repeats N]
+
+Makes N copies of the recording (links to its files) that name one rig, and measures them
+  - by `disctrack batch -j 1` and `-j 2`;
+  - by two independent `disctrack batch -j 1`, half of the copies each: what this machine gives to two processes that
+    know nothing of each other, so that their time is the least that -j 2 could take;
+  - in one process, one recording after the other, each tracked in two stretches by two threads.
+Times are the best of the repeats, taken in turn. The ratios hold better than the times; on a busy machine neither does.
+Not a test: nothing fails here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+
+from calibration import CalibrationSettings
+from calibration.rig_file import read_rig
+from disctrack.analyse import analyse, run_analyse, write_analysis
+from disctrack.batch.processes import ONE_THREAD
+from disctrack.calibration_stage import calibrate_into, source_of
+from disctrack.pipeline import open_pairs
+from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.recording import read_recording
+from disctrack.storage import Provenance, write_trajectory
+from disctrack.tracking import prepare, track
+
+PACKAGE = str(Path(__file__).resolve().parents[2])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--rig", type=Path, help="default: calibrated from the recording's views")
+    parser.add_argument("--copies", type=int, default=8)
+    parser.add_argument("--report", action="store_true", help="with report and figures of each, as a user would")
+    parser.add_argument("--repeats", type=int, default=2)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        day = copies_of(arguments.recording.resolve(), arguments.rig, Path(scratch), arguments.copies)
+        compare(day, arguments.report, arguments.repeats)
+
+
+def copies_of(recording: Path, rig: Path | None, scratch: Path, n: int) -> list[Path]:
+    """The copies, in two halves of one folder."""
+    declared = read_recording(recording)
+    if rig is None:
+        rig = scratch / "rig.h5"
+        settings = CalibrationSettings(distortion="k1 k2 p1 p2", board="flat")
+        calibrate_into(rig, source_of(declared, settings), overwrite=True, figures=False)
+    text = declared.file.read_text(encoding="utf-8")
+    start, end = text.index("[calibration]"), text.index("[gravity]")
+    text = f'{text[:start]}[calibration]\nrig = "{rig.resolve().as_posix()}"\n\n{text[end:]}'
+    folders = []
+    for i in range(n):
+        folder = scratch / "day" / f"half {i % 2}" / f"copy {i}"
+        folder.mkdir(parents=True)
+        for camera in ("left", "right"):
+            (folder / camera).symlink_to(recording / camera, target_is_directory=True)
+        (folder / "recording.toml").write_text(text, encoding="utf-8")
+        folders.append(folder)
+    return folders
+
+
+def compare(day: list[Path], report: bool, repeats: int) -> None:
+    root = day[0].parents[1]
+    halves = sorted({folder.parent for folder in day})
+    ways = {
+        "disctrack batch -j 1": lambda: batches([root], 1, report),
+        "disctrack batch -j 2": lambda: batches([root], 2, report),
+        "two independent processes": lambda: batches(halves, 1, report),
+        "one process, two stretches per recording": lambda: in_stretches(day, report),
+    }
+    in_stretches(day[:1], report)  # compiles
+    best = dict.fromkeys(ways, float("inf"))
+    for _ in range(repeats):
+        for way, action in ways.items():
+            for results in root.rglob("*results"):
+                shutil.rmtree(results)
+            best[way] = min(best[way], action())
+    pairs = sum(len(open_pairs(read_recording(folder))) for folder in day)
+    one, two, independent, stretches = best.values()
+    print(f"{len(day)} recordings, {pairs} pairs, {'with' if report else 'without'} reports")
+    for way, seconds in best.items():
+        print(f"  {way:<44} {seconds:7.1f} s  {pairs / seconds:6.0f} pairs/s  {one / seconds:5.2f} x -j 1")
+    print(f"  {'-j 2 / two independent processes, time':<44} {two / independent:7.2f}")
+    print(f"  {'two stretches / -j 2, time':<44} {stretches / two:7.2f}")
+
+
+def batches(roots: list[Path], side_by_side: int, report: bool) -> float:
+    """Seconds that batches on these folders take, all at once."""
+    began = time.perf_counter()
+    words = ["-j", str(side_by_side), *([] if report else ["--no-report"])]
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-m", "disctrack", "batch", str(root), *words],
+            cwd=PACKAGE,
+            env=os.environ | ONE_THREAD,
+            stdout=subprocess.DEVNULL,
+        )
+        for root in roots
+    ]
+    if any(process.wait() for process in running):
+        raise SystemExit("a batch failed")
+    return time.perf_counter() - began
+
+
+def in_stretches(day: list[Path], report: bool) -> float:
+    """Seconds for the same in this process, its start not counted."""
+    cv2.setNumThreads(1)
+    prepare()
+    began = time.perf_counter()
+    for folder in day:
+        recording = read_recording(folder)
+        pairs, rig = open_pairs(recording), read_rig(recording.rig_file)
+        tracking = track(
+            lambda a, b, pairs=pairs: iter_pair_blocks(pairs.left, pairs.right, a, b, threads=1),
+            range(len(pairs)),
+            rig,
+            recording.disc,
+            recording.frame_rate,
+            gravity=recording.gravity,
+            workers=2,
+        )
+        path = folder / "results" / "trajectory.h5"
+        provenance = Provenance(recording.name, pairs.inputs(), {})
+        write_trajectory(path, tracking.trajectory, provenance, overwrite=True)
+        if report:
+            run_analyse(path, overwrite=True)
+        else:
+            write_analysis(path, analyse(tracking.trajectory))
+    return time.perf_counter() - began
+
+
+if __name__ == "__main__":
+    main()
