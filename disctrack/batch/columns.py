@@ -4,6 +4,9 @@ from disctrack.frames import CAMERAS, COORDINATES
 
 _UNITS = ("m",) * 3 + ("rad",) * 3
 
+# Reduced chi-square of the rolling model with k_m alone; what thousands of dots scatter by is far below.
+LACKS_SOMETHING = 1.5
+
 # Every column of the summary in order, and what it means.
 COLUMNS: dict[str, str] = {
     "recording": "folder below the batch's, with slashes",
@@ -14,8 +17,8 @@ COLUMNS: dict[str, str] = {
     "pairs_measured": "pairs with a pose",
     "duration_s": "from the first of them to the last",
     "k_m_m_s2": "lever arm of the rolling friction per squared precession rate, fitted to the dots [m s^2]",
-    "k_m_sigma_m_s2": "its standard deviation",
-    "k_m_reduced_chi_square": "of that fit; far from 1, the model lacks something",
+    "k_m_sigma_m_s2": "its standard deviation, larger by the root of the next column where that exceeds 1",
+    "k_m_reduced_chi_square": "of that fit; far from 1, the model lacks something and k_m takes a part of it",
     "k_m_undetermined": "why there is no k_m",
     "n_energy": "exponent of the energy in t_f - t",
     "n_energy_sigma": "",

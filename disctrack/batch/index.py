@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from disctrack.batch.columns import LACKS_SOMETHING
 from disctrack.batch.reasons import reason_of
 from disctrack.whole_files import write_whole
 
@@ -80,7 +81,7 @@ def _cells(row: Row) -> str:
         escape(row["recording"]),
         escape(row["status"]),
         pairs,
-        _plus_minus(row["k_m_m_s2"], row["k_m_sigma_m_s2"], 1e8),
+        _friction(row),
         *(_plus_minus(row[n], row[f"{n}_sigma"]) for n in ("n_energy", "n_theta", "n_psidot")),
         _plus_minus(row["t_f_s"], row["t_f_sigma_s"], digits=5),
         "–" if None in rms else f"{max(rms):.4f}",
@@ -88,6 +89,12 @@ def _cells(row: Row) -> str:
         " ".join(_link(row[key], text) for key, text in (("report", "report"), ("diagnosis_report", "diagnosis"))),
     ]
     return "".join(f"<td>{cell}</td>" for cell in cells)
+
+
+def _friction(row: Row) -> str:
+    """With the chi-square of its model where that says that the number is not the whole story."""
+    shown, misfit = _plus_minus(row["k_m_m_s2"], row["k_m_sigma_m_s2"], 1e8), row["k_m_reduced_chi_square"]
+    return shown if misfit is None or misfit <= LACKS_SOMETHING else f"{shown} (model: χ² {misfit:.3g})"
 
 
 def _plus_minus(value: float | None, sigma: float | None, factor: float = 1.0, digits: int = 4) -> str:

@@ -61,8 +61,8 @@ def analysed_numbers(analysis: Analysis) -> Numbers:
 def friction_numbers(trajectory: Trajectory) -> Numbers:
     """The paper's k_m [m s^2] fitted to the dots of all frames, with the reduced chi-square of that model.
 
-    Where it is far from 1, the model lacks something, and k_m takes a part of that. `k_m_undetermined` says why there
-    is none.
+    Where that is far from 1, the model lacks something and k_m takes a part of it: sigma is then larger by its root,
+    and no more than a hint. `k_m_undetermined` says why there is no k_m.
     """
     nothing: Numbers = {"k_m_m_s2": None, "k_m_sigma_m_s2": None, "k_m_reduced_chi_square": None}
     try:
@@ -73,9 +73,10 @@ def friction_numbers(trajectory: Trajectory) -> Numbers:
         return nothing | {"k_m_undetermined": str(error)}
     if not found.converged:
         return nothing | {"k_m_undetermined": "the rolling model with this loss does not fit the motion"}
+    misfit = np.sqrt(max(found.reduced_chi_square, 1.0))
     return {
         "k_m_m_s2": _number(found.values[_K_M]),
-        "k_m_sigma_m_s2": _number(found.sigma(_K_M)),
+        "k_m_sigma_m_s2": _number(found.sigma(_K_M) * misfit),
         "k_m_reduced_chi_square": _number(found.reduced_chi_square),
         "k_m_undetermined": "",
     }

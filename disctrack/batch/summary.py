@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import disctrack
-from disctrack.batch.columns import COLUMNS
+from disctrack.batch.columns import COLUMNS, LACKS_SOMETHING
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places, options_as_json
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
@@ -140,6 +140,8 @@ def line_of(row: Row, width: int) -> str:
     parts = [f"{row['pairs_measured']} of {row['pairs']} pairs"]
     if row["k_m_m_s2"] is not None:
         parts.append(f"k_m {row['k_m_m_s2'] * 1e8:.4f} +- {row['k_m_sigma_m_s2'] * 1e8:.4f} e-8 m s2")
+        if row["k_m_reduced_chi_square"] > LACKS_SOMETHING:
+            parts.append(f"but the model with it lacks something (chi-square {row['k_m_reduced_chi_square']:.3g})")
     if row["n_theta"] is not None:
         parts.append(f"n_theta {row['n_theta']:.4f} +- {row['n_theta_sigma']:.4f}")
     if row["t_f_s"] is not None:
