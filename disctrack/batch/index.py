@@ -71,7 +71,7 @@ def _table(rows: Sequence[Row]) -> str:
     header = ("recording", "status", "pairs", "k_m (10⁻⁸ m s²)", "n_E", "n_θ", "n_ψ̇", "t_f (s)", "rms (px)", "χ²", "")
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join(f"<tr class={row['status'].split()[0]}>{_cells(row)}</tr>" for row in rows)
-    return f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    return f'<div class="scroll card"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _cells(row: Row) -> str:
@@ -113,7 +113,7 @@ body{margin:0}main{max-width:1280px;margin:0 auto;padding:2rem 1.5rem 4rem}
 h1{font-size:1.7rem;margin:.2rem 0 1rem}h2{font-size:1.25rem;margin:1.6rem 0 .6rem}
 .warn{background:#fff6e5;border:1px solid #e6c27a;border-radius:10px;padding:.9rem 1.2rem;margin:1.2rem 0}
 .warn ul{margin:.4rem 0 0;padding-left:1.2rem;overflow-wrap:anywhere}
-.scroll{overflow-x:auto;background:#fff;border:1px solid #dfe5ea;border-radius:10px;padding:.6rem 1rem}
+.scroll{overflow-x:auto}.card{background:#fff;border:1px solid #dfe5ea;border-radius:10px;padding:.6rem 1rem}
 table{border-collapse:collapse;font-size:.88rem}
 th,td{text-align:left;padding:.3rem .9rem .3rem 0;border-bottom:1px solid #e8edf1;white-space:nowrap;
 font-variant-numeric:tabular-nums}

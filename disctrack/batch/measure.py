@@ -126,7 +126,7 @@ def _reusable(path: Path, recording: Recording, rig: StereoRig, pairs: ImagePair
 def _track(
     path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs, job: Job, progress: Progress
 ) -> tuple[Trajectory, dict[str, Any], Provenance]:
-    done = 0
+    done = 0  # read and added to by several threads: a lost update spoils the bar for a moment, no more
 
     def advance(n: int) -> None:
         nonlocal done

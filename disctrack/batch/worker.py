@@ -58,17 +58,19 @@ def _listen(lines: queue.Queue[str | None], busy: threading.Event) -> None:
 
 
 class _Teller:
-    """Tells the share done, not more often than anyone can read."""
+    """Tells the share done, from any thread, and not more often than anyone can read."""
 
     def __init__(self, answers: TextIO) -> None:
         self.answers = answers
         self.last = 0.0
+        self.lock = threading.Lock()
 
     def __call__(self, share: float) -> None:
-        now = time.monotonic()
-        if now - self.last > PROGRESS_EVERY:
-            self.last = now
-            _tell(self.answers, {"share": share})
+        with self.lock:
+            now = time.monotonic()
+            if now - self.last > PROGRESS_EVERY:
+                self.last = now
+                _tell(self.answers, {"share": share})
 
 
 def _tell(answers: TextIO, message: dict[str, Any]) -> None:
