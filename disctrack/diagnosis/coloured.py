@@ -8,7 +8,7 @@ significant; to whiten with their covariance makes chi-squares, sigmas and predi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,8 @@ class SmoothNoise:
     def covariance(self, time: Array) -> Array:
         """(n, n) of one stretch of samples; different stretches are independent."""
         apart = (time[:, None] - time[None, :]) / self.memory
-        # a share of 1e-6 keeps the Cholesky factor regular where the white part is next to nothing
-        floor = (self.white**2 + 1e-6 * self.smooth**2) * np.eye(len(time))
+        # a share of 1e-9 keeps the Cholesky factor regular where the white part is next to nothing
+        floor = (self.white**2 + 1e-9 * self.smooth**2) * np.eye(len(time))
         return np.asarray(self.smooth**2 * np.exp(-0.5 * apart**2) + floor, float)
 
     def whitening(self, time: Array) -> Array:
@@ -50,14 +50,23 @@ class Stretch:
 
 
 def estimate(stretches: Sequence[Stretch], start: SmoothNoise) -> SmoothNoise:
-    """Restricted maximum likelihood: what is left in all stretches after their bases are cleared out."""
+    """Restricted maximum likelihood: what is left in all stretches after their bases are cleared out.
+
+    A memory beyond a fifth of the longest stretch is not sought: such an error looks like the motion itself.
+    """
+    # of large numbers that the bases explain, the likelihood would leave rounding
+    stretches = [replace(s, values=s.values - s.basis @ np.linalg.lstsq(s.basis, s.values)[0]) for s in stretches]
+    longest = 0.2 * max(float(np.ptp(s.time)) for s in stretches)
+    bounds = [(np.log(1e-3 * x), np.log(1e3 * x)) for x in (start.white, start.smooth)]
+    bounds.append((np.log(0.01 * longest), np.log(longest)))
 
     def cost(x: Array) -> float:
         noise = SmoothNoise(*np.exp(x).tolist())
         return sum(_minus_log_likelihood(s, noise) for s in stretches)
 
-    x = np.log([start.white, start.smooth, start.memory])
-    found = minimize(cost, x, method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.05, "maxiter": 250})
+    x = np.log([start.white, start.smooth, min(start.memory, 0.9 * longest)])
+    options = {"xatol": 0.02, "fatol": 0.1, "maxiter": 160}
+    found = minimize(cost, x, method="Nelder-Mead", bounds=bounds, options=options)
     return SmoothNoise(*np.exp(found.x).tolist())
 
 

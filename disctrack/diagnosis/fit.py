@@ -62,7 +62,7 @@ def compress(residual: Array, derivative: Array) -> tuple[Array, Array]:
 
     The Q of [derivative, residual] is dropped; norms and angles of all combinations of columns stay.
     """
-    stacked = np.column_stack([derivative.reshape(-1, derivative.shape[-1]), residual.reshape(-1)])
+    stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
     R = triangle(stacked)
     return R[:, -1], R[:, :-1]
 
@@ -93,6 +93,8 @@ def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, A
 def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Array:
     """Argmin |right - matrix x| with lower <= x <= upper; where directions are undetermined, the shortest x."""
     length = np.linalg.norm(matrix, axis=0)
+    if length.size == 0:
+        return np.zeros(0)
     scale = np.where(length > 0, 1.0 / np.where(length > 0, length, 1.0), 1.0)
     scaled = matrix * scale
     x = np.asarray(np.linalg.lstsq(scaled, right, rcond=1e-12)[0] * scale, float)

@@ -48,7 +48,8 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     train = fit(Subset(system, rows), quantities, start)
     test = ~rows & (system.weights > 0)
     residual, derivative = system.linearise(train.values, train.names)
-    residual, derivative = residual[test].reshape(-1), derivative[test].reshape(-1, len(train.names))
+    residual, derivative = residual[test].reshape(-1), derivative[test]
+    derivative = derivative.reshape(residual.size, len(train.names))
     n_data = int(np.sum(system.weights[test]))
     if not (np.isfinite(residual).all() and np.isfinite(derivative).all()):
         return HeldOut(train, test, np.inf, float(n_data), -np.inf, n_data)
@@ -63,6 +64,8 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
 
 
 def _square_root(covariance: Array) -> Array:
+    if covariance.size == 0:  # a model without quantities
+        return covariance
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(scale > 0, scale, 1.0)
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))

@@ -105,7 +105,9 @@ def _sigmas(cleared: Array, before: Array) -> Array:
     normal = (cleared / length).T @ (cleared / length)
     eigenvalues, vectors = np.linalg.eigh(normal)
     floor = INVISIBLE**2
-    variance = (vectors**2) @ np.where(eigenvalues > floor, 1.0 / np.maximum(eigenvalues, floor), np.inf)
+    seen = eigenvalues > floor
+    variance = (vectors[:, seen] ** 2) @ (1.0 / eigenvalues[seen])
+    variance[np.any(np.abs(vectors[:, ~seen]) > INVISIBLE, axis=1)] = np.inf
     return np.asarray(np.sqrt(variance) / length, float)
 
 

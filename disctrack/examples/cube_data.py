@@ -1,0 +1,260 @@
+"""Tosses of a cube as published, and the stretches of them in which nothing touches it.
+
+Data: Pfrommer, Halm & Posa, "ContactNets", CoRL 2020: 570 tosses of a cube onto a table, poses from tags on its faces
+at 148 Hz. Lengths of the file are half widths of the cube; here they are metres, by the declared half width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from disctrack.errors import AnalysisError
+
+Array = NDArray[np.float64]
+
+HALF_WIDTH = 0.0524  # [m] as declared
+FRAME_RATE = 148.0  # [Hz]
+MASS = 0.37  # [kg]
+CLEARANCE = 0.12  # [half widths] of the lowest corner, from which on nothing touches: several times what contacts show
+SHORTEST = 9  # samples of a flight
+GLITCH = 6.0  # times the median roughness, beyond which a flight is not one: a hand, or a tag mistaken
+RELEASE = 5.0  # sigmas by which a first sample may stand off the smooth motion before it counts as still in the hand
+MAX_RELEASE = 6  # samples
+REST = 8  # last samples of a toss
+STILL = 0.02  # [m/s] between two samples, below which a cube lies still
+AT_REST = (0.03, np.cos(np.radians(1.5)))  # [half widths] about the resting height, and cosine of a face's tilt
+
+
+@dataclass(frozen=True)
+class Toss:
+    """Poses of one toss."""
+
+    number: int
+    position: Array  # (n, 3) [m]
+    rotation: Array  # (n, 3, 3) body to world
+
+    @property
+    def reach(self) -> Array:
+        """(n,) height of the centre over the lowest corner, in half widths: 1 on a face, sqrt(3) on a corner."""
+        return np.asarray(np.abs(self.rotation[:, 2, :]).sum(axis=1), float)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A stretch of a toss in free flight, with the smooth motion about which effects are reckoned."""
+
+    number: int  # of the toss
+    time: Array  # (n,) from the middle [s]
+    position: Array  # (n, 3) [m]
+    rotation: Array  # (n, 3, 3)
+    path: Array  # (n, 3) parabola through the positions
+    velocity: Array  # (n, 3) its slope
+    omega: Array  # (3,) constant angular velocity in world axes that fits best [rad/s]
+    turning: Array  # (n, 3, 3) rotation at that velocity
+    turn: Array  # (n, 3) from there to the measured attitude, rotation vector in axes of the body [rad]
+    along: Array  # (3,) horizontal direction of the flight
+    across: Array  # (3,) horizontal, to its left
+
+    @property
+    def speed(self) -> float:
+        """Mean speed [m/s]."""
+        return float(np.linalg.norm(self.velocity, axis=1).mean())
+
+
+def read_tosses(folder: Path) -> tuple[Toss, ...]:
+    """All tosses of `cube_tosses.npz`. Raises AnalysisError."""
+    path = Path(folder) / "cube_tosses.npz"
+    if not path.is_file():
+        raise AnalysisError(f"{path}: not there. Name the folder that holds cube_tosses.npz.")
+    with np.load(path) as file:
+        if not {"state", "offset"} <= set(file.files):
+            raise AnalysisError(f"{path}: holds {sorted(file.files)}; expected state (n, 13) and offset (tosses + 1,).")
+        state, offset = np.asarray(file["state"], float), np.asarray(file["offset"], int)
+    if state.ndim != 2 or state.shape[1] < 7 or not np.isfinite(state[:, :7]).all() or offset[-1] != len(state):
+        raise AnalysisError(f"{path}: state is {state.shape}, offset ends at {offset[-1]}; expected finite rows of 13.")
+    rotation = Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
+    return tuple(
+        Toss(i, HALF_WIDTH * state[a:b, :3], rotation[a:b]) for i, (a, b) in enumerate(pairwise(offset.tolist()))
+    )
+
+
+def without_copies(tosses: Sequence[Toss]) -> tuple[tuple[Toss, ...], int]:
+    """Tosses without those that are others turned about the vertical, and how many they were.
+
+    Such copies have the same heights to the last digit; in a comparison with held-out tosses they would be cheats.
+    """
+    first: dict[bytes, Toss] = {}
+    for toss in tosses:
+        first.setdefault(np.round(toss.position[:8, 2] / HALF_WIDTH, 6).tobytes(), toss)
+    kept = tuple(first.values())
+    return kept, len(tosses) - len(kept)
+
+
+def flights(tosses: Sequence[Toss]) -> tuple[tuple[Flight, ...], int]:
+    """The first flight of every toss, and how many were left out because they are rough or too short.
+
+    A flight begins with the first sample that keeps to the smooth motion of the others (before, a hand still holds the
+    cube; the very first sample is never taken) and lasts until a corner comes as low as CLEARANCE. Rough is one whose
+    third differences are GLITCH times those of the others: no smooth motion has them.
+    """
+    ends = [_first_contact(toss) for toss in tosses]
+    whole = [smooth_flight(t, 1, n) for t, n in zip(tosses, ends, strict=True) if n - 1 >= SHORTEST]
+    if not whole:
+        return (), len(tosses)
+    sigma = 1.4826 * float(np.median([np.median(np.abs(_off(f)[2:-2])) for f in whole]))
+    found = []
+    for toss, end in zip(tosses, ends, strict=True):
+        for first in range(1, min(MAX_RELEASE, end - SHORTEST) + 1):
+            flight = smooth_flight(toss, first, end)
+            if np.abs(_off(flight)[0]).max() <= RELEASE * sigma:
+                found.append(flight)
+                break
+    rough = np.array([np.sqrt(np.mean(np.diff(_off(f), 3, axis=0) ** 2)) for f in found])
+    smooth = tuple(f for f, r in zip(found, rough, strict=True) if r <= GLITCH * np.median(rough))
+    return smooth, len(tosses) - len(smooth)
+
+
+def _first_contact(toss: Toss) -> int:
+    clear = toss.position[:, 2] / HALF_WIDTH - toss.reach > CLEARANCE
+    return len(clear) if clear.all() else int(np.argmin(clear))
+
+
+def _off(flight: Flight) -> Array:
+    """(n, 6) distances from the smooth motion [m], turns as they move the middle of a face."""
+    return np.concatenate([flight.position - flight.path, HALF_WIDTH * flight.turn], axis=1)
+
+
+def smooth_flight(toss: Toss, first: int, end: int) -> Flight:
+    """Samples `first` to `end` of a toss with their parabola and constant angular velocity, both by least squares."""
+    position, rotation = toss.position[first:end], toss.rotation[first:end]
+    n = len(position)
+    time = np.asarray((np.arange(n) - (n - 1) / 2) / FRAME_RATE, float)
+    powers = np.asarray(time[:, None] ** np.arange(3), float)
+    parabola = np.linalg.lstsq(powers, position, rcond=None)[0]
+    velocity = parabola[1] + 2 * time[:, None] * parabola[2]
+    measured = Rotation.from_matrix(rotation)
+    middle = measured[n // 2]
+    omega = (measured[-1] * measured[0].inv()).as_rotvec() * FRAME_RATE / (n - 1)
+    for _ in range(6):  # Gauss-Newton; the second step already changes less than the noise
+        turning = Rotation.from_rotvec(time[:, None] * omega) * middle
+        left = (measured * turning.inv()).as_rotvec()
+        shift, rate = np.linalg.lstsq(powers[:, :2], left, rcond=None)[0]
+        middle, omega = Rotation.from_rotvec(shift) * middle, omega + rate
+    turning = Rotation.from_rotvec(time[:, None] * omega) * middle
+    turn = (turning.inv() * measured).as_rotvec()
+    path = powers @ parabola
+    along = np.array([parabola[1, 0], parabola[1, 1], 0.0]) / np.hypot(*parabola[1, :2])
+    across = np.cross([0.0, 0.0, 1.0], along)
+    return Flight(
+        toss.number,
+        time,
+        position,
+        rotation,
+        path,
+        velocity,
+        omega,
+        np.asarray(turning.as_matrix(), float),
+        turn,
+        along,
+        across,
+    )
+
+
+@dataclass(frozen=True)
+class Resting:
+    """A cube at rest on a face, in the axes of the flight that led there."""
+
+    number: int
+    height: float  # of the centre [m]
+    spin: float  # rate of turning about the vertical [rad/s]; NaN while it still slides
+    normal: Array  # (2,) components of the face's normal along and across
+    by_axes: Array  # (2, 3) change of the normal by a turn of the tags' axes against the cube's, about each body axis
+    point: Array  # (3,) along, across, up [m]; where it would be if the declared half width were right
+
+
+def resting(tosses: Sequence[Toss], flown: Sequence[Flight]) -> tuple[Resting, ...]:
+    """The tosses of the given flights that end on a face."""
+    directions = {f.number: np.stack([f.along, f.across]) for f in flown}
+    found = []
+    for toss in tosses:
+        if toss.number not in directions:
+            continue
+        axes, last = directions[toss.number], slice(-REST, None)
+        z = toss.position[last, 2] / HALF_WIDTH
+        up = toss.rotation[last, 2, :]
+        face = int(np.abs(up).mean(axis=0).argmax())
+        if np.abs(up[:, face]).min() > AT_REST[1] and np.ptp(z) < AT_REST[0] and abs(z.mean() - 1) < 3 * AT_REST[0]:
+            normal = (toss.rotation[last, :, face] * np.sign(up[:, face])[:, None]).mean(axis=0)
+            place = toss.position[last].mean(axis=0)
+            point = np.array([*(axes @ place), HALF_WIDTH])
+            spin = np.nan
+            if np.abs(np.diff(toss.position[last], axis=0)).max() * FRAME_RATE < STILL:
+                turned = Rotation.from_matrix(toss.rotation[last] @ toss.rotation[last][0].T).as_rotvec()[:, 2]
+                spin = float(np.polyfit(np.arange(REST) / FRAME_RATE, turned, 1)[0])
+            upward = np.eye(3)[face] * np.sign(up[-1, face])
+            by_axes = axes @ toss.rotation[-1] @ np.cross(np.eye(3), upward).T
+            found.append(Resting(toss.number, float(place[2]), spin, axes @ normal, by_axes, point))
+    return tuple(found)
+
+
+def contact_line(tosses: Sequence[Toss]) -> tuple[float, float]:
+    """Slope of (height / half width) against reach while a corner or edge stays on the table, minus 1; standard error.
+
+    A cube of another size or another scale has a slope; so have rounded edges, and these data do not separate them.
+    """
+    reach, over = [], []
+    for toss in tosses:
+        gap = toss.position[:, 2] / HALF_WIDTH - toss.reach
+        held = (np.abs(np.gradient(gap)) < 0.004) & (np.abs(gap + 0.045) < 0.075) & (toss.reach > 1.02)
+        reach.append(toss.reach[held])
+        over.append(gap[held])
+    x, y = np.concatenate(reach), np.concatenate(over)
+    if len(x) < 20:
+        return np.nan, np.nan
+    weight = np.ones(len(x))
+    for _ in range(20):
+        line = np.polyfit(x - 1, y, 1, w=np.sqrt(weight))
+        left = y - np.polyval(line, x - 1)
+        weight = 1 / (1 + (left / 0.01) ** 2)
+    spread = np.sqrt(np.sum(weight * left**2) / np.sum(weight)) / np.sqrt(np.sum(weight * (x - x.mean()) ** 2))
+    return float(line[0]), float(spread)
+
+
+def side_force_of_sliding(tosses: Sequence[Toss]) -> tuple[float, float]:
+    """Acceleration across the velocity over the speed [1/s] while the cube slides on a face, and its standard error.
+
+    What turns with the spin (friction under a turning face does) is taken off by regression.
+    """
+    rows = []
+    for toss in tosses:
+        z = toss.position[:, 2] / HALF_WIDTH
+        flat = (np.abs(toss.rotation[:, 2, :]).max(axis=1) > AT_REST[1]) & (np.abs(z - 0.978) < AT_REST[0])
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]]).astype(int))).reshape(-1, 2)
+        for a, b in edges:
+            if b - a >= SHORTEST:
+                place, rotation = toss.position[a + 1 : b - 1, :2], toss.rotation[a + 1 : b - 1]
+                t = (np.arange(len(place)) - (len(place) - 1) / 2) / FRAME_RATE
+                bend, v, _ = np.polyfit(t, place, 2)
+                spin = np.polyfit(t, Rotation.from_matrix(rotation @ rotation[len(t) // 2].T).as_rotvec()[:, 2], 1)[0]
+                speed = float(np.hypot(*v))
+                if speed > 0.2:
+                    rows.append((speed, spin, 2 * (v[0] * bend[1] - v[1] * bend[0]) / speed, len(t)))
+    if len(rows) < 20:
+        return np.nan, np.nan
+    speed, spin, across, n = np.array(rows).T
+    A, weight = np.column_stack([speed, spin]), n**2.5  # a second derivative's variance falls with the fifth power
+    W = np.sqrt(weight)
+    for _ in range(20):
+        x = np.linalg.lstsq(A * W[:, None], across * W, rcond=None)[0]
+        left = across - A @ x
+        W = np.sqrt(weight / (1 + (left / 0.5) ** 2))
+    inverse = np.linalg.inv((A * W[:, None]).T @ (A * W[:, None]))
+    spread = inverse @ ((A * (W**2 * left)[:, None]).T @ (A * (W**2 * left)[:, None])) @ inverse
+    return float(x[0]), float(np.sqrt(spread[0, 0]))

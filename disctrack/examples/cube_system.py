@@ -1,0 +1,216 @@
+"""A tossed cube in free flight as a system that `disctrack.diagnosis` can diagnose.
+
+Base model: the centre of the tags is the centre of mass and falls with the declared gravity; a uniform cube turns at a
+constant angular velocity. Place, velocity, attitude and angular velocity are each flight's own: they are cleared out,
+so that a sample is judged by what the samples before it in the same flight foretell of it (recursive residuals). Every
+effect is small; its residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.diagnosis.coloured import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.system import Candidate, Quantity, Values
+from disctrack.errors import AnalysisError
+from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies
+from disctrack.examples.cube_effects import CANDIDATES, GRAVITY, columns, resting_columns
+
+Array = NDArray[np.float64]
+
+CHANNELS = ("x", "y", "z", "turn_1", "turn_2", "turn_3")
+GROUPS = {"horizontal": (0, 1), "vertical": (2,), "turn": (3, 4, 5)}  # channels whose noise is alike
+HELD_OUT = 3  # every third toss
+_START = {"horizontal": SmoothNoise(2e-5, 5e-5, 0.03), "vertical": SmoothNoise(2e-5, 3e-5, 0.03),
+          "turn": SmoothNoise(2e-4, 3e-4, 0.03)}  # fmt: skip
+_DIFFUSE = 1e6  # variance of a flight's own numbers over that of the noise, before they are cleared exactly
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Samples of one flight: measured minus base model, and the effects' columns, not whitened."""
+
+    flight: Flight
+    left: Array  # (n, 6) [m], [rad]
+    effects: Array  # (n, 6, k)
+    own: Array  # (n, 3, 6) what a flight's own attitude and angular velocity do to its turn
+
+
+class CubeTosses:
+    """Poses in free flight, one row a sample (its first two foretell nothing), then heights at rest, one row a toss."""
+
+    base: tuple[Quantity, ...] = ()
+    candidates: tuple[Candidate, ...] = CANDIDATES
+
+    def __init__(self, tosses: Sequence[Toss]) -> None:
+        """Find the flights, measure their noise, whiten. Raises AnalysisError."""
+        tosses, self.n_copies = without_copies(tosses)
+        self.flights, self.n_left_out = flights(tosses)
+        if len(self.flights) < 2 * HELD_OUT:
+            raise AnalysisError(f"{len(self.flights)} free flights in {len(tosses)} tosses: 6 are needed at least.")
+        self.names = tuple(dict.fromkeys(q.name for c in CANDIDATES for q in c.quantities))
+        rows = self._rows = [_rows(f, self.names) for f in self.flights]
+        self.cubes = resting(tosses, self.flights)
+        self.noise = _measured_noise(rows)
+        parts = [_whitened(r, self.noise) for r in rows]
+        blocks, toss, present = [], [], []
+        for flight, part in zip(self.flights, parts, strict=True):
+            blocks += [part, np.zeros((1, *part.shape[1:]))]  # a row without data between two flights
+            toss += [np.full(len(part) + 1, flight.number)]
+            present += [np.full(len(part), 6.0), np.zeros(1)]
+        still, self.resting_sigma = _resting_rows(self.cubes, self.names)
+        everything = np.concatenate([*blocks, still])
+        self._columns, self._left = everything[..., :-1], everything[..., -1]
+        self._index = {name: i for i, name in enumerate(self.names)}
+        self.weights = np.concatenate([*present, np.sum(np.any(still != 0, axis=-1), axis=1)])
+        self.toss = np.concatenate([*toss, np.array([c.number for c in self.cubes], int)])
+        self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """No candidate has a threshold."""
+        return ()
+
+    def training_rows(self) -> NDArray[np.bool_]:
+        """(n,) False for every third toss."""
+        return np.asarray(self.toss % HELD_OUT != HELD_OUT - 1, bool)
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """Whitened residual (n, 6), and the prediction's derivative (n, 6, k): linear in every quantity."""
+        amounts = np.zeros(len(self.names))
+        for name, value in values.items():
+            amounts[self._index[name]] = value
+        residual = self._left - self._columns @ amounts
+        return residual, self._columns[..., [self._index[n] for n in names]]
+
+    def residuals(self, values: Values, seen: float = 1.0) -> list[Array]:
+        """Measured minus predicted (n, 6) [m], [rad] of every flight.
+
+        Its own start and rates are fitted by least squares to the first share `seen` of it; the rest is a forecast.
+        """
+        amounts = np.array([values.get(n, 0.0) for n in self.names])
+        found = []
+        for r in self._rows:
+            n = len(r.left)
+            rows = np.arange(n) < max(4, round(seen * n))
+            found.append(_cleared(r.left - r.effects @ amounts, r, rows))
+        return found
+
+
+def _resting_rows(cubes: Sequence[Resting], names: Sequence[str]) -> tuple[Array, Array]:
+    """Whitened (m, 6, k + 1), four of the six used; standard deviations (4,) of height [m], normal, spin [rad/s].
+
+    How much resting cubes differ once all candidates have taken their share is the noise.
+    """
+    if len(cubes) < 4 * HELD_OUT:
+        return np.zeros((0, 6, len(names) + 1)), np.full(4, np.nan)
+    effects = resting_columns(cubes, names)
+    left = np.array([[c.height - HALF_WIDTH, *c.normal, c.spin] for c in cubes])
+    found = np.zeros((len(cubes), 6, len(names) + 1))
+    sigma = np.full(4, np.nan)
+    for i in range(4):
+        known = np.isfinite(left[:, i])
+        A = effects[known, i][:, np.any(effects[:, i] != 0, axis=0)]
+        freedom = int(known.sum()) - A.shape[1]
+        if freedom < 4:
+            continue
+        rest = left[known, i] - A @ np.linalg.lstsq(A, left[known, i], rcond=1e-10)[0]
+        sigma[i] = np.sqrt(np.sum(rest**2) / freedom)
+        if sigma[i] > 0:
+            found[known, i, :-1], found[known, i, -1] = effects[known, i] / sigma[i], left[known, i] / sigma[i]
+    return found, sigma
+
+
+def _rows(flight: Flight, names: Sequence[str]) -> _Rows:
+    falling = np.zeros_like(flight.position)
+    falling[:, 2] = -GRAVITY * flight.time**2 / 2
+    left = np.concatenate([flight.position - falling, flight.turn], axis=1)
+    left[:, :3] -= np.linalg.lstsq(_line(flight), left[:, :3], rcond=None)[0][0]  # large numbers off before whitening
+    step = np.swapaxes(flight.turning, 1, 2)
+    dt = flight.time[1] - flight.time[0]
+    turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(0.5 * (step[1:] + step[:-1]) * dt, axis=0)])
+    own = np.concatenate([np.broadcast_to(np.eye(3), step.shape), turned], axis=2)
+    return _Rows(flight, left, columns(flight, names), own)
+
+
+def _line(flight: Flight) -> Array:
+    return np.column_stack([np.ones(len(flight.time)), flight.time])
+
+
+def _cleared(left: Array, rows: _Rows, seen: NDArray[np.bool_]) -> Array:
+    """Without what the flight's own motion, fitted to the samples `seen`, makes of it."""
+    line, own = _line(rows.flight), rows.own
+    place = line @ np.linalg.lstsq(line[seen], left[seen, :3], rcond=None)[0]
+    amount = np.linalg.lstsq(own[seen].reshape(-1, 6), left[seen, 3:].reshape(-1), rcond=None)[0]
+    return left - np.concatenate([place, own @ amount], axis=1)
+
+
+def recursive_whitening(covariance: Array, basis: Array) -> Array:
+    """W (m - k, m): rows blind to the basis (m, k), W covariance W^T = 1, row i made of the samples up to k + i.
+
+    With a diffuse prior on the basis the Cholesky factor predicts each sample from those before it; the first k
+    foretell nothing. What the finite prior leaves is projected out.
+    """
+    k = basis.shape[1]
+    scaled = basis / np.linalg.norm(basis, axis=0) * np.sqrt(len(basis) * np.trace(covariance) / len(basis))
+    root = np.linalg.cholesky(covariance + _DIFFUSE * scaled @ scaled.T)
+    W = np.linalg.inv(root)[k:]
+    Q = np.linalg.qr(basis)[0]
+    return np.asarray(W - (W @ Q) @ Q.T, float)
+
+
+def _whitened(rows: _Rows, noise: Mapping[str, SmoothNoise]) -> Array:
+    """(n - 2, 6, k + 1) effects and residual of one flight, the residual last."""
+    everything = np.concatenate([rows.effects, rows.left[..., None]], axis=-1)
+    n, _, k = everything.shape
+    found = np.empty((n - 2, 6, k))
+    for name, channels in GROUPS.items():
+        K = noise[name].covariance(rows.flight.time)
+        if name == "turn":
+            W = recursive_whitening(np.asarray(np.kron(K, np.eye(3)), float), rows.own.reshape(-1, 6))
+            found[:, 3:] = (W @ everything[:, 3:].reshape(3 * n, k)).reshape(n - 2, 3, k)
+        else:
+            W = recursive_whitening(K, _line(rows.flight))
+            for c in channels:
+                found[:, c] = W @ everything[:, c]
+    return found
+
+
+def _measured_noise(rows: Sequence[_Rows]) -> dict[str, SmoothNoise]:
+    """Noise of each group of channels, from what is left when all candidates together have taken their share."""
+    noise = dict(_START)
+    for _ in range(2):
+        whitened = np.concatenate([_whitened(r, noise) for r in rows]).reshape(-1, rows[0].effects.shape[-1] + 1)
+        length = np.linalg.norm(whitened[:, :-1], axis=0)
+        scale = np.where(length > 0, length, 1.0)
+        # normal equations: 50 columns of length one, of which some are alike by intention
+        A = whitened[:, :-1] / scale
+        amounts = np.linalg.pinv(A.T @ A, rcond=1e-10, hermitian=True) @ (A.T @ whitened[:, -1]) / scale
+        left = [_cleared(r.left - r.effects @ amounts, r, np.ones(len(r.left), bool)) for r in rows]
+        for name, channels in GROUPS.items():
+            noise[name] = estimate(_by_length(rows, left, channels), noise[name])
+    return noise
+
+
+def _by_length(rows: Sequence[_Rows], left: Sequence[Array], channels: Sequence[int]) -> list[Stretch]:
+    """Flights of one length share instants, so that their samples stand side by side."""
+    found: dict[int, list[Array]] = {}
+    lines: dict[int, _Rows] = {}
+    for r, x in zip(rows, left, strict=True):
+        found.setdefault(len(x), []).append(x[:, list(channels)])
+        lines[len(x)] = r
+    return [Stretch(lines[n].flight.time, np.concatenate(v, axis=1), _line(lines[n].flight)) for n, v in found.items()]
+
+
+def white_chi_square(system: CubeTosses, values: Values) -> dict[str, float]:
+    """Mean square of what is left over the white part of the noise alone, per group: 1 if nothing else were there."""
+    left = system.residuals(values)
+    freedom = sum(len(x) - 2 for x in left)
+    found = {}
+    for name, channels in GROUPS.items():
+        total = sum(float(np.sum(x[:, list(channels)] ** 2)) for x in left)
+        found[name] = total / (freedom * len(channels)) / system.noise[name].white ** 2
+    return found

@@ -1,0 +1,178 @@
+"""A tossed cube: hidden effects are found, named and sized; noise is not; the published tosses hold several."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis import diagnose
+from disctrack.examples.cube_data import CLEARANCE, HALF_WIDTH, flights, read_tosses, without_copies
+from disctrack.examples.cube_system import CubeTosses, recursive_whitening
+from disctrack.examples.cube_tosses import SETTINGS, analyse_tosses, main
+from tests.oracles import tossed_cube
+
+N = 60  # tosses that are simulated
+
+
+@pytest.fixture(scope="module")
+def published(shared_data):
+    folder = shared_data / "contactnets_cube"
+    if not (folder / "cube_tosses.npz").is_file():
+        pytest.skip(f"{folder} is not there")
+    return read_tosses(folder)
+
+
+@pytest.fixture(scope="module")
+def answer(published):
+    return analyse_tosses(published[:180])
+
+
+def simulated(rng, folder, n=N, **hidden):
+    state, offset = tossed_cube.toss(rng, n, **hidden)
+    np.savez(folder / "cube_tosses.npz", state=state.astype(np.float32), offset=offset)
+    return read_tosses(folder)
+
+
+def named(diagnosis):
+    return {f.candidate.name for f in diagnosis.found}
+
+
+def test_recursive_residuals_of_noise_are_white_and_blind_to_the_motion(rng):
+    t = np.linspace(-1, 1, 12)
+    K = 0.3**2 * np.eye(12) + np.exp(-0.5 * ((t[:, None] - t) / 0.3) ** 2)
+    basis = np.column_stack([np.ones(12), t])
+    W = recursive_whitening(K, basis)
+    assert W.shape == (10, 12)
+    assert_allclose(W @ basis, 0, atol=1e-10)
+    assert_allclose(W @ K @ W.T, np.eye(10), atol=1e-4)  # the finite prior on the basis: 1e-6 times some ten
+    assert_allclose(np.triu(W, 3), 0, atol=1e-3)  # each made of itself and those before
+
+
+@pytest.mark.parametrize(
+    ("hidden", "expected"),
+    [
+        ({}, {}),
+        ({"scale": -0.02}, {"length_scale.change": -0.02}),
+        ({"centre_of_mass": (0, 0, 3e-3)}, {"centre_of_mass.c_3": 3e-3}),
+        (
+            {"scale": 0.015, "centre_of_mass": (2e-3, 0, -1e-3)},
+            {"length_scale.change": 0.015, "centre_of_mass.c_1": 2e-3, "centre_of_mass.c_3": -1e-3},
+        ),
+        ({"inertia": (1.08, 1.06, 1.0)}, {"principal_moments.e_11": 0.08, "principal_moments.e_22": 0.06}),
+    ],
+    ids=["nothing", "scale", "centre of mass", "scale and centre of mass", "inertia"],
+)
+def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hidden, expected):
+    system = CubeTosses(simulated(rng, tmp_path, **hidden))
+    found = diagnose(system, {}, SETTINGS, system.training_rows())
+    assert named(found) == {key.partition(".")[0] for key in expected}
+    assert found.verdict == ("found" if expected else "nothing missing")
+    for key, value in expected.items():
+        # four sigmas, and what first order leaves out: a fiftieth
+        assert abs(found.after.values[key] - value) < 4 * found.after.sigma(key) + 0.02 * abs(value)
+
+
+def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scale(rng, tmp_path):
+    system = CubeTosses(simulated(rng, tmp_path, gravity=9.7))
+    found = diagnose(system, {}, SETTINGS, system.training_rows())
+    (effect,) = found.found
+    rivals = {r.candidate.name for r in effect.cannot_be_told_from}
+    assert {effect.candidate.name} | rivals == {"gravity", "frame_rate"}
+
+
+def test_a_vertical_that_leans_with_every_toss_is_not_taken_for_one_that_leans_in_the_room(rng, tmp_path):
+    system = CubeTosses(simulated(rng, tmp_path, lean=0.01))
+    found = diagnose(system, {}, SETTINGS, system.training_rows())
+    assert named(found) == {"toss_tilt"}
+    assert abs(found.after.values["toss_tilt.across"] - 0.01) < 4 * found.after.sigma("toss_tilt.across") + 2e-4
+
+
+def test_flights_end_before_contact_and_begin_after_release(published):
+    tosses, _ = without_copies(published[:180])
+    found, left_out = flights(tosses)
+    by_number = {t.number: t for t in tosses}
+    assert len(found) > 0.85 * len(tosses)
+    assert left_out == len(tosses) - len(found)
+    for f in found[::10]:
+        toss = by_number[f.number]
+        lowest = toss.position[1 : 1 + len(f.time), 2] / HALF_WIDTH - toss.reach[1 : 1 + len(f.time)]
+        assert lowest.min() > CLEARANCE
+    # second differences of the height scatter about g by sqrt(6) x 24 um x rate^2 = 1.3 m/s^2; a contact adds hundreds
+    bends = np.concatenate([np.diff(f.position[:, 2], 2) for f in found]) * 148.0**2
+    assert np.percentile(np.abs(bends + 9.6), 99.5) < 6
+
+
+def test_some_published_tosses_are_copies_of_others_turned_about_the_vertical(published):
+    kept, copies = without_copies(published)
+    assert (len(kept), copies) == (537, 33)
+
+
+def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of_mass(answer):
+    """The first 180 tosses; the figures of all of them are in the slow test."""
+    assert answer.diagnosis.verdict == "found"
+    assert {"length_scale", "toss_tilt", "centre_of_mass", "tag_axes"} <= named(answer.diagnosis)
+    values = answer.diagnosis.after.values
+    assert values["length_scale.change"] == pytest.approx(-0.025, abs=0.003)
+    assert values["toss_tilt.across"] == pytest.approx(0.0138, abs=0.002)
+    assert values["centre_of_mass.c_3"] == pytest.approx(5.4e-3, abs=0.6e-3)
+    for group in ("horizontal", "vertical"):
+        assert answer.after.rms[group] < 0.6 * answer.before.rms[group]
+        assert answer.after.forecast_end[group] < 0.5 * answer.before.forecast_end[group]
+
+
+def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
+    system = answer.system
+    all_candidates = system.candidates
+    try:
+        system.candidates = tuple(c for c in all_candidates if c.name in ("clock_offset", "rotational_drag", "tilt"))
+        refused = diagnose(system, {}, SETTINGS, system.training_rows())
+    finally:
+        system.candidates = all_candidates
+    assert refused.verdict == "unexplained"
+    assert not refused.found
+
+
+def test_shuffled_residuals_of_the_tosses_give_no_finding(answer, rng):
+    system = answer.system
+    residual, _ = system.linearise(answer.diagnosis.after.values, [])
+    original = system._left
+    try:
+        shuffled = original.copy()
+        for rows in (system.weights == 6, (system.weights > 0) & (system.weights < 6)):
+            shuffled[rows] = rng.permutation(residual[rows], axis=0)
+        shuffled *= original != 0  # what was not measured stays so
+        system._left = shuffled
+        assert not diagnose(system, {}, SETTINGS, system.training_rows()).found
+    finally:
+        system._left = original
+
+
+def test_command_writes_diagnosis_and_figure_of_the_tosses(rng, tmp_path, capsys):
+    simulated(rng, tmp_path, 30, scale=-0.02)
+    assert main([str(tmp_path), "-o", str(tmp_path / "out")]) == 0
+    assert "length_scale" in capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert found["verdict"] == "found"
+    assert found["effects"][0]["name"] == "length_scale"
+    assert found["after"]["reduced_chi_square"] < 1.15
+    assert found["before"]["held_out"]["rms"]["vertical_um"] > found["after"]["held_out"]["rms"]["vertical_um"]
+    assert (tmp_path / "out" / "cube_tosses.png").stat().st_size > 10_000
+    assert main([str(tmp_path / "out")]) == 1
+    assert "cube_tosses.npz" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_figures_of_all_published_tosses(published):
+    answer = analyse_tosses(published)
+    d = answer.diagnosis
+    assert d.before.reduced_chi_square == pytest.approx(3.4, abs=0.3)
+    assert d.after.reduced_chi_square < 1.05
+    assert d.held_out_after.ratio_to_floor < 1.05
+    value, sigma = d.after.values["length_scale.change"], d.after.sigma("length_scale.change")
+    assert value == pytest.approx(-0.0249, abs=0.001)
+    assert sigma < 5e-4
+    assert d.after.values["principal_moments.e_11"] == pytest.approx(0.064, abs=0.01)
+    assert d.after.values["principal_moments.e_22"] == pytest.approx(0.052, abs=0.01)
+    assert answer.after.rms["horizontal"] < 30e-6
+    assert answer.after.rms["vertical"] < 26e-6

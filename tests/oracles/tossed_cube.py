@@ -1,0 +1,80 @@
+"""A tossed cube by integrating Newton's and Euler's equations with quaternions: shares no line with the product."""
+
+import numpy as np
+
+SIDE = 2 * 0.0524
+RATE = 148.0
+
+
+def _quaternion_rate(q, omega_body):
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    a, b, c = np.moveaxis(omega_body, -1, 0)
+    parts = (-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a)
+    return 0.5 * np.stack(parts, axis=-1)
+
+
+def matrix(q):
+    """Body to world (..., 3, 3) of w, x, y, z."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
+
+
+def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), drag=0.0, scale=0.0, lean=0.0, noise=2e-5):
+    """State (n * 40, 13) and offset of n tosses: 24 samples of flight at most, then 16 at rest, in half widths.
+
+    lean : [rad] of gravity, in the measured axes, to the left of every flight
+    noise : [m] of a position; of an attitude, that over the half width
+    """
+    h, steps = 1 / RATE / 8, 24 * 8
+    J = np.asarray(inertia, float)
+    offset_of_mass = np.asarray(centre_of_mass, float)
+    heading = rng.uniform(0, 2 * np.pi, n)
+    along = np.stack([np.cos(heading), np.sin(heading), np.zeros(n)], axis=-1)
+    across = np.stack([-along[:, 1], along[:, 0], np.zeros(n)], axis=-1)
+    down = gravity * (np.array([0.0, 0.0, -1.0]) + lean * across)
+    x = -0.25 * along + np.array([0.0, 0.0, 0.17])
+    v = rng.uniform(0.9, 1.3, (n, 1)) * along + np.array([0.0, 0.0, -0.1])
+    q = rng.standard_normal((n, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    omega = 3.0 * rng.standard_normal((n, 3))
+
+    def rates(x, v, q, omega):
+        pull = down - drag * np.linalg.norm(v, axis=1, keepdims=True) * v
+        return v, pull, _quaternion_rate(q, omega), np.cross(J * omega, omega) / J
+
+    seen_x, seen_q = [], []
+    y = (x, v, q, omega)
+    for step in range(steps):
+        if step % 8 == 0:
+            seen_x.append(y[0] - np.einsum("nij,j->ni", matrix(y[2]), offset_of_mass))
+            seen_q.append(y[2] / np.linalg.norm(y[2], axis=1, keepdims=True))
+        k1 = rates(*y)
+        k2 = rates(*(a + h / 2 * b for a, b in zip(y, k1, strict=True)))
+        k3 = rates(*(a + h / 2 * b for a, b in zip(y, k2, strict=True)))
+        k4 = rates(*(a + h * b for a, b in zip(y, k3, strict=True)))
+        y = tuple(a + h / 6 * (p + 2 * r + 2 * s + t) for a, p, r, s, t in zip(y, k1, k2, k3, k4, strict=True))
+    still_x = np.repeat((seen_x[-1] * [1, 1, 0] + [0, 0, SIDE / 2])[None], 16, axis=0)
+    yaw = rng.uniform(0, 2 * np.pi, n)
+    # the table is level, so that in axes which lean, resting cubes lean and stand on a slope
+    still_x[..., 2] += lean * np.sum(still_x * across, axis=-1)
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    side = lean / 2 * along
+    level = np.concatenate([c - s * side[:, 2:], c * side[:, :1] + s * side[:, 1:2], c * side[:, 1:2] - s * side[:, :1],
+                            s + c * side[:, 2:]], axis=-1)  # fmt: skip
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    position = np.concatenate([np.array(seen_x), still_x]).swapaxes(0, 1)
+    attitude = np.concatenate([np.array(seen_q), np.repeat(level[None], 16, axis=0)]).swapaxes(0, 1)
+    # one resting pose per toss is off by more than the noise of a sample, as tags are
+    off = np.concatenate([np.zeros((n, 24, 3)), np.repeat(2e-4 * rng.standard_normal((n, 1, 3)), 16, axis=1)], axis=1)
+    position = (1 + scale) * position + off + noise * rng.standard_normal(position.shape)
+    turn = noise / (SIDE / 2) * rng.standard_normal(position.shape)
+    turn[:, 24:] += 2e-3 * rng.standard_normal((n, 1, 3))
+    attitude = attitude + _quaternion_rate(attitude, turn)
+    attitude /= np.linalg.norm(attitude, axis=-1, keepdims=True)
+    state = np.concatenate([position / (SIDE / 2), attitude, np.zeros((n, 40, 6))], axis=-1)
+    return state.reshape(-1, 13), 40 * np.arange(n + 1)
