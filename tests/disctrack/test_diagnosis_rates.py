@@ -6,8 +6,9 @@ import pytest
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.enlarged import declared_model
 from disctrack.diagnosis.fit import fit
+from disctrack.validate.diagnosis_power import power
 from disctrack.validate.diagnosis_rates import draw, trajectory_of, trial
-from disctrack.validate.hidden_effects import HIDDEN_EFFECTS, hidden_effect
+from disctrack.validate.hidden_effects import HIDDEN_EFFECTS, Planted, hidden_effect
 
 # whose planting takes another way than the prediction: through the renderer's faults, instants, frames, areas
 MEASUREMENT = {e.name for e in HIDDEN_EFFECTS if e.visible and not e.plant(e.size, np.random.default_rng(1)).effects}
@@ -55,3 +56,20 @@ def test_a_trial_without_an_effect_finds_nothing():
     verdict = trial([], [], seed=4)
     assert verdict.verdict == "nothing missing"
     assert verdict.found == ()
+
+
+def test_an_effect_stands_out_by_what_its_refit_gains():
+    """The power curve's prediction, of a linearisation without the effect, is the gain of a fit with it."""
+    effect, seed = hidden_effect("table_tilt"), 6
+    (predicted,) = power([effect], [seed], rate=500.0)
+    size = 20.0 / predicted.standing_out[0] * effect.size
+    planted = effect.plant(size, np.random.default_rng([seed, 34]))
+    trajectory = trajectory_of(draw(seed, Planted({}), 500.0), planted)
+    system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
+    base = fit(system, system.base, system.start())
+    more = fit(system, (*base.quantities, *candidate_of(system, planted.truth).quantities), base.values)
+    # noncentral chi-square of two degrees at 20^2: 402 +- 40
+    assert base.cost - more.cost == pytest.approx(402, abs=4 * 40)
+    assert predicted.probability(size) > 0.999
+    assert predicted.probability(0.01 * size) < 0.01
+    assert 0 < predicted.smallest(0.5) < predicted.smallest(0.9) < size

@@ -59,7 +59,7 @@ def test_a_tilted_table_in_images_of_an_independent_motion_is_found_and_sized(tm
 
 @pytest.mark.slow
 def test_nothing_is_found_in_images_of_an_independent_motion_without_an_effect(tmp_path):
-    scene = full_scene(42, 200, 500.0)
+    scene = full_scene(42, 150, 400.0)
     document = diagnosis_of(hide(tmp_path, scene=scene, body=body_of(scene)))
     assert document["verdict"] == "nothing missing", document["sentence"]
     assert document["effects"] == []
@@ -82,7 +82,7 @@ CASES = {
         Faults(),
         {"centre_of_mass": {"c_1": 7e-5, "c_2": -7e-5}},
     ),
-    "frame rate": ({}, Faults(frame_rate_hz=506.0), {"frame_rate": {"change": 0.012}}),
+    "frame rate": ({}, Faults(frame_rate_hz=404.8), {"frame_rate": {"change": 0.012}}),
     "tilt and a late camera": (
         tilted(0.002, -1.0)[0],
         Faults(right_delay_s=2e-4),
@@ -100,6 +100,6 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_hidden_in_images_of_an_independent_motion_is_found(name, tmp_path):
     changes, faults, truth = CASES[name]
-    scene = full_scene(50 + len(name), 250, 500.0)
+    scene = small_scene(50 + len(name), 150, 400.0)
     recording = hide(tmp_path, scene=scene, body=body_of(scene, **changes), faults=faults, note=name)
     assert_found(diagnosis_of(recording), truth)
