@@ -212,6 +212,16 @@ class Faults:
     misprint_mm: tuple[Pair, ...] = ()  # true minus declared centre of each dot
     misprint_sigma_mm: float = 0.0  # the same drawn at random
     pattern_offset_mm: Pair = (0.0, 0.0)  # paper and dots glued off centre
+    pattern_turn_deg: float = 0.0  # and turned about the disc's axis
+    pattern_scale: float = 1.0  # true over declared distances of the dots from the pattern's middle
+    pattern_height_mm: float = 0.0  # of the dots above half the thickness: paper and glue
+    table_turn_deg: Pair = (0.0, 0.0)  # rotation vector, x and y, of the true table in the axes of the table view
+    table_height_mm: float = 0.0  # of the true table in those axes
+    exposure_s: float = 0.0  # true exposure; 0: that of the cameras
+    ellipse_centre_share: float = (
+        0.0  # not of the images: of whoever takes the centre of a dot's image for the image of
+    )
+    # its centre; 1: not corrected at all. Nothing to draw, but a model may know of it
     hidden_markers: tuple[int, ...] = ()  # dots that have come off
     left: CameraFault = field(default_factory=CameraFault)
     right: CameraFault = field(default_factory=CameraFault)
@@ -301,6 +311,7 @@ def _check(scene: Scene, where: str) -> None:
         "markers.diameter_mm": scene.markers.diameter_mm,
         "board.square_mm": board.square_mm,
         "gravity_m_s2": scene.gravity_m_s2,
+        "faults.pattern_scale": scene.faults.pattern_scale,
     }
     for key, value in positive.items():
         if not (math.isfinite(value) and value > 0):
@@ -317,6 +328,7 @@ def _check(scene: Scene, where: str) -> None:
         (scene.cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", scene.cameras.bit_depth, "8, 10, 12, 16"),
         (scene.cameras.n_frames < 1, "cameras.n_frames", scene.cameras.n_frames, "at least 1"),
         (scene.cameras.exposure_s < 0, "cameras.exposure_s", scene.cameras.exposure_s, "0 or more"),
+        (scene.faults.exposure_s < 0, "faults.exposure_s", scene.faults.exposure_s, "0 or more"),
         (min(scene.cameras.image_size) < 16, "cameras.image_size", scene.cameras.image_size, "at least 16 x 16"),
         (min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"),
         (scene.render.subpixels < 2, "render.subpixels", scene.render.subpixels, "2 or more"),

@@ -35,6 +35,11 @@ def true_frame_rate(scene: Scene) -> float:
     return scene.faults.frame_rate_hz or scene.cameras.frame_rate_hz
 
 
+def true_exposure(scene: Scene) -> float:
+    """Time over which a frame is exposed [s]."""
+    return scene.faults.exposure_s or scene.cameras.exposure_s
+
+
 def motion_of(scene: Scene) -> SceneMotion:
     """Motion that the scene asks for; raises SceneError where it cannot be had."""
     return {"static": _static, "table": _table, "rolling": _rolling}[scene.motion.kind](scene)
@@ -76,7 +81,7 @@ def _rolling(scene: Scene) -> SceneMotion:
 
 def _margin(scene: Scene) -> tuple[float, float]:
     """Time needed before the first and after the last mid exposure of the left camera [s]."""
-    half, delay = scene.cameras.exposure_s / 2, scene.faults.right_delay_s
+    half, delay = true_exposure(scene) / 2, scene.faults.right_delay_s
     return half + max(-delay, 0.0), half + max(delay, 0.0)
 
 

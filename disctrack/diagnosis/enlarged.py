@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.scene_rig import scene_with_rig
 from disctrack.diagnosis.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
-from disctrack.rolling.effects import find_effect
 from disctrack.scene import CameraFault, Faults, Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
 
@@ -51,11 +51,11 @@ def declared_model(trajectory: Trajectory, choice: str = PAPER) -> Declared:
 def model_toml(system: DiscSystem, values: Values, name: str) -> str:
     """The fitted motion as a scene: disc, dots, gravity, first state, effects with their values, faults found.
 
-    What a scene cannot express (table frame, scale and height of the pattern, ...) stands in comments.
+    The cameras are like those of the recording, so that `render` shows it from where it was filmed.
     """
     model = system.model_with(values)
     state = {k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")}
-    scene = Scene(name=name, gravity_m_s2=model.gravity)
+    scene = scene_with_rig(Scene(name=name, gravity_m_s2=model.gravity), system.rig)
     disc = model.disc
     scene = replace(
         scene,
@@ -84,29 +84,19 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
         formulas={e.name: dict(e.formulas) for e in model.effects if e.formulas},
     )
     scene = replace(scene, motion=replace(scene.motion, kind="rolling", rolling=rolling))
-    return "\n".join([*_header(name, values), scene_toml(scene)])
+    return "\n".join([*_header(name, system), scene_toml(scene)])
 
 
 def _rounded(number: float) -> float:
     return float(f"{number:.12g}")
 
 
-def _header(name: str, values: Values) -> list[str]:
-    lines = [f"# Fitted to {name}. Read by disctrack simulate, render, and diagnose --model."]
-    beyond = [k for k, v in values.items() if v and not _expressible(k)]
-    return lines + [f"# not in a scene: {k} = {values[k]!r}" for k in beyond]
-
-
-def _expressible(key: str) -> bool:
-    kind, _, parameter = key.partition(".")
-    lens = any(
-        kind in (f"{c}_turned", f"{c}_shifted", f"{c}_focal", f"{c}_distortion", f"{c}_principal_point")
-        for c in CAMERAS
-    )
-    known = (
-        find_effect(kind) is not None or kind in ("state", "rig", "frame_rate", "time_offset", "pattern_offset") or lens
-    )
-    return bool(parameter) and (known or kind.startswith(("dot_", "misprint_")))
+def _header(name: str, system: DiscSystem) -> list[str]:
+    first, last = (int(system.trajectory.frame[i]) for i in (system.rows.start, system.rows.stop - 1))
+    return [
+        f"# Fitted to frames {first} to {last} of {name}. Read by disctrack simulate, render, and diagnose --model.",
+        "# motion.rolling: the motion and its effects. faults: what is wrong with cameras, dots and table.",
+    ]
 
 
 def _faults(system: DiscSystem, values: Values) -> Faults:
@@ -119,6 +109,13 @@ def _faults(system: DiscSystem, values: Values) -> Faults:
         frame_rate_hz=system.trajectory.frame_rate * (1 + rate) if rate else 0.0,
         misprint_mm=misprint if np.any(misprint) else (),
         pattern_offset_mm=(1e3 * get("pattern_offset.x"), 1e3 * get("pattern_offset.y")),
+        pattern_turn_deg=float(np.degrees(get("pattern_rotation.angle"))),
+        pattern_scale=1.0 + get("pattern_scale.change"),
+        pattern_height_mm=1e3 * get("pattern_height.offset"),
+        table_turn_deg=(float(np.degrees(get("table_plane.tilt_x"))), float(np.degrees(get("table_plane.tilt_y")))),
+        table_height_mm=1e3 * get("table_height.offset"),
+        exposure_s=float(np.sqrt(max(get("exposure_blur.T2"), 0.0))),
+        ellipse_centre_share=get("ellipse_centre.share"),
         left=_camera_fault("left", values),
         right=_camera_fault("right", values),
     )
@@ -144,6 +141,14 @@ def _values_of_faults(scene: Scene) -> dict[str, float]:
         "frame_rate.change": faults.frame_rate_hz / scene.cameras.frame_rate_hz - 1 if faults.frame_rate_hz else 0.0,
         "pattern_offset.x": 1e-3 * faults.pattern_offset_mm[0],
         "pattern_offset.y": 1e-3 * faults.pattern_offset_mm[1],
+        "pattern_rotation.angle": float(np.radians(faults.pattern_turn_deg)),
+        "pattern_scale.change": faults.pattern_scale - 1.0,
+        "pattern_height.offset": 1e-3 * faults.pattern_height_mm,
+        "table_plane.tilt_x": float(np.radians(faults.table_turn_deg[0])),
+        "table_plane.tilt_y": float(np.radians(faults.table_turn_deg[1])),
+        "table_height.offset": 1e-3 * faults.table_height_mm,
+        "exposure_blur.T2": faults.exposure_s**2,
+        "ellipse_centre.share": faults.ellipse_centre_share,
     }
     for i, (x, y) in enumerate(faults.misprint_mm):
         values |= {f"misprint_{i}.x": 1e-3 * x, f"misprint_{i}.y": 1e-3 * y}

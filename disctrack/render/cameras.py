@@ -70,14 +70,20 @@ def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
 
 
 def rig_after_faults(rig: StereoRig, scene: Scene) -> StereoRig:
-    """The rig while the disc was filmed: as calibrated, but for what `scene.faults` did to the cameras since."""
+    """The rig while the disc was filmed, in axes of the true table.
+
+    As calibrated, but for what `scene.faults` did to the cameras since, and for a table that is not where the
+    calibration's table view says.
+    """
+    turn_table = rotation_from_vector(np.radians([*scene.faults.table_turn_deg, 0.0]))
+    lift_table = np.array([0.0, 0.0, scene.faults.table_height_mm * 1e-3])
     views = []
     for camera, (R, t), fault in zip(
         rig.cameras, rig.camera_poses(), (scene.faults.left, scene.faults.right), strict=True
     ):
         turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
-        moved = turn @ (t - np.array(fault.translation_mm) * 1e-3)
-        views.append(View(_changed_lens(camera, fault), turn @ R, moved))
+        moved = turn @ (t + R @ lift_table - np.array(fault.translation_mm) * 1e-3)
+        views.append(View(_changed_lens(camera, fault), turn @ R @ turn_table, moved))
     left, right = views
     R_right_left = right.R_camera_world @ left.R_camera_world.T
     return replace(

@@ -140,11 +140,12 @@ def expected_disc_image(
         disc = true_disc.disc
         dots = disc.marker_centres_body[:, :2] if visible is None else disc.marker_centres_body[visible, :2]
         paper = np.array([*true_disc.paper_centre_body, disc.radius - scene.appearance.rim_width_mm * 1e-3])
+        top = float(disc.marker_centres_body[:, 2].mean())  # half the thickness, unless the paper lies higher
         for R, centre, weight in zip(R_world_body, q[:, :3], weights, strict=True):
             draw_disc(
                 cells, background, (y0, x0), stage.rays, s, weight,
                 np.ascontiguousarray(view.R_camera_world @ R), view.R_camera_world @ centre + view.t_camera_world,
-                disc.radius, disc.half_thickness, paper, np.ascontiguousarray(dots), disc.marker_diameter / 2,
+                disc.radius, top, paper, np.ascontiguousarray(dots), disc.marker_diameter / 2,
                 _surface_greys(R, scene),
             )  # fmt: skip
         for rod in occluders:

@@ -21,7 +21,7 @@ from disctrack.render.images import Stage, TrueDisc, expected_board_image, expec
 from disctrack.render.sensor import digitise
 from disctrack.render.truth import Truth, write_truth
 from disctrack.scene import Scene
-from disctrack.scene_motion import SceneMotion, motion_of, true_frame_rate
+from disctrack.scene_motion import SceneMotion, motion_of, true_exposure, true_frame_rate
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]  # images done, images in all
@@ -96,15 +96,17 @@ def run_render(
 def true_disc_of(scene: Scene) -> TrueDisc:
     """The disc with its dots and paper where they really are."""
     declared, faults = scene.declared_disc, scene.faults
-    shift = np.zeros((declared.n_markers, 3))
-    shift[:, :2] = np.array(faults.pattern_offset_mm) * 1e-3
+    centres = declared.marker_centres_body.copy()
     if faults.misprint_mm:
-        shift[:, :2] += np.array(faults.misprint_mm) * 1e-3
+        centres[:, :2] += np.array(faults.misprint_mm) * 1e-3
     if faults.misprint_sigma_mm > 0:
         rng = np.random.default_rng([scene.seed, 6])
-        shift[:, :2] += faults.misprint_sigma_mm * 1e-3 * rng.standard_normal((declared.n_markers, 2))
+        centres[:, :2] += faults.misprint_sigma_mm * 1e-3 * rng.standard_normal((declared.n_markers, 2))
+    c, s = np.cos(np.radians(faults.pattern_turn_deg)), np.sin(np.radians(faults.pattern_turn_deg))
+    centres[:, :2] = faults.pattern_scale * centres[:, :2] @ np.array([[c, s], [-s, c]])
+    centres += np.array([*faults.pattern_offset_mm, faults.pattern_height_mm]) * 1e-3
     x, y = faults.pattern_offset_mm
-    disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
+    disc = replace(declared, marker_centres_body=centres)
     return TrueDisc(disc, (x * 1e-3, y * 1e-3))
 
 
@@ -147,7 +149,7 @@ def _board_images(part: Path, scene: Scene, truth: Truth) -> Iterator[_Image]:
 def _disc_images(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iterator[_Image]:
     true_disc = TrueDisc(truth.disc, (float(truth.paper_centre_body[0]), float(truth.paper_centre_body[1])))
     still = scene.motion.kind == "static"
-    exposure = 0.0 if still else scene.cameras.exposure_s
+    exposure = 0.0 if still else true_exposure(scene)
     for c, stage in enumerate(stages(truth.rig_while_filming, scene)):
         fault = (scene.faults.left, scene.faults.right)[c]
         delay = 0.0 if still or c == 0 else scene.faults.right_delay_s

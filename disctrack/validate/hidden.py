@@ -100,6 +100,7 @@ def measured(
     rng = np.random.default_rng([20261121, seed])
     scene = Scene(seed=seed, faults=faults or Faults())
     f, disc, u = scene.faults, scene.declared_disc, unseen or Unseen()
+    u = replace(u, exposure=u.exposure or f.exposure_s)
     believed_rig = rig_of(scene)
     covariance = rig_covariance(believed_rig, scene)
     # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them
@@ -146,9 +147,10 @@ def _on_the_true_table(rig: StereoRig, u: Unseen) -> StereoRig:
 def _true_centres(disc: Disc, f: Faults, u: Unseen) -> Array:
     centres = disc.marker_centres_body.copy()
     centres[:, :2] += np.array(f.misprint_mm or np.zeros((disc.n_markers, 2))) * 1e-3
-    centres = (1.0 + u.pattern_scale) * centres @ rotation_from_vector(np.array([0.0, 0.0, u.pattern_turn])).T
+    turn = u.pattern_turn + np.radians(f.pattern_turn_deg)
+    centres = (f.pattern_scale + u.pattern_scale) * centres @ rotation_from_vector(np.array([0.0, 0.0, turn])).T
     centres[:, :2] += np.array(f.pattern_offset_mm) * 1e-3
-    centres[:, 2] = disc.marker_centres_body[:, 2] + u.pattern_height
+    centres[:, 2] = disc.marker_centres_body[:, 2] + u.pattern_height + f.pattern_height_mm * 1e-3
     return centres
 
 
