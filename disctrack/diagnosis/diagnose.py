@@ -19,6 +19,7 @@ from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn
 from disctrack.diagnosis.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.search import Diagnosis, Settings
 from disctrack.diagnosis.separation import Separation, separations
+from disctrack.diagnosis.shape import refine_shapes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.words import sentence
 from disctrack.errors import AnalysisError, OutputError
@@ -95,6 +96,7 @@ def diagnose_trajectory(
     if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
         text = sentence(diagnosis, diagnosis.after, None, None)
         return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
+    diagnosis, remarks = refine_shapes(system, diagnosis)
     moment, learned = _beyond_the_catalogue(system, diagnosis)
     if learned is not None:
         reason = (
@@ -117,7 +119,7 @@ def diagnose_trajectory(
         if f.cannot_be_told_from and separate
     }
     return DiscDiagnosis(
-        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, answer.notes
+        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, (*answer.notes, *remarks)
     )
 
 

@@ -82,7 +82,8 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
         parts = _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)} if amounts else {})
         for name, members in parts.items():
             quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
-            found.append(Candidate(name, effect.name, "motion", effect.title, effect.source, quantities))
+            shape = tuple(effect_quantity(effect, p) for p in effect.parameters if p.is_shape)
+            found.append(Candidate(name, effect.name, "motion", effect.title, effect.source, quantities, shape=shape))
         if effect.name == "slip":
             found.append(slip_candidate(effect))
     return tuple(found)

@@ -43,6 +43,7 @@ class Candidate:
     source: str
     quantities: tuple[Quantity, ...]
     start: tuple[float, ...] = ()  # where a refit begins, if not at null
+    shape: tuple[Quantity, ...] = ()  # of its law (an exponent, a scale): held at null until the effect is found
     threshold: bool = False  # acts only beyond some value: at null it has no derivative, and the system gives starts
 
     @property

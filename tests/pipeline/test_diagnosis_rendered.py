@@ -75,7 +75,11 @@ def test_a_saved_model_rendered_and_measured_again_lacks_nothing_against_itself(
     )
     first = diagnosis_of(recording)
     assert first["verdict"] == "found"
-    assert "kz" in {e["name"] for e in first["effects"]}
+    (height, pivoting) = first["effects"]
+    assert height["name"] == "pattern_height"
+    # three sigmas, and what the images' own errors add at 1/800 px
+    assert abs(height["parameters"][0]["value"] - 1e-4) < 3 * height["parameters"][0]["sigma"] + 5e-7
+    assert "kz" in {pivoting["name"], *(c["name"] for c in pivoting["class"])}
     model = tmp_path / "first" / "out" / "diagnosis" / "model.toml"
     again = tmp_path / "second" / "recording"
     assert main(["render", str(model), "-o", str(again)]) == 0
