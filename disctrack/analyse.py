@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from disctrack.scaling import (
     fit_power_laws,
     power_law_end,
 )
-from disctrack.storage import read_provenance, read_trajectory, write_group
+from disctrack.storage import read_provenance, read_setup, read_trajectory, write_group
 from disctrack.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -102,6 +103,7 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
     """Motion, contact, energy and scaling laws of a trajectory.
 
     window, circle_duration : [s] before t_f for the exponents, before the end for the circle
+    Of a trajectory of which only a part was tracked, that part is analysed; the result has its length.
     Raises AnalysisError when the trajectory has no table frame, or too few poses.
     """
     if not trajectory.rig.world_is_table:
@@ -110,6 +112,7 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
             "vertical are known. Name the view whose board lies on the table ([table] in recording.toml), calibrate "
             "and track again."
         )
+    trajectory = _tracked_part(trajectory)
     motion = differentiate(trajectory)
     until, sense = _end_of_rolling(motion)
     contact = analyse_contact(motion, circle_duration, until)
@@ -135,6 +138,18 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         scaling=scaling,
         warnings=_warnings(trajectory, motion, contact, scaling),
     )
+
+
+def _tracked_part(trajectory: Trajectory) -> Trajectory:
+    """The frames from the first to the last in which a pose was looked for."""
+    n, rows = len(trajectory), np.flatnonzero(trajectory.looked_for)
+    if rows.size in (0, n):
+        return trajectory
+    part = slice(int(rows[0]), int(rows[-1]) + 1)
+    per_frame: dict[str, Any] = {
+        name: value[part] for name, value in vars(trajectory).items() if isinstance(value, np.ndarray)
+    }
+    return replace(trajectory, **per_frame)
 
 
 def _end_of_rolling(motion: Motion) -> tuple[float, float]:
@@ -182,15 +197,23 @@ def _in_words(exponent: Exponent) -> str:
 
 
 def write_analysis(path: Path, analysis: Analysis) -> None:
-    """Add the groups motion, contact, energy and scaling to the trajectory file, replacing older ones."""
-    write_group(
-        path, "motion", _motion_variables(analysis), axes=_state_axes(), attributes=_motion_attributes(analysis)
-    )
+    """Add the groups motion, contact, energy and scaling to the trajectory file, replacing older ones.
+
+    Frames outside the part that was tracked are NaN.
+    """
+    file_time = read_setup(path).time
+    first = int(np.searchsorted(file_time, analysis.motion.time[0] - 1e-9))
+
+    def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
+        return {name: _at_full_length(item, len(file_time), first) for name, item in variables.items()}
+
+    motion = whole(_motion_variables(analysis))
+    write_group(path, "motion", motion, axes=_state_axes(), attributes=_motion_attributes(analysis))
     onset, circle = analysis.contact.onset, analysis.contact.circle
     write_group(
         path,
         "contact",
-        _series_variables(analysis.contact.series),
+        whole(_series_variables(analysis.contact.series)),
         attributes={
             "rolling_onset_s": onset.time,
             "rolling_onset_low_s": onset.low,
@@ -211,7 +234,7 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
     write_group(
         path,
         "energy",
-        _series_variables(energy.series),
+        whole(_series_variables(energy.series)),
         attributes={
             "loss_J": energy.loss,
             "loss_sigma_J": energy.loss_sigma,
@@ -222,6 +245,16 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
         },
     )
     _write_scaling(path, analysis.scaling)
+
+
+def _at_full_length(item: Variable, n: int, first: int) -> Variable:
+    """A variable of frames first.. as one of all n frames of the file."""
+    data = np.asarray(item.data)
+    if item.dims[0] != "time" or len(data) == n:
+        return item
+    out = np.full((n, *data.shape[1:]), np.nan if data.dtype.kind == "f" else 0, data.dtype)
+    out[first : first + len(data)] = data
+    return replace(item, data=out)
 
 
 def _series_variables(series: tuple[Series, ...]) -> dict[str, Variable]:

@@ -49,6 +49,7 @@ N_STATE = len(STATE)  # 18
 CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
 GROUP_OF_CHANNEL = np.array([0, 0, 1, 2, 2, 3])
 GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
+FRAMES_AT_ONCE = 1024
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
 KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
 
@@ -264,27 +265,47 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     """
     n = len(samples.ticks)
     half = int(np.ceil(HALF_WINDOW_LENGTHS * max(p.length.max() for p in processes)))
-    weights, prior = np.zeros((n, len(CHANNEL_GROUPS), 3, 2 * half + 1)), np.zeros((n, 6, 3, 3))
-    unknown = np.zeros(n, bool)
     scale = np.zeros(6)
+    for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
+        scale[list(group)] = np.sqrt(process.noise_scale)
+    noise = samples.covariance * np.outer(scale, scale)
+    out = (
+        np.empty((n, 3, 6)),
+        np.empty((n, 3, 3)),
+        np.empty((n, 18, 18)),
+        np.empty((n, 18, samples.sensitivity.shape[2])),
+    )
+    for first in range(0, n, FRAMES_AT_ONCE):  # the windows of all frames at once would be as large as all the rest
+        rows = np.arange(first, min(first + FRAMES_AT_ONCE, n))
+        weights, prior, unknown = _weights_and_prior(samples, processes, half, rows)
+        for k in range(0, len(rows), FRAMES_AT_ONCE // 8):
+            some = slice(k, k + FRAMES_AT_ONCE // 8)
+            parts = _smoothed_rows(samples, noise, rows[some], weights[some][:, GROUP_OF_CHANNEL], half)
+            for whole, part in zip(out, parts, strict=True):
+                whole[rows[some]] = part
+        for channel in range(6):
+            entries = channel + 6 * np.arange(3)
+            out[2][rows[:, None, None], entries[:, None], entries] += prior[:, channel]
+        for whole in out:
+            whole[rows[unknown]] = np.nan
+    return out
+
+
+def _weights_and_prior(
+    samples: _Samples, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """For k rows: weights (k, groups, 3, w), prior covariance (k, 6, 3, 3), True where that leaves too much open."""
+    k = len(rows)
+    weights, prior = np.zeros((k, len(CHANNEL_GROUPS), 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
+    unknown = np.zeros(k, bool)
     for number, (group, process) in enumerate(zip(CHANNEL_GROUPS, processes, strict=True)):
         channels = list(group)
         variance = samples.variance[:, channels].mean(axis=1)
-        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, samples.part)
+        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, samples.part, rows)
         prior[:, channels] = P[:, None]
-        scale[channels] = np.sqrt(process.noise_scale)
-        open_fraction = P[:, 1, 1] * process.length**2 / process.amplitude2
-        unknown |= ~np.isfinite(open_fraction) | (~samples.good & (open_fraction > KNOWN_FRACTION))
-    noise = samples.covariance * np.outer(scale, scale)
-    chunks = np.array_split(np.arange(n), max(1, n // 128))
-    parts = [_smoothed_rows(samples, noise, rows, weights[rows][:, GROUP_OF_CHANNEL], half) for rows in chunks]
-    state, R, covariance, sensitivity = (np.concatenate(p) for p in zip(*parts, strict=True))
-    for channel in range(6):
-        entries = channel + 6 * np.arange(3)
-        covariance[:, entries[:, None], entries] += prior[:, channel]
-    for array in (state, R, covariance, sensitivity):
-        array[unknown] = np.nan
-    return state, R, covariance, sensitivity
+        open_fraction = P[:, 1, 1] * process.length[rows] ** 2 / process.amplitude2[rows]
+        unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))
+    return weights, prior, unknown
 
 
 def _smoothed_rows(

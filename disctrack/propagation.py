@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 # Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
 # quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.
 STEPS = np.repeat([1e-6, 1e-6, 1e-4, 1e-3, 1e-2, 1.0], 3)
+FRAMES_AT_ONCE = 1024  # the derivatives of all frames at once would be twice the result
 RESOLVED_TILT_SIGMAS = 5.0  # below this many sigmas of theta, the direction of precession is not determined
 
 
@@ -115,21 +116,27 @@ def propagate(motion: Motion, function: Callable[[State], Array]) -> Propagated:
 
     NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
     """
-    state = state_of(motion)
+    state, n = state_of(motion), len(motion)
+    parts = [_propagated(motion, state, slice(i, i + FRAMES_AT_ONCE), function) for i in range(0, n, FRAMES_AT_ONCE)]
+    value, covariance, sensitivity = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Propagated(value, covariance, sensitivity, motion.rig_covariance)
+
+
+def _propagated(
+    motion: Motion, whole: State, rows: slice, function: Callable[[State], Array]
+) -> tuple[Array, Array, Array]:
+    """Value (k, p), covariance (k, p, p) and sensitivity (k, p, 30) of some frames."""
+    state = State(*(part[rows] for part in vars(whole).values()))
     jacobian = np.stack(
         [(function(displaced(state, e)) - function(displaced(state, -e))) / (2 * e.sum()) for e in np.diag(STEPS)],
         axis=-1,
-    )  # (n, k, 18)
+    )  # (k, p, 18)
     value = function(state)
-    tilt_sigma = np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
+    tilt_sigma = np.sqrt(np.trace(motion.covariance[rows, 3:6, 3:6], axis1=1, axis2=2) / 3)
     value = np.where((state.sine > RESOLVED_TILT_SIGMAS * tilt_sigma)[:, None], value, np.nan)
     jacobian[~np.isfinite(value)] = np.nan
-    return Propagated(
-        value=value,
-        covariance=jacobian @ motion.covariance @ jacobian.swapaxes(1, 2),
-        calibration_sensitivity=jacobian @ motion.calibration_sensitivity,
-        rig_covariance=motion.rig_covariance,
-    )
+    covariance = jacobian @ motion.covariance[rows] @ jacobian.swapaxes(1, 2)
+    return value, covariance, jacobian @ motion.calibration_sensitivity[rows]
 
 
 RATES = (

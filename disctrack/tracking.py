@@ -29,7 +29,6 @@ from disctrack.errors import TrackingError
 from disctrack.first_pass import StillScene
 from disctrack.markers import (
     TYPICAL_BLUR_PX,
-    DotCentres,
     NoiseModel,
     TemplateLimits,
     dot_centres,
@@ -72,6 +71,7 @@ SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the d
 MOST_STRETCHES = 16
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 SEARCH_AGAIN = 50  # frames after which a disc that was not found is searched for though the scene has not changed
+FITTED_AT_ONCE = 4096  # frames
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
 
@@ -106,13 +106,28 @@ class Tracking:
 
 @dataclass
 class _Tables:
+    """What is kept of every pair until the poses are fitted: 0.7 kB with six dots."""
+
+    pixels: Array  # (n, 2, m, 2)
+    covariance_px2: Array  # (n, 2, m, 2, 2)
+    status: NDArray[np.uint8]  # (n, 2, m)
+    R: Array  # (n, 3, 3)
+    t: Array  # (n, 3)
+    frame_status: NDArray[np.uint8]  # (n,)
+
+
+@dataclass
+class _Rows:
     """What the loop over frames fills."""
 
     results: Array  # (n, 2, m, 12)
     status: NDArray[np.uint8]  # (n, 2, m)
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
-    frame_status: NDArray[np.uint8]  # (n,)
+
+    def since(self, i: int) -> _Rows:
+        """The rows from number i on."""
+        return _Rows(self.results[i:], self.status[i:], self.R[i:], self.t[i:])
 
 
 Law = tuple[list[NoiseModel], list[float]]  # noise and blur [px] of the left and the right camera
@@ -150,7 +165,7 @@ class _Follower:
         if not self.law.done():
             self.law.set_result(None)
 
-    def run(self, images: Images, readable: NDArray[np.bool_], tables: _Tables, at: slice) -> int:
+    def run(self, images: Images, readable: NDArray[np.bool_], rows: _Rows) -> int:
         """Follow the disc through images; returns the number of frames before it was lost."""
         poses = self.rig.camera_poses()
         return int(
@@ -170,10 +185,10 @@ class _Follower:
                 self.limits.array(),
                 *self.last,
                 *self.before,
-                tables.results[at],
-                tables.status[at],
-                tables.R[at],
-                tables.t[at],
+                rows.results,
+                rows.status,
+                rows.R,
+                rows.t,
                 MAX_PREDICTION_RMS_PX,
             )
         )
@@ -219,7 +234,8 @@ def track(
             + ": a pose needs at least three dots that are not on one line"
         )
     tables = _empty_tables(n, disc.n_markers)
-    maps = [normalised_maps(camera) for camera in rig.cameras]
+    with ThreadPoolExecutor(2) as pool:  # 0.1 s each
+        maps = list(pool.map(normalised_maps, rig.cameras))
     maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
     edges = stretch_edges(pairs, disc)
     followers = [
@@ -358,7 +374,8 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
 
 def _empty_tables(n: int, m: int) -> _Tables:
     return _Tables(
-        results=np.full((n, 2, m, kernels.N_RESULT), np.nan),
+        pixels=np.full((n, 2, m, 2), np.nan),
+        covariance_px2=np.full((n, 2, m, 2, 2), np.nan),
         status=np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
         R=np.full((n, 3, 3), np.nan),
         t=np.full((n, 3), np.nan),
@@ -366,9 +383,14 @@ def _empty_tables(n: int, m: int) -> _Tables:
     )
 
 
+def _empty_rows(n: int, m: int) -> _Rows:
+    tables = _empty_tables(n, m)
+    return _Rows(np.full((n, 2, m, kernels.N_RESULT), np.nan), tables.status, tables.R, tables.t)
+
+
 def _clear(tables: _Tables, rows: slice) -> None:
     empty = _empty_tables(1, tables.status.shape[2])
-    tables.results[rows], tables.status[rows] = empty.results, empty.status
+    tables.pixels[rows], tables.covariance_px2[rows], tables.status[rows] = np.nan, np.nan, empty.status
     tables.R[rows], tables.t[rows], tables.frame_status[rows] = empty.R, empty.t, empty.frame_status
 
 
@@ -387,6 +409,9 @@ def _follow_block(
     follower: _Follower, images: Images, readable: NDArray[np.bool_], tables: _Tables, start: int
 ) -> None:
     n, i = len(images), 0
+    own = slice(start, start + n)
+    results = np.full((n, 2, follower.disc.n_markers, kernels.N_RESULT), np.nan)
+    rows = _Rows(results, tables.status[own], tables.R[own], tables.t[own])
     while i < n:
         if not readable[i].any():
             tables.frame_status[start + i] = FrameStatus.UNREADABLE
@@ -399,7 +424,7 @@ def _follow_block(
             _remember(follower, images[i:], readable[i:])
             i += 1
             continue
-        done = follower.run(images[i:], readable[i:], tables, slice(start + i, start + n))
+        done = follower.run(images[i:], readable[i:], rows.since(i))
         tables.frame_status[start + i : start + i + done] = FrameStatus.MEASURED
         i += done
         if i < n:
@@ -409,6 +434,8 @@ def _follow_block(
                 follower.first_reason = follower.first_reason or _refusals(tables.status[start + i])
                 _remember(follower, images[i:], readable[i:])
                 i += 1
+    dots = dot_centres(results, rows.status)
+    tables.pixels[own], tables.covariance_px2[own] = dots.pixels, dots.covariance_px2
 
 
 @dataclass
@@ -499,8 +526,8 @@ def _measure_blur_and_noise(
             follower.noise[camera] = typical_noise(images[int(np.argmax(readable[:n, camera])), camera])
     for blur_known in (False, True):  # the second time with the blur of the first
         follower.start_from(pose, following)
-        trial = _empty_tables(n, m)
-        done = follower.run(images[:n], readable[:n], trial, slice(0, n))
+        trial = _empty_rows(n, m)
+        done = follower.run(images[:n], readable[:n], trial)
         if done == 0:
             return
         for camera, (R_cw, t_cw) in enumerate(follower.rig.camera_poses()):
@@ -546,10 +573,9 @@ def _assemble(
     pairs: range,
 ) -> Tracking:
     first = next((follower for follower in followers if follower.measured), followers[0])
-    dots = dot_centres(tables.results, tables.status)
     as_built = refine_as_built(
-        dots.pixels,
-        dots.covariance_px2,
+        tables.pixels,
+        tables.covariance_px2,
         first.rig,
         first.disc,
         tables.R,
@@ -559,24 +585,17 @@ def _assemble(
         max_frames=SHARED_FRAMES,
     )
     faults = without_shared_faults(
-        dots.pixels, dots.covariance_px2, first.rig, first.disc, tables.R, tables.t, max_frames=SHARED_FRAMES
+        tables.pixels, tables.covariance_px2, first.rig, first.disc, tables.R, tables.t, max_frames=SHARED_FRAMES
     )
     if settings.refine_markers and faults is not None:
         as_built = _without_false_shifts(as_built, first.disc, faults)
-    fits = fit_poses(
-        dots.pixels,
-        dots.covariance_px2,
-        as_built.rig,
-        as_built.disc.marker_centres_body,
-        tables.R,
-        tables.t,
-        reject_outliers=settings.reject_outliers,
-    )
+    fits = _fit_all(tables, as_built, settings.reject_outliers)
     factor = max(1.0, trimmed_reduced_chi_square(fits))
     noise_factor = factor if faults is None else min(factor, max(1.0, faults.reduced_chi_square))
-    dots = replace(dots, covariance_px2=dots.covariance_px2 * noise_factor)
-    fits = replace(fits, covariance=fits.covariance * factor, chi_square=fits.chi_square / factor)
-    trajectory = _trajectory(dots, fits, tables, as_built, time, pairs, frame_rate, gravity)
+    tables.covariance_px2 *= noise_factor  # in place: nobody else holds them
+    fits.covariance[...] *= factor
+    fits = replace(fits, chi_square=fits.chi_square / factor)
+    trajectory = _trajectory(fits, tables, as_built, time, pairs, frame_rate, gravity)
     return Tracking(
         trajectory=trajectory,
         noise=(first.noise[0], first.noise[1]),
@@ -600,8 +619,28 @@ def _without_false_shifts(as_built: AsBuilt, declared: Disc, faults: SharedFault
     return replace(as_built, disc=disc, marker_shift=shift, marker_shift_sigma=faults.marker_shift_sigma)
 
 
+def _fit_all(tables: _Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFits:
+    """The poses of all frames, some thousands at a time: what a fit needs beside its result is five times as large."""
+    n, whole = len(tables.t), dict[str, NDArray]()
+    for first in range(0, n, FITTED_AT_ONCE):
+        rows = slice(first, first + FITTED_AT_ONCE)
+        part = fit_poses(
+            tables.pixels[rows],
+            tables.covariance_px2[rows],
+            as_built.rig,
+            as_built.disc.marker_centres_body,
+            tables.R[rows],
+            tables.t[rows],
+            reject_outliers=reject_outliers,
+        )
+        for name, value in vars(part).items():
+            if name not in whole:
+                whole[name] = np.empty((n, *value.shape[1:]), value.dtype)
+            whole[name][rows] = value
+    return PoseFits(**whole)
+
+
 def _trajectory(
-    dots: DotCentres,
     fits: PoseFits,
     tables: _Tables,
     as_built: AsBuilt,
@@ -620,8 +659,8 @@ def _trajectory(
     status[followed & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
     status[followed & (total < 3)] = FrameStatus.MARKERS_NOT_FOUND
     status[followed & (total >= 3) & ~fits.converged] = FrameStatus.NOT_CONVERGED
-    marker_status = dots.status.copy()
-    seen = dots.status == MarkerStatus.MEASURED
+    marker_status = tables.status.copy()
+    seen = tables.status == MarkerStatus.MEASURED
     marker_status[seen & ~fits.used & fits.converged[:, None, None]] = MarkerStatus.REJECTED
     squared = np.where(fits.used, np.sum(fits.residuals_px**2, axis=-1), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -637,8 +676,8 @@ def _trajectory(
         frame_status=status,
         reprojection_rms_px=rms,
         reduced_chi_square=fits.reduced_chi_square,
-        markers_px=dots.pixels,
-        markers_covariance_px2=dots.covariance_px2,
+        markers_px=tables.pixels,
+        markers_covariance_px2=tables.covariance_px2,
         markers_residual_px=fits.residuals_px,
         marker_status=marker_status,
         disc=as_built.disc,

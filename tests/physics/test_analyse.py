@@ -13,7 +13,9 @@ from disctrack.analyse import analyse, run_analyse, write_analysis
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError, TrajectoryFileError
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
+from disctrack.pipeline import at_full_length
 from disctrack.storage import Provenance, read_group, read_trajectory, write_trajectory
+from disctrack.trajectory import FrameStatus
 
 
 @pytest.fixture(scope="module")
@@ -222,3 +224,22 @@ def test_report_is_not_overwritten_unasked(tmp_path, late):
     with pytest.raises(OutputError, match="exists"):
         run_analyse(path)
     assert (tmp_path / "trajectory_analysis" / "report.html").read_text() == "mine"
+
+
+def test_rest_that_was_left_out_costs_nothing_and_changes_no_number(tmp_path, late, analysed):
+    """The same motion in the middle of a recording ten times as long, of which the rest was not tracked."""
+    long = at_full_length(replace(late, time=late.time - late.time[0] + 1.8), 10 * len(late), 1800)
+    status = long.frame_status.copy()
+    status[:1800] = status[1800 + len(late) :] = FrameStatus.STILL
+    long = replace(long, frame_status=status)
+    found = analyse(long)
+    assert len(found.motion) == len(late)
+    assert_allclose(found.motion.omega_world, analysed.motion.omega_world, rtol=1e-9, atol=1e-9)
+    assert_allclose(found.scaling.laws.n_theta.value, analysed.scaling.laws.n_theta.value, atol=1e-6)
+    path = stored(tmp_path, long)
+    write_analysis(path, found)
+    energy, _ = read_group(path, "energy")
+    assert energy["total"].shape == (10 * len(late),)
+    assert_allclose(energy["total"][1800 : 1800 + len(late)], found.series("total").value, atol=0)
+    assert np.isnan(energy["total"][:1800]).all()
+    assert any("of 450 frames" in text for text in found.warnings)
