@@ -128,7 +128,7 @@ def measure(
     tracked = range(span.start, span.stop)
     edges = stretch_edges(tracked, recording.disc)
     workers = _workers(pairs, len(edges) - 1, threads)
-    readers = max(1, (threads or default_threads()) // workers)
+    readers = max(1, (threads or default_threads()) // workers)  # each worker has its own three blocks
 
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers, breaks=edges):

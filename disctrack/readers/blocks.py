@@ -15,7 +15,7 @@ from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
 
-BLOCK_BYTES = 32 << 20  # large enough to hide the switch between blocks, small enough for three of them in 100 MB
+BLOCK_BYTES = 16 << 20  # large enough to hide the switch between blocks, small enough for six of them in 100 MB
 
 
 @dataclass(frozen=True)
