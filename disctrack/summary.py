@@ -42,7 +42,8 @@ def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> lis
     """Frames measured and lost with the reasons, sigmas, reprojection error, warnings."""
     lines = [*_frame_lines(trajectory)]
     if found := findings.get("first_pass"):
-        lines.append(_line("motion", f"{found['verdict']} (first pass, {found['looked_at']} pairs looked at)"))
+        looked = f" (first pass, {found['looked_at']} pairs looked at)" if found["looked_at"] else ""
+        lines.append(_line("motion", f"{found['verdict']}{looked}"))
     if trajectory.measured.any():
         lines += [
             _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
