@@ -7,6 +7,7 @@ data set (n,) beside it. A data set that lies in one piece is read at the speed 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 import zlib
@@ -189,6 +190,7 @@ class Hdf5Frames:
         self.dtype = stack.dtype.newbyteorder("=")
         self.bit_depth = bit_depth or 8 * self.dtype.itemsize
         self.timestamps, self.frame_rate = timestamps, frame_rate
+        self._digests: list[bytes | None] = [None] * int(stack.shape[0])
         self._shuffled = _SHUFFLE in _filters(stack)
         self.random_access = self._inflated_here = bool(
             stack.chunks == (1, *stack.shape[1:]) and _DEFLATE in _filters(stack) <= {_SHUFFLE, _DEFLATE}
@@ -230,6 +232,7 @@ class Hdf5Frames:
                 raise RecordingError(f"{where}: cannot be read ({error}). Copy the file again.") from error
         if content is not None:
             self._inflate(content, image, where)
+        self._digests[index] = hashlib.sha256(image.data).digest()
         if out is None or image is out:
             return image
         out[...] = image
@@ -258,12 +261,12 @@ class Hdf5Frames:
         return 0 if info.byte_offset is None else int(info.size)
 
     def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 of size, type and grey values of frames start..stop-1."""
+        """SHA-256 of size, type and grey values of frames start..stop-1; those already read are not read again."""
         digest = hashlib.sha256(f"{self.image_size} {self.dtype.str}".encode())
         image = np.empty(self.image_size[::-1], self.dtype)
         for index in range(start, stop):
-            try:
-                digest.update(self.read(index, image).data)
-            except RecordingError:
-                digest.update(b"unreadable")
+            if self._digests[index] is None:
+                with contextlib.suppress(RecordingError):
+                    self.read(index, image)
+            digest.update(self._digests[index] or b"unreadable")
         return digest.hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -92,8 +93,8 @@ class VideoFile:
             try:
                 with self.file.open("rb") as stream:
                     self._digest = hashlib.file_digest(stream, "sha256").digest()
-            except OSError as error:
-                raise RecordingError(f"{self.file}: cannot be read: {error.strerror}. Copy it again.") from error
+            except OSError:  # the file went away: what was measured stays, but no other run will be taken for the same
+                self._digest = b"unreadable" + os.urandom(16)
         return hashlib.sha256(self._digest + f"{start}:{stop}".encode()).hexdigest()
 
     def _first_readable(self) -> tuple[Frame, list[str]]:

@@ -136,6 +136,26 @@ def test_blocks_of_both_cameras_hold_every_pair(tmp_path, kind):
             assert_array_equal(block.images[:, camera], frames[block.frames])
 
 
+@pytest.mark.parametrize("kind", [FORMATS[0], FORMATS[4], *(k for k in FORMATS if k.suffix in ("h5", "mkv"))], ids=str)
+def test_the_content_hash_tells_a_changed_frame_and_nothing_else(tmp_path, kind):
+    frames = frames_of(kind.bits)
+    changed = frames.copy()
+    changed[7, 3, 4] ^= 1
+    found = []
+    for name, content in (("a", frames), ("b", frames), ("c", changed)):
+        (tmp_path / name).mkdir()
+        kind.write(tmp_path / name / f"left.{kind.suffix}", content, **kind.options)
+        reader = open_frames(f"left.{kind.suffix}", tmp_path / name, "left")
+        if name == "b":  # computed while reading, or apart
+            for index in range(N):
+                reader.read(index)
+        found.append((reader.content_sha256(0, N), reader.content_sha256(0, 5)))
+    if kind.suffix != "mkv":  # a container has an identity of its own
+        assert found[0] == found[1]
+        assert found[0][1] == found[2][1]
+    assert found[0][0] != found[2][0]
+
+
 def test_several_tiff_files_of_one_camera_continue_one_another(tmp_path):
     frames = frames_of(16)
     for number, part in enumerate((frames[:13], frames[13:14], frames[14:])):
