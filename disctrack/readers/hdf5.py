@@ -26,7 +26,7 @@ from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 _LARGEST_CHUNK = 512 << 20  # bytes: what the library takes at once, whatever the file's size
-_DEPTHS = (8, 10, 12, 14, 16)
+_DEPTHS = (10, 12, 14, 16)  # of 16-bit whole numbers
 _DEFLATE, _SHUFFLE = 1, 2  # filters by their registered numbers
 _SMALL = 1 << 12  # bytes: what deflate may add to what it cannot compress
 
@@ -115,7 +115,7 @@ def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
     rate = _attribute(stack, "frame_rate")
     bits = _attribute(stack, "bit_depth")
     common: dict[str, Any] = {
-        "bit_depth": int(bits) if bits in _DEPTHS and bits <= 8 * stack.dtype.itemsize else None,
+        "bit_depth": int(bits) if bits in _DEPTHS and stack.dtype.itemsize == 2 else None,
         "timestamps": _timestamps(stack, n, where),
         "frame_rate": rate if rate is not None and rate > 0 else None,
     }

@@ -289,7 +289,7 @@ def _format_notes(frame: Any) -> list[str]:
     name, notes = frame.format.name, []
     if name.startswith("yuvj") or (name.startswith("yuv") and frame.color_range == 2):
         notes.append(f"luma of {name} (full range) is used as it is")
-    elif name.startswith(("yuv", "nv", "p0", "uyvy")):
+    elif name.startswith(("yuv", "nv", "p0", "uyvy", "yuyv")):
         notes.append(f"luma of {name} is used as it is, not stretched: limited range has black at 16 and white at 235")
     if name.startswith(("yuv4", "yuvj4")) and _depth(frame) == 8 and any(_varies(p) for p in frame.planes[1:3]):
         notes.append("the video has colour: its luma is a mixture of what the sensor measured")
@@ -305,11 +305,14 @@ def _luma(frame: Any, where: str) -> Frame:
     """Grey values (h, w) of a decoded frame without conversion; a view of its memory where possible."""
     name = frame.format.name
     component = frame.format.components[0]
-    if name.startswith(("gray", "yuv", "nv12", "nv16", "nv21", "nv24", "p0", "uyvy")) and name[-2:] not in ("be", "32"):
+    if name.startswith(("gray", "yuv", "yuyv", "nv12", "nv16", "nv21", "nv24", "p0", "uyvy")) and name[-2:] not in (
+        "be",
+        "32",
+    ):
         plane = frame.planes[0]
         dtype = np.uint8 if component.bits == 8 else np.dtype("<u2")
         if component.bits in (8, 9, 10, 12, 14, 16):
-            step, first = {"yuyv422": (2, 0), "uyvy422": (2, 1), "yuv444": (1, 0)}.get(name, (1, 0))
+            step, first = {"yuyv422": (2, 0), "uyvy422": (2, 1)}.get(name, (1, 0))
             rows = np.frombuffer(plane, dtype)[: plane.line_size * frame.height // np.dtype(dtype).itemsize]
             rows = rows.reshape(frame.height, -1)[:, first : step * frame.width : step]
             return np.asarray(rows)

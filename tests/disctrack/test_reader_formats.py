@@ -187,6 +187,15 @@ def test_the_frame_rate_and_times_that_imagej_ome_and_hdf5_note_are_found(tmp_pa
         assert_allclose(reader.timestamps, times, rtol=0, atol=1e-12)  # decimal text of milliseconds
 
 
+@pytest.mark.parametrize(("declared", "found"), [(12, 12), (8, 16), (99, 16), ("many", 16)])
+def test_a_bit_depth_that_cannot_be_is_not_believed(tmp_path, declared, found):
+    write_hdf5(tmp_path / "stack.h5", frames_of(12), {"bit_depth": declared})
+    reader = open_frames("stack.h5", tmp_path, "left")
+    assert reader.bit_depth == found
+    (block,) = iter_pair_blocks(reader, reader, block=N)
+    assert_array_equal(block.images[:, 0], frames_of(12))
+
+
 def test_one_of_several_data_sets_must_be_named(tmp_path):
     with h5py.File(tmp_path / "both.h5", "w") as file:
         file["left"], file["right"] = frames_of(8, 1), frames_of(8, 2)
@@ -238,6 +247,26 @@ def test_luma_of_limited_range_is_not_stretched(tmp_path):
     assert (read.min(), read.max()) == (16, 235)
     assert_array_equal(read, frames)
     assert any("not stretched" in note for note in reader.notes)
+
+
+@pytest.mark.parametrize(("pixels", "first"), [("yuyv422", 0), ("uyvy422", 1)])
+def test_luma_between_chroma_is_taken_alone(tmp_path, pixels, first):
+    """As cameras with a standard interface write raw video: two bytes for each pixel, one of them luma."""
+    av = pytest.importorskip("av")
+    frames = frames_of(8)
+    with av.open(str(tmp_path / "left.avi"), "w") as container:
+        stream = container.add_stream("rawvideo", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
+        for frame in frames:
+            picture = av.VideoFrame(WIDTH, HEIGHT, pixels)
+            rows = np.full((HEIGHT, picture.planes[0].line_size), 128, np.uint8)
+            rows[:, first : 2 * WIDTH : 2] = frame
+            picture.planes[0].update(rows.tobytes())
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    reader = open_frames("left.avi", tmp_path, "left")
+    for index in (0, 5, 2):
+        assert_array_equal(reader.read(index), frames[index])
 
 
 def test_frames_that_a_recorder_dropped_are_named(tmp_path):
