@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from disctrack.diagnosis.fit import Fit
@@ -13,7 +14,6 @@ from disctrack.diagnosis.held_out import HeldOut
 from disctrack.diagnosis.output import effect_json, tried_json
 from disctrack.diagnosis.search import Diagnosis
 from disctrack.diagnosis.system import System
-from disctrack.diagnosis.whiteness import ljung_box
 
 Array = NDArray[np.float64]
 
@@ -53,25 +53,26 @@ def document(
 
 
 def memory(system: System, fit: Fit, lags: int = 5) -> Array:
-    """Autocorrelation (lags, w) of the whitened residual at lags of 1, 2, ... samples, over samples without a gap."""
-    residual, _ = system.linearise(fit.values, [])
-    present = system.weights > 0
-    power = np.mean(residual[present] ** 2, axis=0)
+    """Autocorrelation (lags, w) of the whitened residual at lags of 1, 2, ... samples, over samples without a gap.
+
+    Without a gap: where rows have as many data as the fullest ones.
+    """
+    residual, full = _full_rows(system, fit)
+    power = np.mean(residual[full] ** 2, axis=0)
     found = []
     for lag in range(1, lags + 1):
-        gapless = np.lib.stride_tricks.sliding_window_view(present, lag + 1).all(axis=1)
-        found.append(np.mean((residual[lag:] * residual[:-lag])[gapless], axis=0) / power)
+        gapless = sliding_window_view(full, lag + 1).all(axis=1)
+        found.append(np.mean((residual[lag:] * residual[:-lag])[gapless], axis=0) / np.where(power > 0, power, 1.0))
     return np.array(found)
 
 
-def stretches(present: NDArray[np.bool_]) -> list[slice]:
-    """Runs of samples without a gap."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+def portmanteau(system: System, fit: Fit, lags: int = 5) -> Array:
+    """Box and Pierce's statistic (w,) over all stretches without a gap: chi-square of `lags` degrees without memory."""
+    _, full = _full_rows(system, fit)
+    pairs = np.array([sliding_window_view(full, lag + 1).all(axis=1).sum() for lag in range(1, lags + 1)])
+    return np.asarray(pairs @ memory(system, fit, lags) ** 2, float)
 
 
-def ljung_box_of_stretches(system: System, fit: Fit, lags: int = 5) -> tuple[Array, int]:
-    """Ljung and Box's statistic per channel, added over stretches without a gap; and its degrees of freedom."""
+def _full_rows(system: System, fit: Fit) -> tuple[Array, NDArray[np.bool_]]:
     residual, _ = system.linearise(fit.values, [])
-    parts = [residual[s] for s in stretches(system.weights > 0) if s.stop - s.start > 4 * lags]
-    return np.sum([ljung_box(part, lags) for part in parts], axis=0), lags * len(parts)
+    return residual, np.asarray(system.weights == system.weights.max(), bool)

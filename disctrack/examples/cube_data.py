@@ -39,6 +39,8 @@ class Toss:
     number: int
     position: Array  # (n, 3) [m]
     rotation: Array  # (n, 3, 3) body to world
+    velocity: Array  # (n, 3) [m/s] as published; only checked, never fitted
+    rate: Array  # (n, 3) angular velocity as published [rad/s], likewise
 
     @property
     def reach(self) -> Array:
@@ -51,6 +53,7 @@ class Flight:
     """A stretch of a toss in free flight, with the smooth motion about which effects are reckoned."""
 
     number: int  # of the toss
+    first: int  # sample of the toss
     time: Array  # (n,) from the middle [s]
     position: Array  # (n, 3) [m]
     rotation: Array  # (n, 3, 3)
@@ -77,11 +80,12 @@ def read_tosses(folder: Path) -> tuple[Toss, ...]:
         if not {"state", "offset"} <= set(file.files):
             raise AnalysisError(f"{path}: holds {sorted(file.files)}; expected state (n, 13) and offset (tosses + 1,).")
         state, offset = np.asarray(file["state"], float), np.asarray(file["offset"], int)
-    if state.ndim != 2 or state.shape[1] < 7 or not np.isfinite(state[:, :7]).all() or offset[-1] != len(state):
+    if state.ndim != 2 or state.shape[1] != 13 or not np.isfinite(state[:, :7]).all() or offset[-1] != len(state):
         raise AnalysisError(f"{path}: state is {state.shape}, offset ends at {offset[-1]}; expected finite rows of 13.")
     rotation = Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
     return tuple(
-        Toss(i, HALF_WIDTH * state[a:b, :3], rotation[a:b]) for i, (a, b) in enumerate(pairwise(offset.tolist()))
+        Toss(i, HALF_WIDTH * state[a:b, :3], rotation[a:b], HALF_WIDTH * state[a:b, 7:10], state[a:b, 10:])
+        for i, (a, b) in enumerate(pairwise(offset.tolist()))
     )
 
 
@@ -154,6 +158,7 @@ def smooth_flight(toss: Toss, first: int, end: int) -> Flight:
     across = np.cross([0.0, 0.0, 1.0], along)
     return Flight(
         toss.number,
+        first,
         time,
         position,
         rotation,
@@ -202,59 +207,3 @@ def resting(tosses: Sequence[Toss], flown: Sequence[Flight]) -> tuple[Resting, .
             by_axes = axes @ toss.rotation[-1] @ np.cross(np.eye(3), upward).T
             found.append(Resting(toss.number, float(place[2]), spin, axes @ normal, by_axes, point))
     return tuple(found)
-
-
-def contact_line(tosses: Sequence[Toss]) -> tuple[float, float]:
-    """Slope of (height / half width) against reach while a corner or edge stays on the table, minus 1; standard error.
-
-    A cube of another size or another scale has a slope; so have rounded edges, and these data do not separate them.
-    """
-    reach, over = [], []
-    for toss in tosses:
-        gap = toss.position[:, 2] / HALF_WIDTH - toss.reach
-        held = (np.abs(np.gradient(gap)) < 0.004) & (np.abs(gap + 0.045) < 0.075) & (toss.reach > 1.02)
-        reach.append(toss.reach[held])
-        over.append(gap[held])
-    x, y = np.concatenate(reach), np.concatenate(over)
-    if len(x) < 20:
-        return np.nan, np.nan
-    weight = np.ones(len(x))
-    for _ in range(20):
-        line = np.polyfit(x - 1, y, 1, w=np.sqrt(weight))
-        left = y - np.polyval(line, x - 1)
-        weight = 1 / (1 + (left / 0.01) ** 2)
-    spread = np.sqrt(np.sum(weight * left**2) / np.sum(weight)) / np.sqrt(np.sum(weight * (x - x.mean()) ** 2))
-    return float(line[0]), float(spread)
-
-
-def side_force_of_sliding(tosses: Sequence[Toss]) -> tuple[float, float]:
-    """Acceleration across the velocity over the speed [1/s] while the cube slides on a face, and its standard error.
-
-    What turns with the spin (friction under a turning face does) is taken off by regression.
-    """
-    rows = []
-    for toss in tosses:
-        z = toss.position[:, 2] / HALF_WIDTH
-        flat = (np.abs(toss.rotation[:, 2, :]).max(axis=1) > AT_REST[1]) & (np.abs(z - 0.978) < AT_REST[0])
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]]).astype(int))).reshape(-1, 2)
-        for a, b in edges:
-            if b - a >= SHORTEST:
-                place, rotation = toss.position[a + 1 : b - 1, :2], toss.rotation[a + 1 : b - 1]
-                t = (np.arange(len(place)) - (len(place) - 1) / 2) / FRAME_RATE
-                bend, v, _ = np.polyfit(t, place, 2)
-                spin = np.polyfit(t, Rotation.from_matrix(rotation @ rotation[len(t) // 2].T).as_rotvec()[:, 2], 1)[0]
-                speed = float(np.hypot(*v))
-                if speed > 0.2:
-                    rows.append((speed, spin, 2 * (v[0] * bend[1] - v[1] * bend[0]) / speed, len(t)))
-    if len(rows) < 20:
-        return np.nan, np.nan
-    speed, spin, across, n = np.array(rows).T
-    A, weight = np.column_stack([speed, spin]), n**2.5  # a second derivative's variance falls with the fifth power
-    W = np.sqrt(weight)
-    for _ in range(20):
-        x = np.linalg.lstsq(A * W[:, None], across * W, rcond=None)[0]
-        left = across - A @ x
-        W = np.sqrt(weight / (1 + (left / 0.5) ** 2))
-    inverse = np.linalg.inv((A * W[:, None]).T @ (A * W[:, None]))
-    spread = inverse @ ((A * (W**2 * left)[:, None]).T @ (A * (W**2 * left)[:, None])) @ inverse
-    return float(x[0]), float(np.sqrt(spread[0, 0]))

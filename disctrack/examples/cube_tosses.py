@@ -21,17 +21,16 @@ from numpy.typing import NDArray
 
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.fit import Fit, fit
-from disctrack.diagnosis.general import document, fit_errors, ljung_box_of_stretches, memory
+from disctrack.diagnosis.general import document, fit_errors, memory, portmanteau
 from disctrack.diagnosis.system import Subset, Values
 from disctrack.diagnosis.words import quantity_text
 from disctrack.examples._command import Outcome, command, dress
+from disctrack.examples.cube_checks import checks
 from disctrack.examples.cube_data import (
     FRAME_RATE,
     HALF_WIDTH,
     Toss,
-    contact_line,
     read_tosses,
-    side_force_of_sliding,
 )
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import CHANNELS, GROUPS, HELD_OUT, CubeTosses, white_chi_square
@@ -41,6 +40,7 @@ Array = NDArray[np.float64]
 
 # The covariance of the noise is that of the data already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
+LAGS = 5  # samples, of the portmanteau test
 SEEN = 0.6  # share of a held-out flight from which the rest is forecast
 ONE_NUMBER = ("gravity", "frame_rate", "length_scale")  # to free flight
 
@@ -83,16 +83,13 @@ def analyse_tosses(tosses: Sequence[Toss]) -> CubeAnswer:
         without[candidate.name] = errors_of(system, fit(training, rest, {}).values)
     held = fit(Subset(system, ~rows), tuple(dict.fromkeys(q for c in found for q in c.quantities)), {})
     pull = {c.name: max(_pull(diagnosis, held, q.name) for q in c.quantities) for c in found}
-    checks = {
-        "contact heights: size of the cube over declared, minus 1, edges sharp": contact_line(tosses),
-        "acceleration across over speed, sliding [1/s]": side_force_of_sliding(tosses),
-    }
+    also = checks(tosses, system.flights)
     over_white = {
         "before": white_chi_square(system, diagnosis.before.values),
         "after": white_chi_square(system, diagnosis.after.values),
     }
     return CubeAnswer(
-        system, diagnosis, errors_of(system, {}), errors_of(system, trained), without, pull, over_white, checks
+        system, diagnosis, errors_of(system, {}), errors_of(system, trained), without, pull, over_white, also
     )
 
 
@@ -152,15 +149,15 @@ def as_document(answer: CubeAnswer) -> dict[str, Any]:
         ("before", d.before, d.held_out_before, answer.before),
         ("after", d.after, d.held_out_after, answer.after),
     ):
-        statistic, freedom = ljung_box_of_stretches(system, f)
+        statistic = portmanteau(system, f, LAGS)
         common = fit_errors(f, held)
         common["held_out"] |= {"rms": _units(errors.rms), "forecast_end": _units(errors.forecast_end)}
         sides[side] = common | {
             "over_white_noise": answer.left_over_white[side],
             "whiteness": {
-                "ljung_box": dict(zip(CHANNELS, statistic.tolist(), strict=True)),
-                "degrees_of_freedom": freedom,
-                "autocorrelation": memory(system, f, 1)[0].tolist(),
+                "portmanteau": dict(zip(CHANNELS, statistic.tolist(), strict=True)),
+                "degrees_of_freedom": LAGS,
+                "autocorrelation": dict(zip(CHANNELS, memory(system, f, 1)[0].tolist(), strict=True)),
             },
         }
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"
@@ -171,7 +168,7 @@ def as_document(answer: CubeAnswer) -> dict[str, Any]:
             k: {"rms": _units(e.rms), "forecast_end": _units(e.forecast_end)} for k, e in answer.without.items()
         },
         "pull_of_held_out_values": answer.pull,
-        "checks": {k: list(v) for k, v in answer.checks.items()},
+        "checks": {k: [x if np.isfinite(x) else None for x in v] for k, v in answer.checks.items()},
         "flights": len(system.flights),
         "left_out": system.n_left_out,
         "copies": system.n_copies,
@@ -201,7 +198,9 @@ def table(answer: CubeAnswer) -> str:
     chi = [r["reduced_chi_square"] for r in ratios]
     free = [r["held_out"]["ratio_to_noise_floor"] or np.nan for r in ratios]
     lines += [f"{'reduced chi-square, all tosses':<34}{chi[0]:10.2f}{chi[1]:10.2f}"]
-    lines += [f"{'error over its floor, held out':<34}{free[0]:10.2f}{free[1]:10.2f}", ""]
+    lines += [f"{'error over its floor, held out':<34}{free[0]:10.2f}{free[1]:10.2f}"]
+    lag_one = [float(np.abs(memory(system, f, 1)[0]).max()) for f in (d.before, d.after)]
+    lines += [f"{'largest autocorrelation, one sample':<35}{lag_one[0]:9.2f}{lag_one[1]:10.2f}", ""]
     lines.append(
         f"{'effect':<20}{'value':<62}{'chi-square':>10}{'held out':>10}{'pull':>6}  rms without it (um, um, mdeg)"
     )
@@ -225,7 +224,7 @@ def table(answer: CubeAnswer) -> str:
             f"{1e3 * n.memory:.0f} ms; left over white alone {answer.left_over_white['before'][group]:.1f} -> "
             f"{answer.left_over_white['after'][group]:.2f}"
         )
-    lines += [f"Check, {name}: {value:.4f} +- {sigma:.4f}" for name, (value, sigma) in answer.checks.items()]
+    lines += [f"Check: {name}: {value:.4f} +- {sigma:.4f}" for name, (value, sigma) in answer.checks.items()]
     return "\n".join(lines)
 
 

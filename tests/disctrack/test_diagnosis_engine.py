@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import Candidate, Quantity, diagnose
+from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
 from disctrack.diagnosis.fit import compress, fit, solve_bounded, triangle
 from disctrack.diagnosis.held_out import held_out, training_rows
 from disctrack.diagnosis.score import Linearisation, angle, score_all
@@ -169,3 +169,45 @@ def test_ljung_box_accepts_noise_and_refuses_a_slow_wave(rng):
     assert (answer.peak_p_value < 1e-6).all()
     # chi-square of 20 degrees: mean 20, standard deviation 6.3, over 300 channels
     assert ljung_box(rng.standard_normal((400, 300))).mean() == pytest.approx(20, abs=1.5)
+
+
+class Line:
+    """Noise, or a line through the origin: a model that declares no quantity of its own."""
+
+    def __init__(self, observed, time):
+        self.time, self.observed, self.weights = time, observed, np.ones(len(time))
+        self.base = ()
+        one = lambda name: Quantity(name, "1", 0.1)  # noqa: E731
+        self.candidates = (
+            Candidate("slope", "slope", "motion", "slope", "", (one("k"), one("unseen"))),
+            Candidate("bend", "bend", "motion", "bend", "", (one("q"),)),
+        )
+
+    def linearise(self, values, names):
+        columns = {"k": self.time, "unseen": 0 * self.time, "q": self.time**2}
+        left = self.observed - sum((values.get(n, 0.0) * c for n, c in columns.items()), np.zeros(len(self.time)))
+        J = np.stack([columns[n] for n in names], axis=-1) if names else np.zeros((len(left), 0))
+        return left[:, None] / SIGMA, J[:, None] / SIGMA
+
+
+def test_a_model_without_quantities_is_diagnosed_and_rows_are_judged_as_asked(rng):
+    time = np.linspace(0, 1, 90)
+    system = Line(0.05 * time + SIGMA * rng.standard_normal(90), time)
+    rows = np.arange(90) % 3 != 0
+    answer = diagnose(system, {}, Settings(noise=1.0), rows)
+    assert [f.candidate.name for f in answer.found] == ["slope"]
+    assert answer.noise == 1.0
+    assert (answer.held_out_after.test_rows == ~rows).all()
+    assert abs(answer.after.values["k"] - 0.05) < 4 * answer.after.sigma("k")
+    assert not diagnose(Line(SIGMA * rng.standard_normal(90), time), {}, Settings(noise=1.0), rows).found
+
+
+def test_a_quantity_that_the_data_do_not_see_is_open_and_its_neighbour_is_not(rng):
+    time = np.linspace(0, 1, 50)
+    system = Line(SIGMA * rng.standard_normal(50), time)
+    (slope, _) = sorted(
+        score_all(Linearisation(system, fit(system, (), {}), system.candidates), system.candidates),
+        key=lambda s: -len(s.sigma),
+    )
+    assert slope.sigma[0] == pytest.approx(SIGMA / np.sqrt(np.sum(time**2)), rel=1e-6)
+    assert slope.sigma[1] == np.inf
