@@ -12,6 +12,7 @@ from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
+CLOCK_TOLERANCE = 1e-3  # relative: cameras whose frames are stamped may run off the nominal rate; the stamps count
 SAME_EXPOSURE = 0.01  # relative; the two cameras' clocks round to different ticks
 SAME_TAKE_S = 600.0  # computers' clocks, and the time that saving one camera after the other takes
 
@@ -84,7 +85,8 @@ def check_headers(left: FrameReader, right: FrameReader, frame_rate: float, decl
 
 
 def _check_rate(header: CameraHeader, camera: str, frame_rate: float, declared_in: str) -> None:
-    if abs(header.frame_rate - frame_rate) > RATE_ROUNDING_HZ:
+    stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
+    if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
         raise RecordingError(
             f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}, but the {camera} camera's frames were recorded "
             f"with {header.rate}, says {header.file}. Every velocity would be wrong by their ratio: correct that."

@@ -204,13 +204,13 @@ def linear_from_10_bits() -> NDArray[np.uint16]:
     """(1024,) 12-bit grey value of each 10-bit code of a packed cine: black 64, white 4064.
 
     The codes follow the transfer curve of ITU-R BT.709, code = 63.5 + 950.4 E'(L) with L = (grey - 64) / 4000. Within
-    one unit of 4095 of the table in the format's description, codes 2 to 1014; what lies above is saturated.
+    one unit of 4095 of the maker's table; codes above 1014 are saturated, and the lowest two end below the line.
     """
     alpha, beta = 1.09929682680944, 0.018053968510807  # BT.709: slope 4.5 below beta, power 0.45 above
     signal = (np.arange(1024) - 63.5) / 950.375
     above = np.maximum((signal + alpha - 1) / alpha, 0) ** (1 / 0.45)
     grey = np.rint(64 + 4000 * np.where(signal < 4.5 * beta, signal / 4.5, above))
-    grey[1015:] = 4095
+    grey[:2], grey[1015:] = (2, 5), 4095
     return grey.astype(np.uint16)
 
 
@@ -231,10 +231,20 @@ def _times(cine: _Cine) -> tuple[NDArray[np.float64] | None, list[str]]:
     fraction, second = cine.trigger
     trigger = (fraction & 0xFFFFFFFC) * 2.0**-32
     times = _seconds(raw[:, 0], raw[:, 1], second) - trigger
-    steps, rate = np.diff(times), float(cine.field("FrameRate") or 0)
-    if len(steps) and not ((steps > 0).all() and abs(float(np.median(steps)) * rate - 1) < 0.01):
-        return None, [f"the time stamps do not belong to a recording with {rate:g} Hz; they are not used"]
+    if not _saved_step(cine, times):
+        rate = cine.field("FrameRate") or 0
+        return None, [f"the time stamps do not belong to a recording with {rate} Hz; they are not used"]
     return times, []
+
+
+def _saved_step(cine: _Cine, times: NDArray[np.float64]) -> int:
+    """Of how many recorded frames one was saved, by the time stamps (the setup does not tell); 0 if they cannot be."""
+    steps = np.diff(times)
+    if not len(steps):
+        return 1
+    periods = float(np.median(steps)) * (cine.field("FrameRate") or 0)
+    step = round(periods)
+    return step if (steps > 0).all() and step >= 1 and abs(periods / step - 1) < 0.01 else 0
 
 
 def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
@@ -262,11 +272,12 @@ def _header(cine: _Cine, layout: PixelLayout, times: NDArray[np.float64] | None)
     fraction, second = cine.trigger
     trigger_time = second + (fraction & 0xFFFFFFFC) * 2.0**-32
     version, serial = cine.field("CameraVersion"), cine.field("Serial")
+    step = 1 if times is None else _saved_step(cine, times)
     return CameraHeader(
         file=str(cine.path),
         device=f"Phantom {version}, serial number {serial}",
-        frame_rate=float(rate),
-        step=1,
+        frame_rate=rate / step,
+        step=step,
         exposure=exposure if 0 < exposure * rate <= 1.001 else None,
         trigger="",
         first_frame=cine.first_image,
@@ -283,7 +294,7 @@ def _setup_notes(cine: _Cine) -> list[str]:
     notes = []
     if cine.field("FRPSteps"):
         notes.append("the frame rate was changed during the recording (frame rate profile)")
-    if cine.field("EDRShutterNs"):
+    if 0 < (cine.field("EDRShutterNs") or 0) < (cine.field("ShutterNs") or 0):
         notes.append("bright pixels are compressed (extreme dynamic range): edges of the dots may be biased")
     if cine.field("bFlipH") or cine.field("bFlipV"):
         notes.append(
