@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.readers import FrameReader
 from disctrack.readers.blocks import default_threads
@@ -30,7 +31,7 @@ MIN_SAVED = 0.1  # [s] of rest at an end that are worth leaving out
 THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
 MIN_PIXELS = 12  # of a quarter of the image's pixels: fewer are hot pixels or an insect
 VIBRATION_PX = 0.03  # a fan's trembling; motion shows from THRESHOLD times this on, summed since rest
-MIN_SIGMA = 0.3  # grey values: rounding, where the sensor's noise is below it
+MIN_SIGMA = 0.3  # steps of the grey value: rounding, where the sensor's noise is below it
 NOISE_BINS = 16
 
 
@@ -67,9 +68,9 @@ class StillScene:
 
 
 def _reduced(image: NDArray) -> Array:
-    """Means of two by two pixels."""
+    """Means of two by two pixels, in steps of the grey value: images of any depth alike."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
-    whole = image[: 2 * height, : 2 * width].astype(np.float32)
+    whole = image[: 2 * height, : 2 * width].astype(np.float32) / np.float32(level_step(image))
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 

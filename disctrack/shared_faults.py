@@ -95,7 +95,7 @@ def without_shared_faults(
         rhs = gradient * unit / noise - shift[free] / unit
         shift[free] += unit * np.linalg.solve(matrix, rhs)
     dots = slice(-2 * m - 1, -1)
-    places = np.linalg.inv(matrix)[dots, dots] * np.outer(unit[dots], unit[dots])
+    places = np.asarray(np.linalg.inv(matrix)[dots, dots] * np.outer(unit[dots], unit[dots]), float)
     reduced = trimmed_reduced_chi_square(fits)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     return SharedFaults(

@@ -160,3 +160,15 @@ def test_a_scene_tells_a_fifth_of_a_pixel_from_noise_and_noise_from_motion():
     scene = StillScene(still.read(0), still.read(1))
     assert not any(scene.differs(still.read(i)) for i in range(2, 60))
     assert all(scene.differs(moved.read(i)) for i in range(2, 20))
+
+
+def test_rest_seen_by_a_quiet_camera_is_rest_in_any_unit_of_grey(rng):
+    """Rounding is all the noise there is: single steps of the grey value, whatever they are called in the file."""
+    y, x = np.mgrid[:SIZE, :SIZE]
+    scene = 60 + 100 / (1 + np.exp((np.hypot(x - 64, y - 64) - 34) / 1.2)) + 0.1 * x
+    rest = [np.rint(scene + 0.15 * rng.standard_normal(scene.shape)).astype(np.uint8) for _ in range(6)]
+    moved = np.roll(rest[5], 2, axis=1)
+    for scale in (1, 16, 257):
+        still = StillScene(*(image.astype(np.uint16) * np.uint16(scale) for image in rest[:2]))
+        assert not any(still.differs(image.astype(np.uint16) * np.uint16(scale)) for image in rest[2:])
+        assert still.differs(moved.astype(np.uint16) * np.uint16(scale))
