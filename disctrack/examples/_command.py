@@ -31,10 +31,14 @@ class Outcome:
     figure: Figure
 
 
-def command(name: str, data: str, diagnose: Callable[[Path], Outcome], words: Sequence[str] | None = None) -> int:
-    """Run one example: print its table, write diagnosis.json and NAME.png where asked for; returns the exit code."""
+def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words: Sequence[str] | None = None) -> int:
+    """Run one example: print its table, write diagnosis.json and NAME.png where asked for; returns the exit code.
+
+    data : what the folder that is given to `diagnose` holds; None for data that come with the sources
+    """
     parser = argparse.ArgumentParser(prog=f"python -m disctrack.examples.{name}", description=diagnose.__doc__)
-    parser.add_argument("folder", type=Path, help=f"folder with {data}")
+    if data is not None:
+        parser.add_argument("folder", type=Path, help=f"folder with {data}")
     parser.add_argument("-o", "--output", type=Path, help="folder for diagnosis.json and the figure")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
     given = parser.parse_args(words)
@@ -42,7 +46,7 @@ def command(name: str, data: str, diagnose: Callable[[Path], Outcome], words: Se
         earlier = given.output / "diagnosis.json" if given.output is not None else None
         if earlier is not None and earlier.exists() and not given.overwrite:
             raise OutputError(f"{earlier}: exists. Choose another folder with -o, or replace with --overwrite.")
-        outcome = diagnose(given.folder)
+        outcome = diagnose() if data is None else diagnose(given.folder)
         print(outcome.table)
         if given.output is not None:
             write_whole(given.output / "diagnosis.json", (json.dumps(outcome.document, indent=1) + "\n").encode())

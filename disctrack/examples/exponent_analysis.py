@@ -1,8 +1,8 @@
-"""Questions to the published exponents: how large is the contradiction, who removes it, what would decide."""
+"""Questions to the published exponents: how large is the contradiction, and who removes it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,16 +12,16 @@ from scipy import stats
 from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.system import Candidate, Values
-from disctrack.disc import Disc
 from disctrack.examples.exponent_model import LastStage, Reading, Setup
-from disctrack.examples.exponent_system import ExponentSystem, Series, exponent_candidates
+from disctrack.examples.exponent_system import ExponentSystem, Series
 from disctrack.published import PREDICTED
+from disctrack.rolling import CATALOGUE, Model, steady_precession
+from disctrack.rolling.evaluate import effect_power, kinematics
 
 Array = NDArray[np.float64]
 
 THIN_DISC = np.array([PREDICTED[1], PREDICTED[2], PREDICTED[0]])  # n_theta, n_psidot, n_energy
-ALUMINIUM_OVER_STEEL = 2.70 / 7.85  # density
-LOW_PRESSURE = 0.1  # of the atmosphere
+SHARE_AT = np.radians(2.0)  # [rad] nutation, in the windows of both surfaces
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,44 @@ def _density(held: HeldOut) -> float:
 
 
 @dataclass(frozen=True)
+class Fixed:
+    """An explanation whose size is known beforehand, alone or beside quantities that are fitted."""
+
+    name: str
+    values: dict[str, float]  # the known sizes
+    fitted: tuple[str, ...]  # quantities fitted beside k_m and spin
+    fit: Fit
+    gain: float  # decrease of chi-square against the base model
+    misfits: tuple[Misfit, ...]
+
+
+def fixed(system: ExponentSystem, base: Fit, name: str, values: Values, free: str = "") -> Fixed:
+    """Fit with these sizes held; `free` names a candidate that is fitted as well."""
+    extra = tuple(q for c in system.candidates if c.name == free for q in c.quantities)
+    found = fit(system, (*system.base, *extra), base.values | dict(values))
+    gain = base.cost - found.cost if found.converged else float("nan")
+    return Fixed(name, dict(values), tuple(q.name for q in extra), found, gain, misfits(system, found.values))
+
+
+def power_shares(system: ExponentSystem, explanation: Explanation) -> tuple[float, ...]:
+    """Share of the power lost that the effect takes at SHARE_AT, per surface; 0 for what is no law of the motion."""
+    shares = []
+    for i, s in enumerate(system.series):
+        own = system.seen_by(i, explanation.fit.values)
+        state = steady_precession(SHARE_AT, s.setup.disc, s.setup.gravity)
+        q = np.array([0.0, 0.0, 0.0, 0.0, state.theta, 0.0])
+        qdot = np.array([0.0, 0.0, 0.0, state.psidot, 0.0, state.phidot])
+        motion = kinematics(q, qdot, s.setup.disc, s.setup.gravity)
+        laws = {n: v for n, v in own.items() if n.partition(".")[0] in CATALOGUE}
+        power = {
+            e.name: float(effect_power(e, motion, s.setup.disc.mass * s.setup.gravity))
+            for e in Model(s.setup.disc).with_values(laws).effects
+        }
+        shares.append(power.get(explanation.candidate.effect, 0.0) / sum(power.values()))
+    return tuple(shares)
+
+
+@dataclass(frozen=True)
 class Scatter:
     """How much of the scatter between trials an error of t_f in each of them would be."""
 
@@ -129,95 +167,9 @@ def scatter(series: Series, values: Values) -> Scatter:
     )
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Trials that could be made, or read again."""
-
-    name: str
-    longest: float | None = None  # [s] time left where the fit begins
-    shortest: float | None = None  # [s] and ends
-    density: float = 1.0  # of the disc, relative
-    thickness: float = 1.0  # relative
-    pressure: float = 1.0  # of the air, relative
-
-    def setup(self, published: Setup) -> Setup:
-        """The published trials, changed."""
-        disc: Disc = replace(
-            published.disc,
-            mass=published.disc.mass * self.density * self.thickness,
-            half_thickness=published.disc.half_thickness * self.thickness,
-            marker_centres_body=published.disc.marker_centres_body * [1, 1, self.thickness],
-        )
-        air = {  # boundary layers go with sqrt(density), the viscous layer does not know the pressure
-            "air_bildsten.beta": np.sqrt(self.pressure),
-            "air_quadratic.a": self.pressure,
-        }
-        longest = self.longest or published.longest
-        start = published.start * max(1.0, 1.3 * longest / 1.5) ** (2 / 3)
-        return replace(
-            published,
-            label=" " + self.name,
-            longest=longest,
-            shortest=self.shortest or published.shortest,
-            start=start,
-            disc=disc,
-            factors=air,
-        )
-
-
-PLANS = (
-    Plan("the same trials again"),
-    Plan("time left 0.05 to 1.5 s", longest=1.5),
-    Plan("time left 0.2 to 1.5 s", longest=1.5, shortest=0.2),
-    Plan("air at a tenth of the pressure", pressure=LOW_PRESSURE),
-    Plan("disc of aluminium", density=ALUMINIUM_OVER_STEEL),
-    Plan("disc twice as thick", thickness=2.0),
-)
-
-
-def separation(system: ExponentSystem, true: Explanation, rival: Explanation, plan: Plan) -> float:
-    """Standard deviations by which the rival fails when the other is true and the plan's trials are added.
-
-    As many trials per surface as published, with the same scatter. The rival is refitted to the published and the
-    new trials together, all quantities free; the spin of the new trials is unknown beforehand.
-    """
-    first = [_expected(system, i, true.fit.values, s.setup, s) for i, s in enumerate(system.series)]
-    planned = [replace(s, setup=plan.setup(s.setup)) for s in system.series]
-    names = [true.candidate.name, rival.candidate.name]
-    empty = ExponentSystem([*system.series, *planned], names)
-    n = len(first)
-    second = [_expected(empty, n + i, true.fit.values, s.setup, s) for i, s in enumerate(planned)]
-    joint = ExponentSystem([*first, *second], [rival.candidate.name])
-    wrong = fit(joint, (*joint.base, *rival.candidate.quantities), rival.fit.values)
-    right = prior_penalty(joint, true.fit.values)
-    return float(np.sqrt(max(wrong.cost - right, 0.0))) if wrong.converged else float("nan")
-
-
-def _expected(system: ExponentSystem, index: int, values: Values, setup: Setup, like: Series) -> Series:
-    """A series whose trials all are what the model with these values foretells."""
-    outcome = system.outcomes(index, values)
-    return Series(setup, np.tile(outcome[:3], (len(like.exponents), 1)), like.covariance, float(outcome[3]))
-
-
-def prior_penalty(system: ExponentSystem, values: Values) -> float:
-    """Chi-square of the priors at these values; a quantity that they lack stands at its null."""
-    pulls = [(values.get(q.name, q.null) - q.null) / q.prior_sigma for q in system.base if np.isfinite(q.prior_sigma)]
-    return float(np.sum(np.square(pulls)))
-
-
-def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Every explanation against every other, once."""
-    return [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
-
-
 def early_stop(setup: Setup, values: Mapping[str, float], theta: float = np.radians(0.5)) -> float:
     """Time [s] before collapse at which the nutation falls to theta, where the disc comes to lie on its paper."""
     stage = LastStage(setup, values)
     t_f, curve = stage.collapse[0], stage.curves[0]
     time = np.linspace(t_f - setup.longest, t_f - 1e-3, 4000)
     return float(t_f - time[np.argmax(np.exp(curve(time)[:, 0]) < theta)])
-
-
-def all_names(surfaces: Sequence[str]) -> tuple[str, ...]:
-    """Names of all candidates."""
-    return tuple(c.name for c in exponent_candidates(surfaces))

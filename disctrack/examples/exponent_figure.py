@@ -1,68 +1,68 @@
-"""Published exponents with the curves along which each explanation moves them."""
+"""Published exponents with the curves along which each explanation moves the prediction."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
 from disctrack.diagnosis.system import Values
+from disctrack.examples._command import dress
 from disctrack.examples.exponent_analysis import THIN_DISC, Explanation
+from disctrack.examples.exponent_report import Answer
 from disctrack.examples.exponent_system import ExponentSystem, Series
+from disctrack.figures import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 Array = NDArray[np.float64]
 
 AXES = ((0, 1), (0, 2))  # pairs of exponents that are shown against each other
-LABELS = ("$n_\\theta$", "$n_{\\dot\\psi}$", "$n_E$")
+LABELS = (r"$n_\theta$", r"$n_{\dot\psi}$", "$n_E$")
 FRACTIONS = (0.0, 0.5, 1.0)  # of the fitted size
+_STYLES = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (AMBER, "D"), ("#7a4fb5", "v"), ("#0d8a8a", "P"))
 
 
-def draw(system: ExponentSystem, explanations: Sequence[Explanation], base: Values, path: Path) -> None:
-    """One row per surface; trials, their mean with its 68 and 95 % region, the models, the explanations."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4.3 * len(system.series)), layout="constrained")
-    FigureCanvasAgg(figure)
+def draw(system: ExponentSystem, answer: Answer) -> Figure:
+    """One row per surface: trials, region of their mean, the model before, and each explanation's way from there."""
+    figure = Figure(figsize=(10.5, 4.1 * len(system.series)), layout="constrained")
     grid = np.atleast_2d(figure.subplots(len(system.series), len(AXES)))
-    colours = mpl.colormaps["tab10"].colors  # type: ignore[attr-defined]
+    base = answer.base.values
     for i, series in enumerate(system.series):
-        paths = {e.candidate.name: _path(system, i, e, base) for e in explanations}
+        ways = {n: _way(system, i, e, base) for n, e in answer.explanations.items()}
         for axes, (a, b) in zip(grid[i], AXES, strict=True):
+            dress(axes)
             _draw_trials(axes, series, a, b)
-            axes.plot(THIN_DISC[a], THIN_DISC[b], "k*", ms=12, label="thin disc: 2/3, $-$1/3, 2/3")
-            for k, (name, points) in enumerate(paths.items()):
-                axes.plot(points[:, a], points[:, b], "-", color=colours[k], lw=1.2)
-                axes.plot(points[-1, a], points[-1, b], "o", color=colours[k], ms=6, label=name)
-            start = system.outcomes(i, base)
-            axes.plot(start[a], start[b], "ks", ms=7, label="simulated, $k_m$ alone")
-            axes.set(xlabel=LABELS[a], ylabel=LABELS[b], title=series.setup.surface)
-    grid[0, 0].legend(fontsize=7, loc="best")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+            for k, (name, points) in enumerate(ways.items()):
+                colour, marker = _STYLES[k % len(_STYLES)]
+                axes.plot(points[:, a], points[:, b], "-", color=colour, lw=1)
+                axes.plot(points[-1, a], points[-1, b], marker, color=colour, ms=7, alpha=0.8, mec="white", label=name)
+            start = ways[next(iter(ways))][0]
+            axes.plot(start[a], start[b], "s", color=INK, ms=8, label="simulated, $k_m$ alone")
+            axes.plot(THIN_DISC[a], THIN_DISC[b], "*", color=INK, ms=13, label="thin disc: 2/3, $-$1/3, 2/3")
+            axes.set(xlabel=LABELS[a], ylabel=LABELS[b])
+            axes.set_title(f"{series.setup.surface}, last {series.setup.longest:g} s", color=INK, fontsize=10)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
+    return figure
 
 
-def _path(system: ExponentSystem, index: int, explanation: Explanation, base: Values) -> Array:
-    """(n, 4) outcomes on the way from the base fit to the fitted explanation."""
+def _way(system: ExponentSystem, index: int, explanation: Explanation, base: Values) -> Array:
+    """(n, 4) outcomes from the base fit to the fitted explanation."""
     end = explanation.fit.values
-    null = {q.name: q.null for q in explanation.candidate.quantities}
-    start = null | dict(base)
+    start = {q.name: q.null for q in explanation.candidate.quantities} | dict(base)
     steps = [{n: start[n] + f * (end[n] - start[n]) for n in end} for f in FRACTIONS]
     return np.array([system.outcomes(index, values) for values in steps])
 
 
-def _draw_trials(axes: Any, series: Series, a: int, b: int) -> None:
+def _draw_trials(axes: Axes, series: Series, a: int, b: int) -> None:
     exponents = series.exponents
-    axes.plot(exponents[:, a], exponents[:, b], ".", color="0.6", label="trials")
+    axes.plot(exponents[:, a], exponents[:, b], ".", color=MUTED, label="trials")
     mean, n = series.mean, len(exponents)
     root = np.linalg.cholesky(np.cov(exponents[:, [a, b]].T) / n)
-    circle = np.exp(1j * np.linspace(0, 2 * np.pi, 100))
+    circle = np.linspace(0, 2 * np.pi, 100)
     for probability, style in ((0.68, "-"), (0.95, "--")):
         radius = np.sqrt(2 * (n - 1) / (n - 2) * stats.f.ppf(probability, 2, n - 2))  # Hotelling
-        ellipse = mean[[a, b]][:, None] + radius * root @ np.stack([circle.real, circle.imag])
-        axes.plot(*ellipse, color="0.3", ls=style, lw=1, label=f"their mean, {100 * probability:.0f} %")
-    axes.plot(mean[a], mean[b], "+", color="0.3", ms=10)
+        ellipse = mean[[a, b]][:, None] + radius * root @ np.stack([np.cos(circle), np.sin(circle)])
+        axes.plot(*ellipse, color=MUTED, ls=style, lw=1, label=f"their mean, {100 * probability:.0f} %")
+    axes.plot(mean[a], mean[b], "+", color=MUTED, ms=10)

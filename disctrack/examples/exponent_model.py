@@ -10,12 +10,13 @@ than 0.005 at 30 % of the nutation, by less than 0.002 at 15 %. It is therefore 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
 
 from disctrack.disc import MA_2014, Disc
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
@@ -45,6 +46,7 @@ class Setup:
     gravity: float = 9.81
     share: float = 0.0  # amplitude of the nutation oscillation over the nutation, at the start
     label: str = ""  # distinguishes several series on one surface
+    fits_t_f: bool = False  # along with the exponents, rather than taking it from the images
     factors: Mapping[str, float] = field(default_factory=dict)  # on parameters of effects: thinner air, for one
 
     @property
@@ -114,9 +116,23 @@ class LastStage:
         reading = reading or Reading()
         rows = []
         for t_f, curve in zip(self.collapse, self.curves, strict=True):
+            if self.setup.fits_t_f:
+                reading = replace(reading, t_f_bias=self._fitted_bias(curve, t_f, reading))
             left, theta, psidot, energy = self._read(curve, t_f, reading)
             rows.append([*(slope(left, v) for v in (theta, psidot, energy)), np.log(t_f)])
         return np.array(rows)
+
+    def _fitted_bias(self, curve: CubicSpline, t_f: float, reading: Reading) -> float:
+        """Error of t_f [s] when it is chosen so that the logarithms of nutation and precession rate are straight."""
+
+        def bend(bias: float) -> float:
+            left, theta, psidot, _ = self._read(curve, t_f, replace(reading, t_f_bias=bias))
+            x = np.vander(np.log(left), 2)
+            y = np.log(np.stack([theta, psidot], axis=1))
+            return float(np.sum((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2))
+
+        furthest = 0.9 * self.setup.shortest
+        return float(minimize_scalar(bend, bounds=(-furthest, furthest), method="bounded", options={"xatol": 1e-8}).x)
 
     def _read(self, curve: CubicSpline, t_f: float, reading: Reading) -> tuple[Array, Array, Array, Array]:
         """Time left as the experimenter has it, nutation, precession rate, energy, (n,) each."""

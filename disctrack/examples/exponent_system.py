@@ -231,7 +231,7 @@ class ExponentSystem:
         setup = self.series[index].setup
         return not mark or owner == (setup.surface + setup.label if plain == SPIN else setup.surface)
 
-    def _own(self, index: int, values: Values) -> dict[str, float]:
+    def seen_by(self, index: int, values: Values) -> dict[str, float]:
         """Values that one series sees, without the surface in their names; what both have adds up."""
         own: dict[str, float] = {}
         for name, value in values.items():
@@ -241,13 +241,13 @@ class ExponentSystem:
         return own
 
     def _reading(self, index: int, values: Values) -> Reading:
-        own = self._own(index, values)
+        own = self.seen_by(index, values)
         given = {field: own.get(q.name, 0.0) for field, q in _READING.values()}
         assert set(given) == {f.name for f in fields(Reading)}
         return Reading(**given)
 
     def _stage(self, index: int, values: Values) -> LastStage:
-        own = self._own(index, values)
+        own = self.seen_by(index, values)
         spin = own.pop(SPIN, SPIN_AT_REST)
         inverse = own.pop(SLIP, 0.0)
         reading = {q.name for _, q in _READING.values()}
