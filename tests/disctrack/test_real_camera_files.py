@@ -10,13 +10,14 @@ from disctrack.errors import RecordingError
 from disctrack.readers import open_frames
 from disctrack.readers.camera_header import header_of
 
+SHIPPED = Path(__file__).resolve().parents[2] / "sample_data" / "camera_files"
 
-@pytest.fixture(scope="module")
-def camera_files(shared_data) -> Path:
-    """Recordings from the tests of other readers; PROVENANCE.md beside them tells of which."""
-    folder = shared_data / "camera_files"
-    if not folder.is_dir():
-        pytest.skip("no camera_files among the shared data")
+
+def folder_of(name: str, request: pytest.FixtureRequest) -> Path:
+    """Where a recording from the tests of other readers lies; PROVENANCE.md beside it tells of which."""
+    folder = SHIPPED if (SHIPPED / name).is_file() else request.getfixturevalue("shared_data") / "camera_files"
+    if not (folder / name).is_file():
+        pytest.skip(f"{name} is neither in sample_data/camera_files nor among the shared data")
     return folder
 
 
@@ -38,7 +39,8 @@ def dice_frame(file: Path, largest: int) -> np.ndarray:
         ("packed_raw_12bpp", 12),
     ],
 )
-def test_cines_of_seven_cameras_have_the_pixels_that_dice_finds(camera_files, name, bits):
+def test_cines_of_seven_cameras_have_the_pixels_that_dice_finds(name, bits, request):
+    camera_files = folder_of(f"{name}.cine", request)
     reader = open_frames(f"{name}.cine", camera_files, "left")
     assert (len(reader), reader.image_size, reader.bit_depth) == (6, (256, 128), bits)
     # codes of 10 bits are made linear to within a unit of the maker's table; single precision costs 2e-4 of a unit
@@ -48,7 +50,8 @@ def test_cines_of_seven_cameras_have_the_pixels_that_dice_finds(camera_files, na
         assert_allclose(reader.read(index), expected, atol=tolerance)
 
 
-def test_a_cine_s_time_stamps_tell_how_many_frames_were_left_out(camera_files):
+def test_a_cine_s_time_stamps_tell_how_many_frames_were_left_out(request):
+    camera_files = folder_of("cine_781.cine", request)
     reader = open_frames("cine_781.cine", camera_files, "left")
     header = header_of(reader)
     assert (len(reader), header.step, header.frame_rate) == (15, 10, 9000)
@@ -56,7 +59,8 @@ def test_a_cine_s_time_stamps_tell_how_many_frames_were_left_out(camera_files):
     assert header.exposure == pytest.approx(10e-6)
 
 
-def test_a_cine_of_a_colour_sensor_is_refused(camera_files):
+def test_a_cine_of_a_colour_sensor_is_refused(request):
+    camera_files = folder_of("invalid_color.cine", request)
     with pytest.raises(RecordingError, match="colour recording"):
         open_frames("invalid_color.cine", camera_files, "left")
 
@@ -65,7 +69,8 @@ def test_a_cine_of_a_colour_sensor_is_refused(camera_files):
     ("name", "rate", "exposure", "first", "size"),
     [("ball_12bit", 30_000, 20e-6, 52, (384, 384)), ("beam", 50_000, 5e-6, 0, (1024, 80))],
 )
-def test_mraw_has_the_pixels_that_pymraw_finds(camera_files, name, rate, exposure, first, size):
+def test_mraw_has_the_pixels_that_pymraw_finds(name, rate, exposure, first, size, request):
+    camera_files = folder_of(f"{name}.cihx", request)
     py_mraw = pytest.importorskip("pyMRAW")
     theirs, _ = py_mraw.load_video(str(camera_files / f"{name}.cihx"))
     reader = open_frames(f"{name}.cihx", camera_files, "left")
