@@ -105,6 +105,7 @@ def _scatter_block(found: Sequence[Scatter]) -> list[str]:
 def _search_block(answer: Answer) -> list[str]:
     d = answer.diagnosis
     lines = [f"Search over {len(d.tried)} effects: {d.verdict}; {d.reason}"]
+    lines += ["  (below 1, as the covariance of so few trials is widened to make the chi-square of their mean right)"]
     for f in d.found:
         others = ", ".join(r.candidate.name for r in f.cannot_be_told_from)
         lines.append(f"  {f.candidate.name}: chi-square falls by {f.gain:.1f}, by noise alone to {f.threshold:.1f}")
