@@ -3,7 +3,8 @@
 A row is one exponent of one trial, cleared of what the exponents before it in the same trial foretell (Cholesky), so
 that all rows are independent with variance one. One more row per surface is the time that the last stage lasts: the
 paper's k_m is that with which its simulation collapses at the measured instant, which is all that k_m can say once
-another law acts beside it.
+another law acts beside it. The tables' own t_f count from the blow that starts the disc, through seconds of slip; a
+rolling disc has nothing to say to them.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from disctrack.diagnosis import Candidate, Quantity
 from disctrack.diagnosis.disc_motion import SLIP, motion_candidates
 from disctrack.diagnosis.system import Values
 from disctrack.disc import MA_2014
+from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import LastStage, Reading, Setup
 from disctrack.published import SURFACES, published_table
 from disctrack.rolling import CATALOGUE, Model, effects
@@ -57,10 +59,11 @@ def sample_covariance(exponents: Array) -> Array:
     """Covariance (k, k) of one trial, widened so that its inverse is unbiased (Hartlap, Simon & Schneider 2007).
 
     With the sample covariance as it is, chi-square of n = 8 trials of three numbers would be 7/3 of what it should be.
+    Raises AnalysisError for fewer than k + 3 trials.
     """
     n, k = exponents.shape
     if n < k + 3:
-        raise ValueError(f"{n} trials of {k} numbers: their covariance needs {k + 3} or more")
+        raise AnalysisError(f"{n} trials of {k} numbers: their covariance needs {k + 3} trials or more")
     return np.asarray(np.cov(exponents.T) * (n - 1) / (n - k - 2), float)
 
 
@@ -82,26 +85,21 @@ def published_series() -> tuple[Series, ...]:
     return tuple(series_of(setup_of(s), published_table(s).exponents[:, ORDER]) for s in SURFACES)
 
 
-def _reading_quantities() -> dict[str, tuple[str, Quantity]]:
-    """Measurement: attribute of `Reading` and quantity, by the name of the effect."""
-    wide = {
-        "t_f": ("t_f_bias", Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2)),
-        "cut": ("cut_shift", Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02)),
-        "theta_zero": ("theta_zero", Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05))),
-        "height_zero": ("height_zero", Quantity("height_zero.shift", "m", 1e-6, typical=2e-5)),
-        "attitude_noise": (
-            "attitude_variance",
-            Quantity("attitude_noise.variance", "rad^2", 1e-8, lower=0.0, typical=np.radians(0.05) ** 2),
-        ),
-        "smoothing": (
-            "smoothing_square",
-            Quantity("smoothing.square", "s^2", 1e-6, lower=0.0, upper=0.06**2, typical=0.01**2),
-        ),
-    }
-    return wide
-
-
-_READING = _reading_quantities()
+# What the reading may do wrong: attribute of `Reading` and quantity, by the name of the effect.
+_READING: dict[str, tuple[str, Quantity]] = {
+    "t_f": ("t_f_bias", Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2)),
+    "cut": ("cut_shift", Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02)),
+    "theta_zero": ("theta_zero", Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05))),
+    "height_zero": ("height_zero", Quantity("height_zero.shift", "m", 1e-6, typical=2e-5)),
+    "attitude_noise": (
+        "attitude_variance",
+        Quantity("attitude_noise.variance", "rad^2", 1e-8, lower=0.0, typical=np.radians(0.05) ** 2),
+    ),
+    "smoothing": (
+        "smoothing_square",
+        Quantity("smoothing.square", "s^2", 1e-6, lower=0.0, upper=0.06**2, typical=0.01**2),
+    ),
+}
 _TITLES = {
     "t_f": ("the instant called t_f is not that of collapse", "section 4a"),
     "cut": ("the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),

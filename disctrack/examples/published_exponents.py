@@ -71,6 +71,9 @@ def known_sizes(system: ExponentSystem, base: Fit, stop: Sequence[float]) -> tup
         fixed(system, base, "Moffatt's layer as calculated", {"air_moffatt.f": 1.0}),
         fixed(system, base, "Bildsten's boundary layers with a factor of one", nominal),
         fixed(system, base, "the same with t_f fitted", nominal, "t_f_each"),
+        # the paper does not say where its fits end; the curves of its figures do so 0.05 s before t_f
+        fixed(system, base, "fits that end 0.02 s later, with t_f fitted", {"cut.shift": -0.02}, "t_f"),
+        fixed(system, base, "fits that end 0.05 s earlier, with t_f fitted", {"cut.shift": 0.05}, "t_f"),
     )
 
 
