@@ -15,7 +15,7 @@ from disctrack.energy import Energy, analyse_energy
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.frames import euler_jacobian
 from disctrack.labelled import Variable
-from disctrack.propagation import RATES, Series, propagate, rates
+from disctrack.propagation import RATES, Series, common_sigma, propagate, rates
 from disctrack.scaling import (
     WINDOW,
     Exponent,
@@ -287,7 +287,7 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
     )
     sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
     S = motion.calibration_sensitivity
-    common = np.sqrt(np.maximum(np.einsum("nsa,ab,nsb->ns", S, motion.rig_covariance, S, optimize=True), 0.0))
+    common = common_sigma(S, motion.rig_covariance)
     for name, values, unit, text, first in vectors:
         for i, axis in enumerate("xyz"):
             item = Series(
@@ -295,12 +295,11 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
             )
             variables |= _series_variables((item,))
     J = euler_jacobian(motion.euler[:, 0], motion.euler[:, 1])
-    turn = J @ S[:, 3:6]
     angle_variance = np.einsum("nij,njk,nik->ni", J, motion.covariance[:, 3:6, 3:6], J)
-    angle_common = np.einsum("nsa,ab,nsb->ns", turn, motion.rig_covariance, turn, optimize=True)
+    shared = common_sigma(J @ S[:, 3:6], motion.rig_covariance)
     for i, name in enumerate(("psi", "theta", "phi")):
-        noise, shared = (np.sqrt(np.maximum(v[:, i], 0.0)) for v in (angle_variance, angle_common))
-        item = Series(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared)
+        noise = np.sqrt(np.maximum(angle_variance[:, i], 0.0))
+        item = Series(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared[:, i])
         variables |= _series_variables((item,))
     return variables | {
         "covariance": Variable(

@@ -33,7 +33,7 @@ CONTACT = (
     ("force_z", "N", "normal contact force"),
     ("friction_needed", "1", "horizontal over normal contact force"),
 )
-SLIP = slice(3, 5)
+PLANE, SLIP = slice(0, 2), slice(3, 5)
 
 # What a calibrated radius, thickness and table (1e-4 each) leave of slip at the rates of a rolling disc (1 to 5 m/s at
 # the edge) is a few tenths of a millimetre per second: slip below this is rolling for every purpose.
@@ -150,7 +150,7 @@ def rolling_onset(
     if frames.size < 2:
         return _no_onset("the contact velocity is not known in any two frames")
     v = found.value[frames, SLIP]
-    C = found.covariance[frames, SLIP, SLIP] + found.calibration_covariance[frames, SLIP, SLIP]
+    C = found.covariance_at(frames, SLIP) + found.calibration_covariance_at(frames, SLIP)
     interval = float(np.median(np.diff(motion.time)))
     share = np.minimum(1.0, interval / (INDEPENDENT_AFTER_LENGTHS * motion.length.min(axis=1)[frames]))
     sizes = np.geomspace(max(4 * tolerance, 1e-5), 10.0, 60)
@@ -252,9 +252,9 @@ def locus_circle(motion: Motion, found: Propagated, duration: float, until: floa
     gain = np.linalg.solve(J.T @ J, J.T)
     residual = distance - radius
     independent = min(len(frames), max(4.0, arc / np.pi))
-    noise = np.einsum("i,nij,j->n", [1.0, 1.0], found.covariance[frames, :2, :2], [1.0, 1.0]).mean() / 2
+    noise = np.einsum("i,nij,j->n", [1.0, 1.0], found.covariance_at(frames, PLANE), [1.0, 1.0]).mean() / 2
     variance = (gain[2] @ gain[2]) * len(frames) / independent * max(float(np.mean(residual**2)), float(noise))
-    per_rig = gain[2] @ np.einsum("ni,nir->nr", J[:, :2], found.calibration_sensitivity[frames, :2])
+    per_rig = gain[2] @ np.einsum("ni,nir->nr", J[:, :2], found.sensitivity_at(frames, PLANE))
     theta = motion.euler[frames, 1]
     expected = motion.disc.radius * np.cos(theta) - motion.disc.half_thickness * np.sin(theta)
     return Circle(

@@ -98,8 +98,10 @@ def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:
     if known.size < 2:
         return (float("nan"),) * 3
     first, last = known[0], known[-1]
-    noise = found.covariance[first, column, column] + found.covariance[last, column, column]
-    difference = found.calibration_sensitivity[last, column] - found.calibration_sensitivity[first, column]
+    ends, this = known[[0, -1]], slice(column, column + 1)
+    noise = found.covariance_at(ends, this).sum()
+    before, after = found.sensitivity_at(ends, this)[:, 0]
+    difference = after - before
     common = max(0.0, float(difference @ found.rig_covariance @ difference))
     return float(found.value[first, column] - found.value[last, column]), float(np.sqrt(noise)), float(np.sqrt(common))
 

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 # Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
 # quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.
 STEPS = np.repeat([1e-6, 1e-6, 1e-4, 1e-3, 1e-2, 1.0], 3)
-FRAMES_AT_ONCE = 1024  # the derivatives of all frames at once would be twice the result
+FRAMES_AT_ONCE = 1024
 RESOLVED_TILT_SIGMAS = 5.0  # below this many sigmas of theta, the direction of precession is not determined
 
 
@@ -63,27 +63,90 @@ class Series:
 
 @dataclass(frozen=True)
 class Propagated:
-    """Values with the covariance that noise and calibration give them."""
+    """Values with the covariance that noise and calibration give them.
+
+    Kept is their derivative; covariances, several times as large, are made for the frames that are asked for.
+    """
 
     value: Array  # (n, k)
-    covariance: Array  # (n, k, k) noise
-    calibration_sensitivity: Array  # (n, k, 30) d value / d RIG_PARAMETERS
-    rig_covariance: Array  # (30, 30)
+    jacobian: Array  # (n, k, 18) d value / d STATE
+    motion: Motion
+
+    @property
+    def covariance(self) -> Array:
+        """(n, k, k) noise."""
+        return self.covariance_at(np.arange(len(self.value)), slice(None))
+
+    @property
+    def calibration_sensitivity(self) -> Array:
+        """(n, k, 30) d value / d RIG_PARAMETERS."""
+        return self.sensitivity_at(np.arange(len(self.value)), slice(None))
 
     @property
     def calibration_covariance(self) -> Array:
         """(n, k, k) at one instant, common to all instants."""
-        S = self.calibration_sensitivity
-        return S @ self.rig_covariance @ np.swapaxes(S, -1, -2)
+        return self.calibration_covariance_at(np.arange(len(self.value)), slice(None))
+
+    @property
+    def rig_covariance(self) -> Array:
+        """(30, 30) of RIG_PARAMETERS."""
+        return self.motion.rig_covariance
+
+    def covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
+        """(f, c, c) noise of some values in some frames."""
+
+        def some(rows: NDArray[np.int64]) -> Array:
+            J = self.jacobian[rows][:, columns]
+            return np.asarray(J @ self.motion.covariance[rows] @ J.swapaxes(1, 2))
+
+        return _by_parts(some, frames)
+
+    def sensitivity_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
+        """(f, c, 30) d value / d RIG_PARAMETERS of some values in some frames."""
+        return _by_parts(
+            lambda rows: self.jacobian[rows][:, columns] @ self.motion.calibration_sensitivity[rows], frames
+        )
+
+    def calibration_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
+        """(f, c, c) from the rig, of some values in some frames."""
+
+        def some(rows: NDArray[np.int64]) -> Array:
+            S = self.sensitivity_at(rows, columns)
+            return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2))
+
+        return _by_parts(some, frames)
 
     def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[Series, ...]:
         """The columns as Series; names are (name, unit, long_name)."""
-        sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        common = np.sqrt(np.maximum(np.diagonal(self.calibration_covariance, axis1=1, axis2=2), 0.0))
+        frames, all_columns = np.arange(len(self.value)), slice(None)
+
+        def sigmas(rows: NDArray[np.int64]) -> Array:
+            noise = np.diagonal(self.covariance_at(rows, all_columns), axis1=1, axis2=2)
+            return np.stack(
+                [np.sqrt(noise), common_sigma(self.sensitivity_at(rows, all_columns), self.rig_covariance)], 1
+            )
+
+        both = _by_parts(sigmas, frames)
         return tuple(
-            Series(name, unit, text, self.value[:, i], sigma[:, i], common[:, i])
+            Series(name, unit, text, self.value[:, i], both[:, 0, i], both[:, 1, i])
             for i, (name, unit, text) in enumerate(names)
         )
+
+
+def common_sigma(sensitivity: Array, rig_covariance: Array) -> Array:
+    """Standard deviations (n, k) that the rig's covariance gives to quantities of sensitivity (n, k, 30)."""
+
+    def some(rows: NDArray[np.int64]) -> Array:
+        S = sensitivity[rows]
+        return np.asarray(np.sqrt(np.maximum(np.sum((S @ rig_covariance) * S, axis=2), 0.0)))
+
+    return _by_parts(some, np.arange(len(sensitivity)))
+
+
+def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np.int64]) -> Array:
+    """A function of frames, some at a time: what it needs on the way may be larger than its result."""
+    parts = [function(frames[i : i + FRAMES_AT_ONCE]) for i in range(0, max(len(frames), 1), FRAMES_AT_ONCE)]
+    return np.concatenate(parts)
 
 
 def state_of(motion: Motion) -> State:
@@ -116,27 +179,22 @@ def propagate(motion: Motion, function: Callable[[State], Array]) -> Propagated:
 
     NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
     """
-    state, n = state_of(motion), len(motion)
-    parts = [_propagated(motion, state, slice(i, i + FRAMES_AT_ONCE), function) for i in range(0, n, FRAMES_AT_ONCE)]
-    value, covariance, sensitivity = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Propagated(value, covariance, sensitivity, motion.rig_covariance)
+    whole = state_of(motion)
 
+    def some(rows: NDArray[np.int64]) -> Array:
+        state = State(*(part[rows] for part in vars(whole).values()))
+        jacobian = np.stack(
+            [(function(displaced(state, e)) - function(displaced(state, -e))) / (2 * e.sum()) for e in np.diag(STEPS)],
+            axis=-1,
+        )  # (f, k, 18)
+        value = function(state)
+        tilt_sigma = np.sqrt(np.trace(motion.covariance[rows, 3:6, 3:6], axis1=1, axis2=2) / 3)
+        value = np.where((state.sine > RESOLVED_TILT_SIGMAS * tilt_sigma)[:, None], value, np.nan)
+        jacobian[~np.isfinite(value)] = np.nan
+        return np.concatenate([value[..., None], jacobian], axis=-1)
 
-def _propagated(
-    motion: Motion, whole: State, rows: slice, function: Callable[[State], Array]
-) -> tuple[Array, Array, Array]:
-    """Value (k, p), covariance (k, p, p) and sensitivity (k, p, 30) of some frames."""
-    state = State(*(part[rows] for part in vars(whole).values()))
-    jacobian = np.stack(
-        [(function(displaced(state, e)) - function(displaced(state, -e))) / (2 * e.sum()) for e in np.diag(STEPS)],
-        axis=-1,
-    )  # (k, p, 18)
-    value = function(state)
-    tilt_sigma = np.sqrt(np.trace(motion.covariance[rows, 3:6, 3:6], axis1=1, axis2=2) / 3)
-    value = np.where((state.sine > RESOLVED_TILT_SIGMAS * tilt_sigma)[:, None], value, np.nan)
-    jacobian[~np.isfinite(value)] = np.nan
-    covariance = jacobian @ motion.covariance[rows] @ jacobian.swapaxes(1, 2)
-    return value, covariance, jacobian @ motion.calibration_sensitivity[rows]
+    both = _by_parts(some, np.arange(len(motion)))
+    return Propagated(both[..., 0], both[..., 1:], motion)
 
 
 RATES = (
