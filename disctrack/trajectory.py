@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +122,16 @@ class Trajectory:
     def calibration_sigma(self) -> Array:
         """(n, 6) standard deviation of q from the rig's covariance [m, rad]; an error that all frames share."""
         return _coordinate_sigma(self.q, self.calibration_covariance)
+
+
+def part(trajectory: Trajectory, rows: slice) -> Trajectory:
+    """The trajectory of these frames only."""
+    n = len(trajectory)
+    everything: dict[str, Any] = {f.name: getattr(trajectory, f.name) for f in fields(trajectory)}
+    per_frame: dict[str, Any] = {
+        k: v[rows] for k, v in everything.items() if isinstance(v, np.ndarray) and v.shape[:1] == (n,)
+    }
+    return replace(trajectory, **per_frame)
 
 
 def _coordinate_sigma(q: Array, pose_covariance: Array) -> Array:

@@ -132,12 +132,13 @@ def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Mis
     if law is None or diagnosis.held_out_before is None:
         return moment, None
     start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    fitted = fit(system, (*base.quantities, *law.candidate.quantities), start)
+    judged = diagnosis.judged or system
+    fitted = fit(judged, (*base.quantities, *law.candidate.quantities), start)
     price = float(np.log(np.sum(system.weights)))
     lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
     saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])
     rows = training_rows(system, diagnosis.settings.train_fraction)
-    held = held_out(system, fitted.quantities, fitted.values, rows)
+    held = held_out(judged, fitted.quantities, fitted.values, rows)
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise
     if not (fitted.converged and saved > 0 and held_gain > 0):
         return moment, None
@@ -155,6 +156,7 @@ def run_diagnose(
     output : folder; without it `<name>_diagnosis` beside the file
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
+    from disctrack.diagnosis.evidence import evidence
     from disctrack.diagnosis.report import write_report  # matplotlib is wanted here only
 
     path = Path(path)
@@ -168,12 +170,15 @@ def run_diagnose(
         result = diagnose_trajectory(trajectory, model)
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
-    document = {"recording": provenance.recording, **result.document}
-    write_diagnosis(path, result, document)
+    beside = evidence(result) if result.before is not None else None
+    if beside is not None and result.moment is None:
+        result = replace(result, moment=beside.moment)
+    document = {"recording": provenance.recording, **as_json(result, beside)}
+    write_diagnosis(path, result, beside, document)
     write_whole(report, (json.dumps(document, indent=1) + "\n").encode())
     toml = folder / "model.toml"
     text = model_toml(result.system, result.after_fit.values, provenance.recording)
     write_whole(toml, text.encode())
-    pages = write_report(folder, result, provenance.recording)
-    said = lines(result)
+    pages = write_report(folder, result, beside, provenance.recording)
+    said = lines(result, beside)
     return DiagnoseOutcome(result, (report, toml, *pages), tuple(said))

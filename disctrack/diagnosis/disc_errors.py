@@ -43,6 +43,8 @@ class Errors:
     reduced_chi_square: float  # of the dots in all images
     reduced_chi_square_pose: float  # of the six numbers per frame that a pose can take
     rms_px: float  # per image coordinate
+    position_um: float  # rms of measured minus fitted position, per axis
+    theta_mdeg: float  # rms of measured minus fitted nutation angle
     ahead: tuple[Ahead, ...]
     ratio_to_floor: float  # free run: rms of the residual over what noise and the fit's own uncertainty allow
     whiteness: Whiteness
@@ -54,12 +56,16 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut) -> Errors:
     rms = float(np.sqrt(np.mean(pixels[system.used] ** 2)))
     pose = system.pose_residual(fit_.values)
     present = system.weights >= 6
+    delta, _ = system.pose_difference(fit_.values)
+    tilt = np.sum(nodal_axes_world(*system.poses(fit_.values)[:, 3:5].T)[0] * delta[:, 3:], axis=1)
     # of the fitted quantities, those without a prior take their share of the pose's numbers
     freedom = 6 * present.sum() - sum(not np.isfinite(q.prior_sigma) for q in fit_.quantities)
     return Errors(
         reduced_chi_square=fit_.reduced_chi_square,
         reduced_chi_square_pose=float(np.sum(pose[present] ** 2) / max(freedom, 1)),
         rms_px=rms,
+        position_um=float(1e6 * np.sqrt(np.mean(delta[present, :3] ** 2))),
+        theta_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(tilt[present] ** 2)))),
         ahead=free_run(system, held),
         ratio_to_floor=held.ratio_to_floor,
         whiteness=whiteness(pose[present], _rate(system), frequencies(system, fit_.values)),
@@ -78,7 +84,8 @@ def frequencies(system: DiscSystem, values: Values) -> dict[str, float]:
     spin = abs(q[-1, 5] - q[0, 5]) / span / (2 * np.pi)
     turn = abs(q[-1, 3] + q[-1, 5] - q[0, 3] - q[0, 5]) / span / (2 * np.pi)
     # between the thin disc's 0.775 and 0.84 at 40 degrees (corrected equations of Ma et al. 2014)
-    return {"precession": precession, "spin": spin, "turn of the face": turn, "nutation": 0.79 * precession}
+    found = {"precession": precession, "spin": spin, "turn of the face": turn, "nutation": 0.79 * precession}
+    return found | {"twice the precession": 2 * precession, "half the frame rate": 0.5 * _rate(system)}
 
 
 def free_run(system: DiscSystem, held: HeldOut, horizons: tuple[float, ...] = HORIZONS) -> tuple[Ahead, ...]:
@@ -129,4 +136,7 @@ def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
         if effect.law is not None:
             power = effect_power(effect, k, motion.contact_force[:, 2])
             balance[f"by {effect.name}"] = float(-np.trapezoid(power, motion.time))
+    if np.any(motion.slip_velocity):
+        power = np.sum(motion.contact_force[:, :2] * motion.slip_velocity, axis=1)
+        balance["by slip"] = float(-np.trapezoid(power, motion.time))
     return balance

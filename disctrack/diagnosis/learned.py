@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.fit import Fit, prior_rows, triangle
-from disctrack.diagnosis.system import Candidate, Quantity
+from disctrack.diagnosis.system import Candidate, Quantity, Values
 from disctrack.rolling.effects import FORMULAS, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
 
@@ -69,6 +69,7 @@ class MissingMoment:
     time: Array  # (k,) middles of the probes [s]
     moment: Array  # (k, 3) M_n, M_m, M_z [N m]
     sigma: Array  # (k, 3)
+    scale: float  # [N m] that its second differences were taken to have before the data
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,11 @@ class _Blocks:
     spacing: float
 
 
-def missing_moment(blocks: _Blocks) -> MissingMoment:
-    """Moment over time with the size and smoothness that make the data most probable (empirical Bayes)."""
+def missing_moment(blocks: _Blocks, scale: float | None = None) -> MissingMoment:
+    """Moment over time with the size and smoothness that make the data most probable (empirical Bayes).
+
+    scale : [N m] of its second differences, in place of the most probable one
+    """
     R = triangle(np.vstack([*blocks.triangles, blocks.prior]))
     k = len(blocks.time)
     right, fitted, probes = R[:, -1], R[:, : blocks.n_fitted], R[:, blocks.n_fitted : -1]
@@ -107,7 +111,7 @@ def missing_moment(blocks: _Blocks) -> MissingMoment:
     projected = (U.T @ right) ** 2
     sizes = np.logspace(-9, -1, 65)  # [N m] prior standard deviation of the second difference
     density = [-0.5 * np.sum(projected / (1 + (a * singular) ** 2) + np.log1p((a * singular) ** 2)) for a in sizes]
-    a = sizes[int(np.argmax(density))]
+    a = float(sizes[int(np.argmax(density))]) if scale is None else scale
     gain = a**2 * singular / (1 + (a * singular) ** 2)
     amplitude = root @ (V.T @ (gain * (U.T @ right)))
     posterior = root @ V.T
@@ -120,6 +124,7 @@ def missing_moment(blocks: _Blocks) -> MissingMoment:
         blocks.time,
         factor * amplitude.reshape(shape).T,
         factor * np.sqrt(np.maximum(variance, 0.0)).reshape(shape).T,
+        a,
     )
 
 
@@ -128,8 +133,11 @@ def _unit(columns: Array) -> Array:
     return columns / np.where(length > 0, length, 1.0)
 
 
-def probe(system: DiscSystem, fit: Fit) -> _Blocks:
-    """Responses of the dots to short moments along n0, m0, k, compressed part by part."""
+def probe(system: DiscSystem, fit: Fit, other: Values | None = None) -> _Blocks:
+    """Responses of the dots to short moments along n0, m0, k, compressed part by part.
+
+    other : values whose prediction takes the place of the data, so that its moment is read in the same way
+    """
     q = system.poses(fit.values)
     span = float(system.time[-1] - system.time[0])
     turns = max(float(np.abs(q[-1, i] - q[0, i])) / (2 * np.pi) for i in (3, 5))
@@ -137,6 +145,9 @@ def probe(system: DiscSystem, fit: Fit) -> _Blocks:
     middles = system.time[0] + span * (np.arange(k) + 0.5) / k
     names = [f"wrench_probe.M_{axis}" for axis in AXES]
     residual, derivative = system.linearise(fit.values, fit.names)
+    right, matrix = prior_rows(fit.quantities, fit.values)
+    if other is not None:
+        residual, right = residual - system.linearise(other, [])[0], np.zeros_like(right)
     columns = np.zeros((*residual.shape, 3, k))
     for i, middle in enumerate(middles):
         values = fit.values | {"wrench_probe.t_0": float(middle), "wrench_probe.width": WIDTH * span / k}
@@ -147,7 +158,6 @@ def probe(system: DiscSystem, fit: Fit) -> _Blocks:
     )
     parts = np.array_split(np.arange(len(residual)), PARTS)
     triangles = tuple(triangle(everything[rows].reshape(-1, everything.shape[-1])) for rows in parts)
-    right, matrix = prior_rows(fit.quantities, fit.values)
     prior = np.concatenate([matrix, np.zeros((len(matrix), 3 * k)), right[:, None]], axis=1)
     return _Blocks(triangles, prior, len(fit.names), middles, span / k)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.disc_errors import Ahead, Errors
 from disctrack.diagnosis.fit import Fit
 from disctrack.diagnosis.search import Found, Tried
 from disctrack.diagnosis.separation import Separation
@@ -20,6 +20,7 @@ from disctrack.storage import write_group
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.diagnose import DiscDiagnosis, Learned
+    from disctrack.diagnosis.evidence import Evidence
 
 GROUP = "diagnosis"
 
@@ -83,7 +84,7 @@ def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None]
     }
 
 
-def _errors(errors: Errors | None) -> dict[str, Any] | None:
+def _errors(errors: Errors | None, longer: tuple[Ahead, ...] = ()) -> dict[str, Any] | None:
     if errors is None:
         return None
     w = errors.whiteness
@@ -91,6 +92,8 @@ def _errors(errors: Errors | None) -> dict[str, Any] | None:
         "reduced_chi_square": _number(errors.reduced_chi_square),
         "reduced_chi_square_pose": _number(errors.reduced_chi_square_pose),
         "rms_px": _number(errors.rms_px),
+        "rms_position_um": _number(errors.position_um),
+        "rms_theta_mdeg": _number(errors.theta_mdeg),
         "held_out": {
             "ratio_to_noise_floor": _number(errors.ratio_to_floor),
             "free_run": [
@@ -103,7 +106,7 @@ def _errors(errors: Errors | None) -> dict[str, Any] | None:
                     "noise_psi_deg": _number(a.noise_psi_deg),
                     "noise_position_mm": _number(a.noise_position_mm),
                 }
-                for a in errors.ahead
+                for a in (*errors.ahead, *longer)
             ],
         },
         "whiteness": {
@@ -152,12 +155,12 @@ def _learned(learned: Learned) -> dict[str, Any]:
     }
 
 
-def as_json(result: DiscDiagnosis) -> dict[str, Any]:
+def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     diagnosis = result.diagnosis
     apart = result.separated_by
     effects = [effect_json(f, diagnosis.after, apart.get(f.candidate.name)) for f in diagnosis.found]
-    rows = result.system.rows
+    rows, longer = result.system.rows, beside.ahead if beside else ()
     return {
         "verdict": diagnosis.verdict,
         "sentence": result.sentence,
@@ -166,16 +169,19 @@ def as_json(result: DiscDiagnosis) -> dict[str, Any]:
         "notes": list(result.notes),
         "frames": [int(result.system.trajectory.frame[i]) for i in (rows.start, rows.stop - 1)],
         "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
-        "before": (_errors(result.before) or {}) | {"parameters": _declared(diagnosis.before)},
-        "after": (_errors(result.after) or {}) | {"parameters": _declared(result.after_fit)},
+        "before": (_errors(result.before, tuple(b for b, _ in longer)) or {})
+        | {"parameters": _declared(diagnosis.before)},
+        "after": (_errors(result.after, tuple(a for _, a in longer)) or {})
+        | {"parameters": _declared(result.after_fit)},
         "noise_variance_over_stated": _number(diagnosis.noise),
         "energy_J": result.energy,
+        "energy_before_J": beside.energy_before if beside else {},
         "tried": [tried_json(t) for t in diagnosis.tried],
         "settings": vars(diagnosis.settings),
     }
 
 
-def write_diagnosis(path: Path, result: DiscDiagnosis, document: dict[str, Any]) -> None:
+def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, document: dict[str, Any]) -> None:
     """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
     system = result.system
     n = len(system.trajectory)
@@ -191,11 +197,18 @@ def write_diagnosis(path: Path, result: DiscDiagnosis, document: dict[str, Any])
         what = f"x, y, z, psi, theta, phi of the model {name}"
         variables[f"q_{name}"] = Variable(predicted, ("time", "coordinate"), "m and rad", what)
     axes = {"coordinate": Variable(np.array(COORDINATES), ("coordinate",), "1", "coordinate")}
+    axes["contact_axis"] = Variable(np.array(["n0", "m0", "k"]), ("contact_axis",), "1", "axis of the contact frame")
+    if beside is not None and beside.measured is not None:
+        from disctrack.diagnosis.evidence import force_of
+
+        force, sigma = np.full((2, n, 3), np.nan)
+        force[system.rows] = beside.measured.force - force_of(system, result.diagnosis.before)
+        sigma[system.rows] = beside.measured.force_sigma
+        what = "mass times measured acceleration, minus the force of the model before"
+        variables["missing_force"] = Variable(force, ("time", "contact_axis"), "N", what)
+        variables["missing_force_sigma"] = Variable(sigma, ("time", "contact_axis"), "N", f"standard deviation: {what}")
     if result.moment is not None:
         axes["probe_time"] = Variable(result.moment.time, ("probe_time",), "s", "middle of a probe of the moment")
-        axes["contact_axis"] = Variable(
-            np.array(["n0", "m0", "k"]), ("contact_axis",), "1", "axis of the contact frame"
-        )
         dims = ("probe_time", "contact_axis")
         what = "contact moment that the model before fails to supply"
         variables["missing_moment"] = Variable(result.moment.moment, dims, "N m", what)
@@ -208,7 +221,7 @@ def write_diagnosis(path: Path, result: DiscDiagnosis, document: dict[str, Any])
     write_group(path, GROUP, variables, axes=axes, attributes=attributes)
 
 
-def lines(result: DiscDiagnosis) -> list[str]:
+def lines(result: DiscDiagnosis, beside: Evidence | None = None) -> list[str]:
     """Some lines for the terminal."""
     before, after = result.before, result.after
     found = [f"{'verdict':<13} {result.diagnosis.verdict}", f"{'':<13} {result.sentence}"]
@@ -225,7 +238,7 @@ def lines(result: DiscDiagnosis) -> list[str]:
         f"{before.rms_px:.4f} -> {after.rms_px:.4f} px rms"
     )
     found.append(f"{'free run':<13} {before.ratio_to_floor:.4g} -> {after.ratio_to_floor:.4g} times the noise floor")
-    for a, b in zip(before.ahead, after.ahead, strict=True):
+    for a, b in (*zip(before.ahead, after.ahead, strict=True), *(beside.ahead if beside else ())):
         found.append(
             f"{'':<13} {a.horizon:g} s ahead: theta {a.theta_deg:.3g} -> {b.theta_deg:.3g} deg, psi {a.psi_deg:.3g} -> "
             f"{b.psi_deg:.3g} deg, position {a.position_mm:.3g} -> {b.position_mm:.3g} mm"

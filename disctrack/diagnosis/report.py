@@ -12,7 +12,8 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from disctrack.diagnosis.diagnose import DiscDiagnosis
-from disctrack.diagnosis.disc_errors import Errors
+from disctrack.diagnosis.disc_errors import HORIZONS, Ahead, Errors
+from disctrack.diagnosis.evidence import Evidence
 from disctrack.diagnosis.figures import all_figures
 from disctrack.diagnosis.search import Found
 from disctrack.diagnosis.words import effect_text, law_text, quantity_text
@@ -27,11 +28,11 @@ th,td{text-align:left;padding:.25rem .6rem;border-bottom:1px solid #e3e8ed;font-
 img{max-width:100%}figcaption{color:#6b7885;font-size:.9rem}figure{margin:1rem 0}.wide{overflow-x:auto}"""
 
 
-def write_report(folder: Path, result: DiscDiagnosis, recording: str) -> tuple[Path, ...]:
+def write_report(folder: Path, result: DiscDiagnosis, beside: Evidence | None, recording: str) -> tuple[Path, ...]:
     """Write diagnosis.html and figures/*.png; returns the files. Raises OutputError."""
     files, pictures = [], []
     with rc_context({"font.size": 10}):
-        for drawn in all_figures(result):
+        for drawn in all_figures(result, beside):
             FigureCanvasAgg(drawn.figure)
             path = folder / "figures" / f"{drawn.name}.png"
             buffer = io.BytesIO()
@@ -41,7 +42,7 @@ def write_report(folder: Path, result: DiscDiagnosis, recording: str) -> tuple[P
             files.append(path)
             pictures.append(_figure(drawn, buffer.getvalue()))
     page = folder / "diagnosis.html"
-    write_whole(page, _page(result, recording, pictures).encode())
+    write_whole(page, _page(result, beside, recording, pictures).encode())
     return (page, *files)
 
 
@@ -53,7 +54,7 @@ def _figure(drawn: Drawn, png: bytes) -> str:
     )
 
 
-def _page(result: DiscDiagnosis, recording: str, pictures: list[str]) -> str:
+def _page(result: DiscDiagnosis, beside: Evidence | None, recording: str, pictures: list[str]) -> str:
     title = escape(f"{recording}: what does the model lack?")
     parts = [
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -61,8 +62,9 @@ def _page(result: DiscDiagnosis, recording: str, pictures: list[str]) -> str:
         f"<body><main><h1>{title}</h1><p class=lead>{escape(result.sentence)}</p>",
         f"<p>Verdict: <b>{escape(result.diagnosis.verdict)}</b>. Model: {escape(result.model)}. "
         f"{escape(result.diagnosis.reason[:1].upper() + result.diagnosis.reason[1:])}.</p>",
+        "".join(f"<p>{escape(text[:1].upper() + text[1:])}.</p>" for text in result.notes),
         _effects(result),
-        _before_after(result),
+        _before_after(result, beside),
         *pictures,
         _tried(result),
     ]
@@ -71,8 +73,9 @@ def _page(result: DiscDiagnosis, recording: str, pictures: list[str]) -> str:
 
 def _effects(result: DiscDiagnosis) -> str:
     items = "".join(
-        f"<li>{escape(effect_text(f, result.diagnosis))}. Without it chi-square rises by {f.gain:.5g} (noise alone: "
-        f"{f.threshold:.3g}); the held-out data become exp({f.held_out_gain / 2:.4g}) times as probable. "
+        f"<li>{escape(effect_text(f, result.diagnosis))}. Without it chi-square rises by {f.gain:.5g}, "
+        f"{np.sqrt(max(f.gain, 0.0)):.4g} sigmas (noise alone: {f.threshold:.3g}); on held-out data it gains "
+        f"{f.held_out_gain:.4g}. "
         f"{escape(_class_text(f, result))}</li>"
         for f in result.diagnosis.found
     )
@@ -103,33 +106,48 @@ def _class_text(found: Found, result: DiscDiagnosis) -> str:
     return " ".join(texts)
 
 
-def _before_after(result: DiscDiagnosis) -> str:
+def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> str:
     before, after = result.before, result.after
-    if before is None or after is None:
+    if before is None or after is None or beside is None:
         return ""
+    both = (before, after)
     rows = [
-        ("reduced chi-square of the dots", f"{before.reduced_chi_square:.4g}", f"{after.reduced_chi_square:.4g}"),
-        ("reduced chi-square of the poses", *(f"{e.reduced_chi_square_pose:.4g}" for e in (before, after))),
-        ("rms of the dots [px]", f"{before.rms_px:.4f}", f"{after.rms_px:.4f}"),
-        ("free run over its noise floor", f"{before.ratio_to_floor:.4g}", f"{after.ratio_to_floor:.4g}"),
-        ("Ljung-Box, probability in noise", *(f"{e.whiteness.p_value:.2g}" for e in (before, after))),
-        *_ahead(before, after),
+        ("reduced chi-square of the dots", *(f"{e.reduced_chi_square:.4g}" for e in both)),
+        ("reduced chi-square of the poses", *(f"{e.reduced_chi_square_pose:.4g}" for e in both)),
+        ("rms of the dots [px]", *(f"{e.rms_px:.4f}" for e in both)),
+        ("rms of the position [um]", *(f"{e.position_um:.3g}" for e in both)),
+        ("rms of the nutation angle [mdeg]", *(f"{e.theta_mdeg:.3g}" for e in both)),
+        ("Ljung-Box: probability of so much memory in noise", *(f"{e.whiteness.p_value:.2g}" for e in both)),
+        ("highest line of the spectrum", *(_line(e) for e in both)),
+        ("free run over its noise floor", *(f"{e.ratio_to_floor:.4g}" for e in both)),
+        *(row for b, a in zip(before.ahead, after.ahead, strict=True) for row in _ahead(b, a)),
+        *(row for b, a in beside.ahead for row in _ahead(b, a)),
         *_laws(result),
+        *_energy(result, beside),
     ]
     body = "".join(f"<tr><td>{escape(a)}<td>{escape(b)}<td>{escape(c)}</tr>" for a, b, c in rows)
-    return f"<h2>Before and after</h2><div class=wide><table><tr><th><th>before<th>after</tr>{body}</table></div>"
+    reached = {a.horizon for a in after.ahead} | {a.horizon for _, a in beside.ahead}
+    short = [f"{h:g}" for h in HORIZONS if h not in reached]
+    remark = f"<p>The recording is too short for free runs of {' and '.join(short)} s.</p>" if short else ""
+    head = "<table><tr><th><th>before<th>after</tr>"
+    return f"<h2>Before and after</h2><div class=wide>{head}{body}</table></div>{remark}"
 
 
-def _ahead(before: Errors, after: Errors) -> list[tuple[str, str, str]]:
-    rows = []
-    for b, a in zip(before.ahead, after.ahead, strict=True):
-        text = f"free run {b.horizon:g} s ahead: "
-        rows += [
-            (text + f"nutation [deg], noise {b.noise_theta_deg:.2g}", f"{b.theta_deg:.3g}", f"{a.theta_deg:.3g}"),
-            (text + f"precession [deg], noise {b.noise_psi_deg:.2g}", f"{b.psi_deg:.3g}", f"{a.psi_deg:.3g}"),
-            (text + f"position [mm], noise {b.noise_position_mm:.2g}", f"{b.position_mm:.3g}", f"{a.position_mm:.3g}"),
-        ]
-    return rows
+def _line(errors: Errors) -> str:
+    """The strongest line of the pose residual: where, near what, and whether noise has as strong ones."""
+    w = errors.whiteness
+    i = int(np.argmin(w.peak_p_value))
+    near = f" ({w.peak_near[i]})" if w.peak_near[i] else ""
+    return f"{w.peak_frequency[i]:.4g} Hz{near}, p = {min(1.0, w.peak_p_value[i] * len(w.peak_p_value)):.2g}"
+
+
+def _ahead(b: Ahead, a: Ahead) -> list[tuple[str, str, str]]:
+    text = f"free run {b.horizon:g} s ahead: "
+    return [
+        (text + f"nutation [deg], noise {b.noise_theta_deg:.2g}", f"{b.theta_deg:.3g}", f"{a.theta_deg:.3g}"),
+        (text + f"precession [deg], noise {b.noise_psi_deg:.2g}", f"{b.psi_deg:.3g}", f"{a.psi_deg:.3g}"),
+        (text + f"position [mm], noise {b.noise_position_mm:.2g}", f"{b.position_mm:.3g}", f"{a.position_mm:.3g}"),
+    ]
 
 
 def _laws(result: DiscDiagnosis) -> list[tuple[str, str, str]]:
@@ -140,8 +158,23 @@ def _laws(result: DiscDiagnosis) -> list[tuple[str, str, str]]:
         if q.name in result.system.model.values:
             start, end = (quantity_text(f.values[q.name], f.sigma(q.name), q.unit) for f in (first, last))
             rows.append((q.name, start, end))
-    for name, joule in result.energy.items():
-        rows.append((f"energy {name} [mJ]", "", f"{1e3 * joule:.5g}"))
+            change = last.values[q.name] - first.values[q.name]
+            rows.append((f"change of {q.name}", "", f"{change:+.3g} {q.unit if q.unit != '1' else ''}".rstrip()))
+    return rows
+
+
+def _energy(result: DiscDiagnosis, beside: Evidence) -> list[tuple[str, str, str]]:
+    """Energy balance of both models, and the loss that the poses alone show."""
+    rows = []
+    for name in {**beside.energy_before, **result.energy}:
+        before, after = (
+            "" if v is None else f"{1e3 * v:.5g}" for v in (beside.energy_before.get(name), result.energy.get(name))
+        )
+        rows.append((f"energy {name} [mJ]", before, after))
+    if beside.measured is not None:
+        loss, sigma = 1e3 * beside.measured.energy_lost, 1e3 * beside.measured.energy_lost_sigma
+        text = quantity_text(loss, sigma, "1")
+        rows.append(("energy lost, from the poses of the disc as declared [mJ]", text, text))
     return rows
 
 

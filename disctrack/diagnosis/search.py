@@ -98,6 +98,7 @@ class Diagnosis:
     tried: tuple[Tried, ...]
     settings: Settings = field(default_factory=Settings)
     partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
+    judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
 
 
 def diagnose(
@@ -113,12 +114,14 @@ def diagnose(
     if not base.converged:
         return _refusal(base, settings)
     modes = common_modes(system, base) if settings.noise is None else None
-    answer = _Search(whitened(system, modes), settings, rows).run(base)
+    judged = whitened(system, modes)
+    answer = _Search(judged, settings, rows).run(base)
     if modes is not None and answer.found:  # a large effect that moves fast looks like scatter of the frames
         again = common_modes(system, answer.after)
         if again is None or again[1].size < modes[1].size:
-            answer = _Search(whitened(system, again), settings, rows).run(base)
-    return answer
+            judged = whitened(system, again)
+            answer = _Search(judged, settings, rows).run(base)
+    return replace(answer, judged=None if judged is system else judged)
 
 
 def noise_variance(system: System, fit_: Fit) -> float:

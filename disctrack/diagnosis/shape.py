@@ -31,6 +31,7 @@ def refine_shapes(system: System, diagnosis: Diagnosis) -> tuple[Diagnosis, tupl
     """The diagnosis with the shapes of the laws fitted along, and remarks on those that the data leave open."""
     if diagnosis.held_out_before is None or diagnosis.verdict == "nothing missing":
         return diagnosis, ()
+    system = diagnosis.judged or system
     notes: list[str] = []
     if diagnosis.verdict == "unexplained" or len(diagnosis.found) > 1:
         diagnosis = _second_trial(system, diagnosis)

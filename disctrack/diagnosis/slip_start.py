@@ -8,8 +8,7 @@ describes it, the diagnosis begins where rolling does.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from disctrack.diagnosis.search import Diagnosis, Found, Settings, Tried, diagno
 from disctrack.diagnosis.system import Candidate
 from disctrack.errors import AnalysisError
 from disctrack.rolling import CATALOGUE, Model
-from disctrack.trajectory import Trajectory
+from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
 MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
@@ -78,19 +77,9 @@ def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:
 def _onset(trajectory: Trajectory, stretch: Stretch) -> RollingOnset | None:
     """When rolling begins, from the contact's velocity; None where the velocities cannot be had."""
     try:
-        return analyse_contact(differentiate(_part(trajectory, stretch.rows))).onset
+        return analyse_contact(differentiate(part(trajectory, stretch.rows))).onset
     except AnalysisError:
         return None
-
-
-def _part(trajectory: Trajectory, rows: slice) -> Trajectory:
-    """The trajectory of these frames only."""
-    n = len(trajectory)
-    everything: dict[str, Any] = {f.name: getattr(trajectory, f.name) for f in fields(trajectory)}
-    per_frame: dict[str, Any] = {
-        k: v[rows] for k, v in everything.items() if isinstance(v, np.ndarray) and v.shape[:1] == (n,)
-    }
-    return replace(trajectory, **per_frame)
 
 
 def _slipping(
@@ -112,7 +101,8 @@ def _slipping(
     if diagnosis.held_out_after is None or not _declares(system):
         return Answer(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis)))
     rows = training_rows(system, settings.train_fraction)
-    slip = SlipStart(base, held_out(system, base.quantities, base.values, rows), _candidate(system))
+    judged = diagnosis.judged or system
+    slip = SlipStart(base, held_out(judged, base.quantities, base.values, rows), _candidate(system))
     return Answer(system, diagnosis, slip, (*system.stretch.notes, *_in_words(system, diagnosis)))
 
 
@@ -177,6 +167,7 @@ def with_slip(diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
     return replace(
         diagnosis,
         verdict=verdict,
+        reason=f"with slip at the start, {diagnosis.reason}",
         found=(found, *diagnosis.found),
         before=slip.without,
         held_out_before=slip.held_out,

@@ -68,15 +68,24 @@ def sentence(diagnosis: Diagnosis, fit: Fit, after: Errors | None, law: LearnedL
     """The answer in one or a few sentences; `fit` is that of the enlarged model."""
     if after is None:
         return f"No answer: {diagnosis.reason}."
-    level = f"{after.rms_px:.4f} px rms ({after.reduced_chi_square:.3f} of the expected variance)"
+    level = (
+        f"{after.position_um:.2g} um and {after.theta_mdeg:.2g} mdeg a frame ({after.rms_px:.4f} px rms, "
+        f"{after.reduced_chi_square:.3f} of the expected variance)"
+    )
     if law is not None:
+        first = "".join(f"Missing in the model: {effect_text(f, diagnosis)}. " for f in diagnosis.found)
         described = f"{law_text(law, fit)} describes it and leaves {level}"
-        return f"A moment is missing that the catalogue does not name: {described}."
+        return f"{first}A moment is missing that the catalogue does not name: {described}."
     if diagnosis.verdict == "nothing missing":
         return f"Nothing is missing at the level of {level}."
     effects = "; and ".join(effect_text(f, diagnosis) for f in diagnosis.found)
+    it = "it" if len(diagnosis.found) == 1 else "them"
     if diagnosis.verdict == "found":
-        return f"Missing in the model: {effects}. With it, what is left is noise: {level}."
+        fall = f"{diagnosis.before.reduced_chi_square:.4g} to {after.reduced_chi_square:.4g}"
+        return (
+            f"Missing in the model: {effects}. With {it} chi-square per degree of freedom falls from {fall}, and what "
+            f"is left is noise: {level}."
+        )
     if effects:
         nearest = f"the nearest description is {effects}, which leaves {level}"
         return f"Something is missing that the catalogue does not name; {nearest}."

@@ -1,12 +1,15 @@
 """disctrack diagnose from file to file: the group, diagnosis.json, the page, and a model that can be used again."""
 
 import json
+import re
 import tomllib
 
 import numpy as np
 import pytest
 
 from disctrack.cli import main
+from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis.evidence import evidence, force_of
 from disctrack.scene import load_scene
 from disctrack.scene_motion import simulate_scene
 from disctrack.storage import Provenance, read_group, read_trajectory, write_trajectory
@@ -51,10 +54,56 @@ def test_group_holds_the_residuals_and_the_document(diagnosed):
     assert len(read_trajectory(diagnosed[0])) == 300  # the rest of the file is as it was
 
 
+def test_group_holds_the_moment_and_force_that_were_missing(diagnosed):
+    arrays, _ = read_group(diagnosed[0], "diagnosis")
+    inner = slice(30, -30)  # derivatives at the ends of a film are poor
+    force, sigma = (arrays[name][inner] for name in ("missing_force", "missing_force_sigma"))
+    # 0.1 mm off at 70 rad/s: m e psidot^2 sin(theta) and more, some mN at a sigma of 1
+    assert np.sqrt(np.mean((force / sigma) ** 2)) > 2
+    moment, sigma = (arrays[name] for name in ("missing_moment", "missing_moment_sigma"))
+    assert moment.shape == sigma.shape
+    assert np.sqrt(np.mean((moment[:, 0] / sigma[:, 0]) ** 2)) > 3  # m g 0.1 mm = 0.2 mN m tips the disc
+
+
+def test_what_was_found_supplies_the_missing_force(diagnosed):
+    """Two routes: accelerations of the poses without a model, and the force of the enlarged model."""
+    result = diagnose_trajectory(read_trajectory(diagnosed[0]), separate=False)
+    beside = evidence(result)
+    added = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
+    missing = beside.measured.force - force_of(result.system, result.diagnosis.before)
+    inner = slice(30, -30)
+    pull = (missing - added)[inner] / beside.measured.force_sigma[inner]
+    # neighbouring frames share noise: some ten independent values per axis, mean square 1 +- 0.25
+    assert np.mean(pull**2) < 2
+    assert np.mean((missing[inner] / beside.measured.force_sigma[inner]) ** 2) > 4
+    of_law, moment = beside.moment_of_law, beside.moment
+    left = (moment.moment - of_law.moment)[2:-2] / moment.sigma[2:-2]
+    assert np.mean(left**2) < 2
+
+
+def test_table_holds_every_error_before_and_after(diagnosed):
+    page = (diagnosed[1] / "diagnosis.html").read_text()
+    for row in (
+        "reduced chi-square of the dots",
+        "rms of the dots [px]",
+        "Ljung-Box",
+        "highest line of the spectrum",
+        "free run 0.1 s ahead: nutation",
+        "free run 0.1 s ahead: precession",
+        "free run 0.1 s ahead: position",
+        "change of km.k_m",
+        "energy lost [mJ]",
+        "sigmas",
+    ):
+        assert row in page, row
+    assert "too short for free runs of 0.3 and 0.5 s" in page  # 0.3 s of film
+    assert not re.search(r"\bnan\b", re.sub(r"base64,[^\"]*", "", page))
+
+
 def test_page_shows_the_figures_and_says_the_sentence(diagnosed):
     page = (diagnosed[1] / "diagnosis.html").read_text()
     assert "Missing in the model" in page
-    assert page.count("<figure>") == len(list((diagnosed[1] / "figures").iterdir())) >= 4
+    assert page.count("<figure>") == len(list((diagnosed[1] / "figures").iterdir())) >= 7
 
 
 def test_enlarged_model_simulates_the_measured_motion(diagnosed):
