@@ -1,7 +1,8 @@
 """Which effect is missing from the model of the motion, or of the measurement?
 
 `diagnose` (search) is the engine: it works on any `System` (system). `DiscSystem` makes one of a trajectory of the disc
-and the rolling model; `run_diagnose` is the stage from file to file.
+and the rolling model; `run_diagnose` is the stage from file to file. Systems that are no disc: `disctrack.examples`;
+for their noise there is `coloured`, for their diagnosis.json `general`.
 """
 
 from disctrack.diagnosis.diagnose import DiagnoseOutcome, DiscDiagnosis, diagnose_trajectory, run_diagnose

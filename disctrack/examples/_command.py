@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,12 +50,23 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
         outcome = diagnose() if data is None else diagnose(given.folder)
         print(outcome.table)
         if given.output is not None:
-            write_whole(given.output / "diagnosis.json", (json.dumps(outcome.document, indent=1) + "\n").encode())
+            write_whole(
+                given.output / "diagnosis.json", (json.dumps(finite(outcome.document), indent=1) + "\n").encode()
+            )
             write_whole(given.output / f"{name}.png", png(outcome.figure))
     except DiscTrackError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def finite(x: Any) -> Any:
+    """The same with None for numbers that JSON does not know."""
+    if isinstance(x, dict):
+        return {k: finite(v) for k, v in x.items()}
+    if isinstance(x, list | tuple):
+        return [finite(v) for v in x]
+    return None if isinstance(x, float) and not math.isfinite(x) else x
 
 
 def png(figure: Figure) -> bytes:

@@ -24,6 +24,7 @@ GRAVITY = 9.81  # [m/s^2] as declared
 AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
 OUNCE = 0.028349523125  # [kg]
 MIDDLE = 30.0  # [m] of the heights seen; about it, perspective bends the scale
+ACCELERATION_DEGREE = 4  # of the polynomial in time that all drops of a ball share: any drag, to 1 mm
 STEP = 1.0 / 15.0  # [s] of the integration: Runge-Kutta errs by less than 1e-6 m over a fall
 _FORCES = ("gravity.change", "constant_drag.c", "linear_drag.k", "quadratic_drag.k")
 _IMAGE = ("height_scale.change", "frame_rate.change", "perspective.bend")
@@ -262,7 +263,7 @@ def _hermite(grid: Array, height: Array, velocity: Array, time: Array) -> Array:
 def height_noise(drops: Sequence[Drop]) -> SmoothNoise:
     """Noise of a height [m] and [s], from what drops of one ball do not have in common.
 
-    All drops of a ball share an acceleration that is any parabola in time; start and velocity are each drop's own. What
+    All drops of a ball share an acceleration that is a polynomial in time; start and velocity are each drop's own. What
     is left (grain of the pixels, a hand that throws, wind, a scale that differs from take to take) is no law of the
     ball. One drop alone shows less of it.
     """
@@ -277,7 +278,7 @@ def _shared_acceleration(drops: Sequence[Drop]) -> Stretch:
     part = np.concatenate([np.full(len(d.time), i) for i, d in enumerate(drops)])
     own = (part[:, None] == np.arange(len(drops))).astype(float)
     u = time[:, None] / time.max()
-    basis = np.concatenate([own, own * u, u**2, u**3, u**4], axis=1)
+    basis = np.concatenate([own, own * u, *(u**k for k in range(2, ACCELERATION_DEGREE + 3))], axis=1)
     return Stretch(time, np.concatenate([d.height for d in drops])[:, None], basis, part)
 
 

@@ -168,7 +168,7 @@ def as_document(answer: CubeAnswer) -> dict[str, Any]:
             k: {"rms": _units(e.rms), "forecast_end": _units(e.forecast_end)} for k, e in answer.without.items()
         },
         "pull_of_held_out_values": answer.pull,
-        "checks": {k: [x if np.isfinite(x) else None for x in v] for k, v in answer.checks.items()},
+        "checks": {k: list(v) for k, v in answer.checks.items()},
         "flights": len(system.flights),
         "left_out": system.n_left_out,
         "copies": system.n_copies,

@@ -72,10 +72,11 @@ def test_quadratic_drag_is_named_and_sized_where_heights_are_good(rng):
     assert found.together.verdict == "found"
     assert [f.candidate.effect for f in found.together.found] in (["quadratic_drag"], ["sphere_drag"])
     assert found.identifiable
-    assert found.forms[0].effects == ("quadratic_drag",)
+    assert found.forms[0].effects[0] == "quadratic_drag"
+    plain = next(f.fit for f in found.forms if f.effects == ("quadratic_drag",))
     for ball in BALLS[:2]:
         name = f"quadratic_drag.k[{ball.name}]"
-        value, sigma = found.forms[0].fit.values[name], found.forms[0].fit.sigma(name)
+        value, sigma = plain.values[name], plain.sigma(name)
         assert abs(value - 0.5 * ball.quadratic_per_cd) < 4 * sigma
         assert sigma < 0.02 * value
 

@@ -121,6 +121,18 @@ def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of
         assert answer.after.forecast_end[group] < 0.5 * answer.before.forecast_end[group]
 
 
+def test_other_columns_and_contacts_of_the_published_tosses_agree(answer):
+    checks = {key.partition(",")[0].partition(" [")[0]: value for key, value in answer.checks.items()}
+    delay, _ = checks["delay of the published velocities"]
+    assert delay == pytest.approx(0.484, abs=0.02)  # differences with the sample before would be half a frame late
+    body, _ = checks["misfit of the published angular velocities if in axes of the body"]
+    world, _ = checks["the same if in axes of the world"]
+    assert body < 0.1 < 1 < world
+    friction, sigma = checks["friction coefficient"]
+    assert friction == pytest.approx(0.211, abs=0.01)
+    assert (friction - 0.18) / sigma > 5  # declared as 0.18
+
+
 def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
     system = answer.system
     all_candidates = system.candidates
