@@ -9,6 +9,7 @@ The public verbs in the order of the measurement; each is imported when it is fi
     write_trajectory(path, measurement.trajectory, trajectory_provenance(recording, found.rig, pairs, None))
     trajectory = read_trajectory(path)
     outcome = run_analyse(path)                                 # -> groups in the file, .report, .analysis
+    batch = run_batch([folder])                                 # all of this for many recordings, -> .rows, .files
 
 Conventions (frames, angles, units, pixels) have one home: the docstring of disctrack.frames.
 """
@@ -20,6 +21,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from disctrack.analyse import Analysis, run_analyse
+    from disctrack.batch import run_batch
     from disctrack.chessboard_views import calibrate_recording, calibrate_views, find_views
     from disctrack.derivatives import differentiate
     from disctrack.disc import Disc
@@ -51,6 +53,7 @@ _HOME = {
     "overlay": ("write_overlay",),
     "derivatives": ("differentiate",),
     "analyse": ("Analysis", "run_analyse"),
+    "batch": ("run_batch",),
     "errors": ("DiscTrackError",),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -82,6 +85,7 @@ __all__ = [  # noqa: RUF022 (in the order of the measurement, not of the alphabe
     "differentiate",
     "run_analyse",
     "Analysis",
+    "run_batch",
     "DiscTrackError",
 ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from typing import Any
 
@@ -13,6 +14,7 @@ from disctrack.batch.records import Result
 from disctrack.errors import ClusterError
 
 CONNECT = 10.0  # [s]
+POLL = 0.1  # [s]
 RETRIES = 3  # of a job whose worker was lost with it, each on another worker
 
 
@@ -25,6 +27,7 @@ def connect(address: str) -> Any:
             "--cluster needs dask.distributed: install disctrack[cluster], here and on the cluster's machines, or "
             "leave --cluster out."
         ) from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is told here
     try:
         client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
     except (OSError, TimeoutError, ValueError, TypeError) as error:
@@ -51,14 +54,17 @@ def run_on_cluster(client: Any, jobs: JobQueue, share: Share) -> None:
             for future in ready:
                 _collect(jobs, pending.pop(future), future)
             if not ready:
-                _check_connection(client)
-                time.sleep(0.1)
+                time.sleep(POLL)
     finally:
         with contextlib.suppress(Exception):  # the scheduler may have gone
             client.cancel(list(pending), force=True)
 
 
 def _collect(jobs: JobQueue, job: Job, future: Any) -> None:
+    if future.cancelled():  # not by us
+        raise ClusterError(
+            "the connection to the cluster's scheduler was lost. What is finished is kept; the same command continues."
+        )
     try:
         answer = future.result()
     except Exception as error:  # the worker was lost too often, or the task could not even be started there
@@ -69,11 +75,3 @@ def _collect(jobs: JobQueue, job: Job, future: Any) -> None:
         jobs.died(job, answer["died"])
     else:
         jobs.finish(job, Result.from_dict(answer))
-
-
-def _check_connection(client: Any) -> None:
-    if client.status not in ("running", "connecting"):
-        raise ClusterError(
-            f"the connection to the cluster's scheduler was lost (status {client.status}). What is finished is kept; "
-            "the same command continues."
-        )

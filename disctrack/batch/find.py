@@ -25,7 +25,7 @@ class Found:
     def name(self, recording: Path) -> str:
         """The recording's place below `base`, with slashes: unique, and the same on every machine."""
         relative = Path(os.path.relpath(recording, self.base)).as_posix()
-        return recording.name if relative == "." else relative
+        return recording.name if relative == "." and len(self.recordings) == 1 else relative
 
 
 def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> Found:

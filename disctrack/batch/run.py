@@ -15,9 +15,11 @@ from disctrack.batch.plan import BatchOptions, Job, Places, Plan, Shard, make_pl
 from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
 from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
-from disctrack.errors import OutputError
+from disctrack.errors import ClusterError, OutputError
 from disctrack.readers.blocks import default_threads
 from disctrack.whole_files import check_writable
+
+INTERRUPTED = "interrupted before it was done"
 
 
 @dataclass(frozen=True)
@@ -74,13 +76,13 @@ def run_batch(
         results = {name: Result.failed(reason) for name, reason in plan.failures.items()}
         cores = default_threads()
         n = side_by_side or cores
-        interrupted = _do(plan, results, n if client is None else None, cores, client)
+        stopped = _do(plan, results, n if client is None else None, cores, client)
     finally:
         if client is not None:
             client.close()
     for job in plan.recordings:
-        results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, "interrupted before it was done")))
-    return _summed_up(places, mine, results, options, interrupted)
+        results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, stopped)))
+    return _summed_up(places, mine, results, options, stopped == INTERRUPTED)
 
 
 def summarise_batch(
@@ -97,8 +99,8 @@ def _places(folders: Sequence[Path], output: Path | None) -> Places:
     return Places(found, output)
 
 
-def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> bool:
-    """Fill `results` with what becomes of the plan's recordings; True if the user interrupted it."""
+def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> str:
+    """Fill `results` with what becomes of the plan's recordings; returns why some have none."""
     recordings = with_threads(plan.recordings, cores, n) if n is not None else plan.recordings
     with _Bar(plan, len(results)) as bar:
 
@@ -114,8 +116,10 @@ def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, clien
             else:
                 run_on_cluster(client, jobs, bar.share)
         except KeyboardInterrupt:
-            return True
-    return False
+            return INTERRUPTED
+        except ClusterError as error:
+            return str(error)
+    return ""
 
 
 def _summed_up(

@@ -51,10 +51,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.summary_only:
         outcome = summarise_batch(arguments.folders, options, arguments.output)
     else:
-        signal.signal(signal.SIGTERM, _interrupt)  # as queueing systems end a job whose time is over
-        outcome = run_batch(
-            arguments.folders, options, arguments.output, arguments.jobs, arguments.shard, arguments.cluster
-        )
+        before = signal.signal(signal.SIGTERM, _interrupt)  # as queueing systems end a job whose time is over
+        try:
+            outcome = run_batch(
+                arguments.folders, options, arguments.output, arguments.jobs, arguments.shard, arguments.cluster
+            )
+        finally:
+            signal.signal(signal.SIGTERM, before)
     files = [outputs.relative(file) for file in outcome.files]
     print("\n".join([*outcome.lines(), *summary.file_lines(files)]))
     _tell_problems(outcome)

@@ -10,13 +10,14 @@ import time
 import pytest
 
 from disctrack.batch import locks
+from disctrack.batch.cluster import run_on_cluster
 from disctrack.batch.find import find_recordings
 from disctrack.batch.jobs import JobQueue
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job, Shard
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
-from disctrack.errors import RecordingError
+from disctrack.errors import ClusterError, RecordingError
 
 GOOD = Result(MEASURED, Record(MEASURED))
 
@@ -43,6 +44,8 @@ def test_recordings_are_found_at_any_depth_in_natural_order_and_results_are_not_
     assert "out/copy" in names_of(find_recordings([root]))
     assert "out/copy" not in names_of(find_recordings([root], leave_out=[out]))
     assert names_of(find_recordings([root / "r3"])) == ["r3"]
+    recordings_at(root / "r3", "r3")
+    assert names_of(find_recordings([root / "r3"])) == [".", "r3"]
 
 
 def test_no_folder_and_no_recording_are_told_apart(tmp_path):
@@ -127,6 +130,53 @@ def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone(result
     assert jobs.finished
     assert results["recording", "a"].record.reason == "twice, killed"
     assert results["recording", "b"].status == MEASURED
+
+
+class Future:
+    """As dask's: done, with an answer, an error, or cancelled."""
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def done(self):
+        return True
+
+    def cancelled(self):
+        return self.answer is None
+
+    def result(self):
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+class Client:
+    """Gives one answer after the other, whatever it is asked."""
+
+    def __init__(self, *answers):
+        self.answers = list(answers)
+
+    def submit(self, *given, **options):
+        return Future(self.answers.pop(0))
+
+    def cancel(self, futures, force):
+        assert not any(isinstance(future.answer, dict) for future in futures)
+
+
+def test_answers_of_a_cluster_are_results_deaths_and_failures(results):
+    jobs = queue_of([], [job("a"), job("b"), job("c")], results)
+    client = Client(GOOD.as_dict(), {"died": "killed"}, RuntimeError("worker lost too often"), GOOD.as_dict())
+    run_on_cluster(client, jobs, lambda job, share: None)
+    assert jobs.finished
+    assert {name: result.status for (_, name), result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
+    assert "worker lost too often" in results["recording", "c"].record.reason
+
+
+def test_a_lost_scheduler_is_told_and_no_recording_is_blamed(results):
+    jobs = queue_of([], [job("a"), job("b")], results)
+    with pytest.raises(ClusterError, match="scheduler was lost"):
+        run_on_cluster(Client(GOOD.as_dict(), None), jobs, lambda job, share: None)
+    assert set(results) == {("recording", "a")}
 
 
 def test_reasons_are_one_line_and_say_what_to_do():
