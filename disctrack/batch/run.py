@@ -149,8 +149,7 @@ class _Bar:
     def __enter__(self) -> _Bar:
         self._bar = tqdm(
             total=sum(job.work for job in self._jobs),
-            desc="batch",
-            bar_format="{desc} {percentage:3.0f}%|{bar}| {postfix} [{elapsed}<{remaining}]",
+            bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]",
             disable=None,
             leave=False,
             smoothing=0.1,
@@ -178,4 +177,4 @@ class _Bar:
 
     def _tell(self) -> None:
         failed = f", {self._n_failed} failed" if self._n_failed else ""
-        self._bar.set_postfix_str(f"{self._finished} of {self._n} recordings{failed}")
+        self._bar.set_description_str(f"{self._finished} of {self._n} recordings{failed}")
