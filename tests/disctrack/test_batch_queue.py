@@ -2,21 +2,26 @@
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from urllib.parse import unquote
 
 import pytest
 
 from disctrack.batch import locks
 from disctrack.batch.cluster import run_on_cluster
+from disctrack.batch.columns import COLUMNS
 from disctrack.batch.find import find_recordings
+from disctrack.batch.index import page
 from disctrack.batch.jobs import JobQueue
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job, Shard
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
+from disctrack.batch.summary import line_of
 from disctrack.errors import ClusterError, RecordingError
 
 GOOD = Result(MEASURED, Record(MEASURED))
@@ -240,3 +245,34 @@ def test_a_disk_without_locks_is_locked_by_a_file_and_a_dead_holders_file_is_cle
     os.utime(holder, (old, old))
     with locked(path, wait=5.0):
         pass
+
+
+def row(**known):
+    return dict.fromkeys(COLUMNS) | {"recording": "r", "status": MEASURED, "reason": ""} | known
+
+
+def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as_text():
+    there = row(
+        recording="day <1>/r #2",
+        pairs=10,
+        pairs_measured=9,
+        report="../day <1>/r #2/results/report.html",
+        k_m_m_s2=3.81e-8,
+        k_m_sigma_m_s2=1e-11,
+        k_m_reduced_chi_square=23.9,
+    )
+    lost = row(recording="x", status=FAILED, reason="<b>no</b> rig")
+    text = page([there, lost])
+    (link,) = [a for a in re.findall(r'href="([^"]+)"', text) if "report" in a]
+    assert unquote(link) == there["report"]
+    assert "#" not in link
+    assert "day &lt;1&gt;/r #2" in text
+    assert "&lt;b&gt;no&lt;/b&gt; rig" in text
+    assert "3.8100 ± 0.0010 (model: χ² 23.9)" in text
+    assert "9 / 10" in text
+
+
+def test_a_line_warns_where_the_model_lacks_something():
+    measured = row(pairs=10, pairs_measured=10, k_m_m_s2=3.81e-8, k_m_sigma_m_s2=1e-11, k_m_reduced_chi_square=1.01)
+    assert "lacks" not in line_of(measured, 3)
+    assert "lacks something (chi-square 23.9)" in line_of(measured | {"k_m_reduced_chi_square": 23.9}, 3)

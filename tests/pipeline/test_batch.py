@@ -5,9 +5,11 @@ import csv
 import ctypes
 import json
 import os
+import re
 import resource
 import shutil
 from pathlib import Path
+from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -322,3 +324,30 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(recordi
     finally:
         recording.chmod(0o755)
     assert not (recording / "results").exists()
+
+
+@pytest.mark.slow
+def test_the_index_links_the_reports_and_compares_repeats(sample_clip, rig_file, tmp_path):
+    """Two parts of one motion: on a common clock they are the same, and the comparison must say so."""
+    text = (sample_clip / "recording.toml").read_text()
+    start, end = text.index("[calibration]"), text.index("[gravity]")
+    for name, frames in (("run 1", slice(0, 300)), ("run 2", slice(15, 300))):
+        for camera in ("left", "right"):
+            (tmp_path / name / camera).mkdir(parents=True)
+            for file in sorted((sample_clip / camera).iterdir())[frames]:
+                (tmp_path / name / camera / file.name).symlink_to(file)
+        declared = text.replace("sample clip", name)
+        declared = declared.replace(text[start:end], f'[calibration]\nrig = "{rig_file.as_posix()}"\n\n')
+        (tmp_path / name / "recording.toml").write_text(declared)
+    outcome = run_batch([tmp_path])
+    assert not outcome.problems
+    page = tmp_path / "batch_results" / "index.html"
+    links = [unquote(link) for link in re.findall(r'href="([^"]+\.html)"', page.read_text())]
+    assert len(links) == 2
+    assert all((page.parent / link).is_file() for link in links)
+    assert "the 2 runs agree" in page.read_text()
+    one, two = outcome.rows
+    later = one["t_f_s"] - two["t_f_s"]  # the second begins 15 ms later
+    assert later == pytest.approx(0.015, abs=4 * np.hypot(one["t_f_sigma_s"], two["t_f_sigma_s"]))
+    sigma = np.hypot(one["k_m_sigma_m_s2"], two["k_m_sigma_m_s2"])
+    assert one["k_m_m_s2"] == pytest.approx(two["k_m_m_s2"], abs=4 * sigma)
