@@ -16,8 +16,10 @@ from scipy import stats
 Array = NDArray[np.float64]
 
 CONSISTENT = 0.05  # probability of a larger chi-square below which the runs are said not to agree
-# Probability, over all runs of a group, that one is pointed at by chance, per quantity.
-FALSE_OUTLIER = 0.02
+# Probability, over all runs of a group, that one is pointed at by chance, per quantity: where the others agree within
+# their sigmas, and where their scatter has to stand in for these (the usual level of Grubbs' test).
+FALSE_OUTLIER = 0.01
+FALSE_OUTLIER_OF_SCATTER = 0.05
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class Average:
     def sigma(self) -> float:
         """Of the weighted mean; the scatter counts where it is larger than stated."""
         return self.sigma_internal * max(1.0, self.birge_ratio if np.isfinite(self.birge_ratio) else 1.0)
+
+    @property
+    def best(self) -> tuple[float, float]:
+        """Value and sigma to quote: weighted while the runs agree; otherwise all count alike, and the scatter tells."""
+        return (self.weighted, self.sigma) if self.agree else (self.mean, self.standard_error)
 
     @property
     def agree(self) -> bool:
@@ -81,12 +88,12 @@ def average(values: Sequence[float] | Array, sigmas: Sequence[float] | Array) ->
         degrees_of_freedom=n - 1,
         p_value=float(stats.chi2.sf(chi_square, n - 1)) if n > 1 else nan,
         birge_ratio=birge,
-        outliers=tuple(int(rows[i]) for i in range(n) if n > 2 and departure(v, s, i) < FALSE_OUTLIER / n),
+        outliers=tuple(int(rows[i]) for i in range(n) if n > 2 and stands_apart(v, s, i)),
     )
 
 
-def departure(values: Array, sigmas: Array, i: int) -> float:
-    """Probability of a value as far from the others as value i, if it were one of them.
+def stands_apart(values: Array, sigmas: Array, i: int) -> bool:
+    """True where value i lies farther from the others than chance would put one of them.
 
     The others' scatter beyond their sigmas (moment estimate of DerSimonian & Laird 1986) is granted to value i, too;
     where it is needed it is known from n - 2 degrees of freedom only, and Student's t replaces the normal law.
@@ -99,7 +106,14 @@ def departure(values: Array, sigmas: Array, i: int) -> float:
     agree = stats.chi2.sf(chi_square, dof) >= CONSISTENT
     mean, sigma = _weighted(others, np.sqrt(own**2 + beyond))
     t = abs(values[i] - mean) / np.sqrt(sigmas[i] ** 2 + beyond + sigma**2)
-    return float(2 * (stats.norm.sf(t) if agree else stats.t.sf(t, dof)))
+    return improbable(float(t), len(values), bool(agree))
+
+
+def improbable(t: float, n: int, others_agree: bool) -> bool:
+    """True where one of n runs is t sigmas away; sigmas from the scatter of the others unless these agree."""
+    if others_agree:
+        return bool(2 * stats.norm.sf(t) < FALSE_OUTLIER / n)
+    return bool(2 * stats.t.sf(t, n - 2) < FALSE_OUTLIER_OF_SCATTER / n)
 
 
 def _weighted(values: Array, sigmas: Array) -> tuple[float, float]:

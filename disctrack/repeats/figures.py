@@ -139,10 +139,9 @@ def fitted_figure(table: ExponentTable, number: int) -> Drawn | None:
     for axes, name in zip(grid, shown, strict=True):
         dress(axes)
         scale, mean = FITTED_SCALES[name], table.averages[name]
-        axes.axvspan(
-            scale * (mean.weighted - mean.sigma), scale * (mean.weighted + mean.sigma), color=MUTED, alpha=0.25, lw=0
-        )
-        axes.axvline(scale * mean.weighted, color=MUTED, linewidth=1.0)
+        value, sigma = mean.best
+        axes.axvspan(scale * (value - sigma), scale * (value + sigma), color=MUTED, alpha=0.25, lw=0)
+        axes.axvline(scale * value, color=MUTED, linewidth=1.0)
         for i, (group, _, run) in enumerate(table.rows):
             item = run.fitted[name]
             face = "white" if i in mean.outliers else None
@@ -153,10 +152,20 @@ def fitted_figure(table: ExponentTable, number: int) -> Drawn | None:
         axes.xaxis.set_major_locator(MaxNLocator(3))
         axes.set_title(f"{FITTED_LABELS[name]}\n{plus_minus(mean, scale)}", fontsize=9, color=INK)
     grid[0].set_yticks(height, [f"{run.name}" for _, _, run in table.rows], fontsize=8)
-    caption = "Fitted to each run, ± 1 σ; band: weighted mean with its σ. Open: away from all others."
+    caption = "Fitted to each run, ± 1 σ; band: mean with its σ, weighted where runs agree. Open: away from all others."
     return Drawn(f"fitted_{number:02d}", f"Exponents and k_m. {table.title}", caption, figure)
 
 
 def plus_minus(average: Average, scale: float = 1.0) -> str:
-    """Weighted mean with its sigma."""
-    return f"{scale * average.weighted:.4f} ± {scale * average.sigma:.4f}" if average.n else "not determined"
+    """The mean to quote with its sigma."""
+    return with_sigma(*(scale * v for v in average.best)) if average.n else "not determined"
+
+
+def with_sigma(value: float, sigma: float) -> str:
+    """Value ± sigma with two digits of the sigma, and four decimals at least."""
+    if not np.isfinite(value):
+        return "not determined"
+    if not (np.isfinite(sigma) and sigma > 0):
+        return f"{value:.4f}"
+    decimals = int(np.clip(np.ceil(-np.log10(sigma)) + 1, 4, 9))
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"

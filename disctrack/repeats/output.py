@@ -15,7 +15,7 @@ import numpy as np
 
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import Comparison, ExponentTable, RepeatGroup
-from disctrack.repeats.figures import FITTED_SCALES, fitted_figure, group_figures, slug
+from disctrack.repeats.figures import FITTED_SCALES, fitted_figure, group_figures, slug, with_sigma
 from disctrack.repeats.runs import FITTED, INDEX, QUANTITIES, Measured, Run
 from disctrack.repeats.spread import Spread
 from disctrack.report import STYLE, draw, gallery, html_table
@@ -66,8 +66,9 @@ def write(comparison: Comparison, folder: Path) -> Written:
 
 def _lead(comparison: Comparison) -> str:
     n, several = sum(len(g.runs) for g in comparison.groups), sum(len(g.runs) > 1 for g in comparison.groups)
+    groups = len(comparison.groups)
     return (
-        f"{n} recordings in {len(comparison.groups)} groups, {several} of them with repeats; "
+        f"{n} recordings in {groups} group{'s' * (groups != 1)}, {several} with repeats; "
         f"{len(comparison.left_out)} files could not be compared."
     )
 
@@ -81,7 +82,7 @@ def _table_section(table: ExponentTable, figure: Any, pictures: dict[str, str]) 
     for label, cell in (
         ("mean ± standard error of the scatter", lambda n, a: _two(n, a.mean, a.standard_error)),
         ("weighted mean ± σ", lambda n, a: _two(n, a.weighted, a.sigma)),
-        ("χ² / degrees of freedom", lambda n, a: f"{a.chi_square:.1f} / {a.degrees_of_freedom}" if a.n > 1 else ""),
+        ("χ² / degrees of freedom", lambda n, a: f"{a.chi_square:.3g} / {a.degrees_of_freedom}" if a.n > 1 else ""),
         ("Birge ratio", lambda n, a: f"{a.birge_ratio:.2f}" if a.n > 1 else ""),
     ):
         cells = [cell(n, table.averages[n]) if n in table.averages else "-" for n in FITTED]
@@ -110,9 +111,7 @@ def _cell(name: str, item: Measured) -> str:
 
 def _two(name: str, value: float, sigma: float) -> str:
     scale = FITTED_SCALES.get(name, 1.0)
-    if not np.isfinite(value):
-        return "not determined"
-    return f"{scale * value:.4f}" + (f" ± {scale * sigma:.4f}" if np.isfinite(sigma) else "")
+    return with_sigma(scale * value, scale * sigma)
 
 
 def _group_section(group: RepeatGroup, figures: Sequence[Any], pictures: dict[str, str]) -> str:
@@ -201,7 +200,9 @@ def _run_json(run: Run) -> dict[str, Any]:
 
 
 def _average_json(item: Average) -> dict[str, Any]:
-    return {**asdict(item), "sigma": item.sigma, "agree": item.agree, "verdict": item.verdict}
+    value, sigma = item.best
+    return {"value": value, "value_sigma": sigma, **asdict(item), "sigma": item.sigma, "agree": item.agree,
+            "verdict": item.verdict}  # fmt: skip
 
 
 def _spread_json(found: Spread | None) -> dict[str, Any] | None:
@@ -239,12 +240,12 @@ def _runs_table(comparison: Comparison) -> Iterable[Sequence[Any]]:
 def _averages_table(comparison: Comparison) -> Iterable[Sequence[Any]]:
     fields = ("n", "mean", "standard_error", "weighted", "sigma", "sigma_internal", "sigma_external", "chi_square",
               "degrees_of_freedom", "p_value", "birge_ratio", "agree")  # fmt: skip
-    yield ["over", "quantity", *fields]
+    yield ["over", "quantity", "value", "value_sigma", *fields]
     sets = [(table.title, table.averages) for table in comparison.tables]
     sets += [(group.name, group.averages) for group in comparison.groups if len(group.runs) > 1]
     for name, averages in sets:
         for quantity, item in averages.items():
-            yield [name, quantity, *(getattr(item, field) for field in fields)]
+            yield [name, quantity, *item.best, *(getattr(item, field) for field in fields)]
 
 
 def _spread_table(found: Spread) -> Iterable[Sequence[Any]]:

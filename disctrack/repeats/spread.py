@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from disctrack.repeats.alignment import Alignment, Curves
-from disctrack.repeats.averages import CONSISTENT, FALSE_OUTLIER
+from disctrack.repeats.averages import CONSISTENT, improbable
 from disctrack.repeats.runs import INDEX, QUANTITIES
 
 Array = NDArray[np.float64]
@@ -179,8 +179,6 @@ def _standing_out(value: Array, parts: Sequence[Part]) -> tuple[str, ...]:
             away = float(np.nanmean((v[i] - others.mean(axis=0)) ** 2))
             own = float(np.nanmean(others.var(axis=0, ddof=1)))
             t = np.sqrt(away / (max(own, measured) * (1 + 1 / (n - 1))))
-            # what the others scatter beyond the measurement is known from n - 2 degrees of freedom
-            law = stats.norm.sf if own < 2 * measured else (lambda x: stats.t.sf(x, n - 2))
-            if 2 * law(t) < FALSE_OUTLIER / n:
+            if improbable(float(t), n, own < 2 * measured):
                 found[i].append(f"{QUANTITIES[INDEX[name]].symbol} ({t:.1f} times the spread of the others)")
     return tuple(", ".join(words) for words in found)
