@@ -29,6 +29,8 @@ from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 Array = NDArray[np.float64]
 Progress = Callable[[int], None]
 
+WHOLE_BELOW = 2.0  # [s] a recording as short as this was cut to what is wanted, and rest in it is wanted too
+
 
 @dataclass(frozen=True)
 class ImagePairs:
@@ -180,6 +182,8 @@ def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, thre
     """What is to be tracked of the pairs."""
     if not settings.first_pass:
         return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame, as asked for")
+    if len(pairs) < WHOLE_BELOW * frame_rate:
+        return MotionSpan(pairs.start, pairs.stop, 0, True, f"every frame of a recording below {WHOLE_BELOW:g} s")
     if not (pairs.left.random_access and pairs.right.random_access):
         return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame: these files can only be read in order")
     return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate, threads)
