@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from threading import Event
+from threading import Event, Lock
 from typing import Protocol
 
 import numpy as np
@@ -221,7 +221,8 @@ def track(
     read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; pairs: which to measure (step 1).
     frame_rate [Hz]; timestamps (len(pairs),) [s] where the camera wrote them. workers: threads that follow stretches
     of a long recording side by side; the result is the same to the last bit for any number of them, if the reader
-    begins a block at each of `stretch_edges`. progress(n) is called when n more pairs are done, from any thread.
+    begins a block at each of `stretch_edges`. progress(n) is called when n more pairs are done, from any thread but one
+    at a time.
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
     settings = settings or TrackingSettings()
@@ -255,7 +256,7 @@ def track(
     for number, follower in enumerate(followers):
         follower.given = partial(_first_law, followers[:number])
 
-    given_up = Event()
+    given_up, telling = Event(), Lock()
 
     def follow(share: range) -> None:
         """Follow the disc through neighbouring stretches."""
@@ -270,7 +271,8 @@ def track(
                     rows = slice(part.start - int(block.frames[0]), part.stop - int(block.frames[0]))
                     at = part.start - pairs.start
                     _follow_block(followers[number], block.images[rows], block.readable[rows], tables, at)
-                progress(len(block.images))
+                with telling:
+                    progress(len(block.images))
                 if given_up.is_set():
                     break
         finally:  # nobody may wait for what will not come
