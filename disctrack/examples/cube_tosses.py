@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.general import document, fit_errors, memory, portmanteau
+from disctrack.diagnosis.held_out import held_out
+from disctrack.diagnosis.search import CLASS_GAIN
 from disctrack.diagnosis.system import Subset, Values
 from disctrack.diagnosis.words import quantity_text
 from disctrack.examples._command import Outcome, command, dress
@@ -42,6 +44,18 @@ Array = NDArray[np.float64]
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
 LAGS = 5  # samples, of the portmanteau test
 SEEN = 0.6  # share of a held-out flight from which the rest is forecast
+# What else might be meant by an effect that was found, to be tried in its place.
+IN_PLACE = {
+    "length_scale": (
+        ("gravity",),
+        ("gravity", "half_width"),
+        ("frame_rate", "half_width"),
+        ("gravity", "table_height"),
+    ),
+    "toss_tilt": (("side_force",), ("frame_rotation",), ("tilt",)),
+    "perspective": (("linear_drag",), ("quadratic_drag",)),
+    "centre_of_mass": (("face_bias",),),
+}
 ONE_NUMBER = ("gravity", "frame_rate", "length_scale")  # to free flight
 
 
@@ -54,6 +68,21 @@ class Errors:
 
 
 @dataclass(frozen=True)
+class Alternative:
+    """Other effects fitted in place of one that was found."""
+
+    effect: str
+    instead: tuple[str, ...]
+    criterion: float  # chi-square plus the Bayesian criterion's price, minus that of what was found
+    held_out: float  # 2 ln p of held-out tosses, minus that of what was found
+
+    @property
+    def equal(self) -> bool:
+        """True where the data do not tell them apart."""
+        return self.criterion < CLASS_GAIN and self.held_out > -CLASS_GAIN
+
+
+@dataclass(frozen=True)
 class CubeAnswer:
     """Everything asked of the tosses."""
 
@@ -63,6 +92,7 @@ class CubeAnswer:
     after: Errors
     without: dict[str, Errors]  # with one effect taken out again, the rest refitted
     pull: dict[str, float]  # largest difference of its values, fitted tosses against held-out ones, in sigmas
+    alternatives: tuple[Alternative, ...]
     left_over_white: dict[str, dict[str, float]]  # before and after: mean square over the white noise alone
     checks: dict[str, tuple[float, float]]  # other numbers of the same tosses, with standard errors
 
@@ -83,13 +113,14 @@ def analyse_tosses(tosses: Sequence[Toss]) -> CubeAnswer:
         without[candidate.name] = errors_of(system, fit(training, rest, {}).values)
     held = fit(Subset(system, ~rows), tuple(dict.fromkeys(q for c in found for q in c.quantities)), {})
     pull = {c.name: max(_pull(diagnosis, held, q.name) for q in c.quantities) for c in found}
+    others = alternatives(system, diagnosis)
     also = checks(tosses, system.flights)
     over_white = {
         "before": white_chi_square(system, diagnosis.before.values),
         "after": white_chi_square(system, diagnosis.after.values),
     }
     return CubeAnswer(
-        system, diagnosis, errors_of(system, {}), errors_of(system, trained), without, pull, over_white, also
+        system, diagnosis, errors_of(system, {}), errors_of(system, trained), without, pull, others, over_white, also
     )
 
 
@@ -98,6 +129,27 @@ def _pull(diagnosis: Diagnosis, held: Fit, name: str) -> float:
     fitted = diagnosis.held_out_after.train
     sigma = np.hypot(fitted.sigma(name), held.sigma(name))
     return abs(fitted.values[name] - held.values[name]) / sigma if sigma > 0 else 0.0
+
+
+def alternatives(system: CubeTosses, diagnosis: Diagnosis) -> tuple[Alternative, ...]:
+    """IN_PLACE, for the effects that were found; the rest of them is refitted along."""
+    if diagnosis.held_out_after is None:
+        return ()
+    catalogue = {c.name: c for c in system.candidates}
+    found = [f.candidate for f in diagnosis.found]
+    price = float(np.log(np.sum(system.weights)))
+    answers = []
+    for candidate in found:
+        for instead in IN_PLACE.get(candidate.name, ()):
+            rest = [c for c in found if c is not candidate and c.name not in instead]
+            quantities = tuple(q for c in (*rest, *(catalogue[n] for n in instead)) for q in c.quantities)
+            other = fit(system, quantities, {})
+            more = len(quantities) - len(diagnosis.after.quantities)
+            held = held_out(system, quantities, {}, system.training_rows())
+            gain = 2 * (held.log_density - diagnosis.held_out_after.log_density)
+            criterion = other.cost - diagnosis.after.cost + price * more
+            answers.append(Alternative(candidate.name, instead, float(criterion), float(gain)))
+    return tuple(answers)
 
 
 def errors_of(system: CubeTosses, values: Values) -> Errors:
@@ -125,12 +177,13 @@ def sentence(answer: CubeAnswer) -> str:
         )
         effects.append(f"{f.candidate.title} ({amounts})")
     text = "Missing: " + "; ".join(effects) if effects else "No effect is claimed to be missing"
-    smooth = answer.system.noise["horizontal"]
-    return (
-        f"{text}. What is left are errors of the poses with a memory of {1e3 * smooth.memory:.0f} ms: {d.reason}."
-        if d.verdict != "unexplained"
-        else f"{text}. Something else is missing: {d.reason}."
+    if d.verdict == "unexplained":
+        return f"{text}. Something else is missing: {d.reason}."
+    left = ", ".join(
+        f"{_people(k, n.smooth):.0f} {'mdeg' if k == 'turn' else 'um'} ({k}) for {1e3 * n.memory:.0f} ms"
+        for k, n in answer.system.noise.items()
     )
+    return f"{text}. What remains, beside white noise, are errors of the poses that last some samples: {left}."
 
 
 def _units(values: Mapping[str, float]) -> dict[str, float]:
@@ -167,6 +220,7 @@ def as_document(answer: CubeAnswer) -> dict[str, Any]:
         "without": {
             k: {"rms": _units(e.rms), "forecast_end": _units(e.forecast_end)} for k, e in answer.without.items()
         },
+        "alternatives": [vars(a) | {"equal": a.equal} for a in answer.alternatives],
         "pull_of_held_out_values": answer.pull,
         "checks": {k: list(v) for k, v in answer.checks.items()},
         "flights": len(system.flights),
@@ -216,6 +270,12 @@ def table(answer: CubeAnswer) -> str:
     lines += [
         "",
         "Not taken: " + "; ".join(f"{t.candidate.name} ({t.reason})" for t in d.tried if t.reason != "chosen"),
+    ]
+    lines += ["", "In place of an effect (criterion above, held-out 2 ln p below what was chosen):"]
+    lines += [
+        f"  {a.effect}: {' + '.join(a.instead)} {a.criterion:+.0f}, {a.held_out:+.0f}"
+        + (" (not told apart)" if a.equal else "")
+        for a in answer.alternatives
     ]
     lines += ["", "One number to free flight: " + ", ".join(ONE_NUMBER) + "; the height at rest separates the last."]
     for group, n in system.noise.items():

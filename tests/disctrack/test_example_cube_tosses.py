@@ -121,6 +121,14 @@ def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of
         assert answer.after.forecast_end[group] < 0.5 * answer.before.forecast_end[group]
 
 
+def test_resting_cubes_part_the_scale_from_gravity_alone_but_not_from_gravity_and_size_together(answer):
+    others = {(a.effect, a.instead): a for a in answer.alternatives}
+    assert others["length_scale", ("gravity",)].criterion > 500
+    assert others["length_scale", ("gravity", "half_width")].criterion < 60
+    assert others["toss_tilt", ("frame_rotation",)].criterion > 100
+    assert others["toss_tilt", ("tilt",)].criterion > 500
+
+
 def test_other_columns_and_contacts_of_the_published_tosses_agree(answer):
     checks = {key.partition(",")[0].partition(" [")[0]: value for key, value in answer.checks.items()}
     delay, _ = checks["delay of the published velocities"]
