@@ -113,26 +113,28 @@ def _form(system: BallDrops, base: Fit, effects: tuple[str, ...]) -> Form:
 
 
 def errors_of(drops: Sequence[Drop], form: str | None) -> Errors:
-    """Least squares without a model of the noise: a law fitted to drop 1, errors on drop 2."""
-    whole: dict[str, float] = {}
-    forecast: dict[str, float] = {}
-    for name in dict.fromkeys(d.ball.name for d in drops):
-        pair = [d for d in drops if d.ball.name == name]
-        if [d.number for d in pair] != [1, 2]:
-            continue
-        system = BallDrops(pair, _WHITE)
-        law = _quantities(system, [form] if form else [])
-        first, second = system.number == 1, (system.number == 2) & (system.weights > 0)
-        values = fit(Subset(system, first), (*system.base[:2], *law), system.start()).values
-        drop = pair[1]
-        for rows, answer, part in (
-            (second, whole, np.ones(len(drop.time), bool)),
-            (second & (system.time <= SEEN), forecast, drop.time > SEEN),
-        ):
-            start = fit(Subset(system, rows), system.base[2:], values)
-            left = drop.height - system.predicted(start.values)[1]
-            answer[name] = float(np.sqrt(np.mean(left[part] ** 2)))
-    return Errors(whole, forecast)
+    """Least squares without a model of the noise: a law fitted to drops 1, errors on drops 2 of the same balls."""
+    numbers: dict[str, list[int]] = {}
+    for drop in drops:
+        numbers.setdefault(drop.ball.name, []).append(drop.number)
+    pairs = [d for d in drops if sorted(numbers[d.ball.name]) == [1, 2]]
+    if not pairs:
+        return Errors({}, {})
+    system = BallDrops(pairs, _WHITE)
+    law = _quantities(system, [form] if form else [])
+    starts = {k: tuple(q for i, d in enumerate(pairs) if d.number == k for q in system.own(i)) for k in (1, 2)}
+    values = fit(Subset(system, system.number == 1), (*starts[1], *law), system.start()).values
+    second = system.number == 2
+    whole = fit(Subset(system, second), starts[2], values).values
+    begun = fit(Subset(system, second & (system.time <= SEEN)), starts[2], values).values
+    answers = []
+    for fitted, since in ((whole, -np.inf), (begun, SEEN)):
+        predicted = system.predicted(fitted)
+        left = {
+            d.ball.name: (d.height - h)[d.time > since] for d, h in zip(pairs, predicted, strict=True) if d.number == 2
+        }
+        answers.append({name: float(np.sqrt(np.mean(x**2))) for name, x in left.items()})
+    return Errors(*answers)
 
 
 def _median(errors: Mapping[str, float]) -> float:

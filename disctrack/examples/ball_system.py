@@ -150,6 +150,10 @@ class BallDrops:
         """Heights and velocities at rest at the first sample; every prediction is nearly linear in them."""
         return {q.name: q.null for q in self.base}
 
+    def own(self, drop: int) -> tuple[Quantity, ...]:
+        """Start and velocity of one drop."""
+        return self.base[2 * drop : 2 * drop + 2]
+
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
         """No candidate has a threshold."""
         return ()

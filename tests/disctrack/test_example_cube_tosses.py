@@ -12,7 +12,7 @@ from disctrack.examples.cube_system import CubeTosses, recursive_whitening
 from disctrack.examples.cube_tosses import SETTINGS, analyse_tosses, main
 from tests.oracles import tossed_cube
 
-N = 60  # tosses that are simulated
+N = 50  # tosses that are simulated
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def published(shared_data):
 
 @pytest.fixture(scope="module")
 def answer(published):
-    return analyse_tosses(published[:180])
+    return analyse_tosses(published[:150])
 
 
 def simulated(rng, folder, n=N, **hidden):
@@ -53,15 +53,13 @@ def test_recursive_residuals_of_noise_are_white_and_blind_to_the_motion(rng):
     ("hidden", "expected"),
     [
         ({}, {}),
-        ({"scale": -0.02}, {"length_scale.change": -0.02}),
-        ({"centre_of_mass": (0, 0, 3e-3)}, {"centre_of_mass.c_3": 3e-3}),
         (
             {"scale": 0.015, "centre_of_mass": (2e-3, 0, -1e-3)},
             {"length_scale.change": 0.015, "centre_of_mass.c_1": 2e-3, "centre_of_mass.c_3": -1e-3},
         ),
         ({"inertia": (1.08, 1.06, 1.0)}, {"principal_moments.e_11": 0.08, "principal_moments.e_22": 0.06}),
     ],
-    ids=["nothing", "scale", "centre of mass", "scale and centre of mass", "inertia"],
+    ids=["nothing", "scale and centre of mass", "inertia"],
 )
 def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hidden, expected):
     system = CubeTosses(simulated(rng, tmp_path, **hidden))
@@ -109,7 +107,7 @@ def test_some_published_tosses_are_copies_of_others_turned_about_the_vertical(pu
 
 
 def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of_mass(answer):
-    """The first 180 tosses; the figures of all of them are in the slow test."""
+    """The first 150 tosses; the figures of all of them are in the slow test."""
     assert answer.diagnosis.verdict == "found"
     assert {"length_scale", "toss_tilt", "centre_of_mass", "tag_axes"} <= named(answer.diagnosis)
     values = answer.diagnosis.after.values
