@@ -23,6 +23,8 @@ from disctrack.diagnosis.system import Candidate, Quantity, System, Values
 Array = NDArray[np.float64]
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
+FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
+MOST_RIVALS = 12
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -113,15 +115,15 @@ def diagnose(
     base = fit(system, system.base, start)
     if not base.converged:
         return _refusal(base, settings)
-    modes = common_modes(system, base) if settings.noise is None else None
+    answer = _Search(system, settings, rows).run(base)
+    if settings.noise is not None or answer.verdict == "unexplained":
+        return answer
+    # looked for only here: what a large effect does from frame to frame would pass for scatter
+    modes = common_modes(system, answer.after)
+    if modes is None:
+        return answer
     judged = whitened(system, modes)
-    answer = _Search(judged, settings, rows).run(base)
-    if modes is not None and answer.found:  # a large effect that moves fast looks like scatter of the frames
-        again = common_modes(system, answer.after)
-        if again is None or again[1].size < modes[1].size:
-            judged = whitened(system, again)
-            answer = _Search(judged, settings, rows).run(base)
-    return replace(answer, judged=None if judged is system else judged)
+    return replace(_Search(judged, settings, rows).run(base), judged=judged)
 
 
 def noise_variance(system: System, fit_: Fit) -> float:
@@ -356,7 +358,8 @@ class _Search:
         others = [c for c in self.system.candidates if c.name not in {d.name for d in trial.candidates}]
         angles = {c.name: angle(linear, signal, c.names) for c in others}
         near = sorted(others, key=lambda c: angles[c.name])
-        near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength][:6]
+        near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]
+        near = near[: MOST_RIVALS if strength < FAINT else MOST_RIVALS // 2]
         found = []
         for candidate in near:
             refitted = self._fit((*rest, candidate), _without(trial.fit.values, effect, rest))

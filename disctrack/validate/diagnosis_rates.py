@@ -1,7 +1,7 @@
 """How often does the diagnosis find, name and size what is hidden, and how often does it cry wolf?
 
     python -m disctrack.validate.diagnosis_rates --seeds 8 --controls 60 -o rates.json
-    python -m disctrack.validate.diagnosis_rates --smallest kz table_tilt
+    python -m disctrack.validate.diagnosis_rates kz=1e-7 table_tilt=3e-5
 
 Every trial draws a motion, a rig with a calibration error of its own, and the noise of the dots; plants an effect
 (`hidden_effects`); and hands the measured trajectory, which does not tell of it, to the diagnosis.
@@ -41,8 +41,6 @@ FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its pap
 DRAWS = 200
 ENOUGH = 3.0  # [sigma] a coefficient may be off
 AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
-STEP = 0.5  # between sizes of which the smallest found is sought
-FOUND_SHARE = 0.9
 
 
 @dataclass(frozen=True)
@@ -237,18 +235,6 @@ def rates(
     )
 
 
-def smallest(effect: HiddenEffect, seeds: Sequence[int], begin: float, rate: float = FRAME_RATE) -> Iterator[Rates]:
-    """Rates at halved sizes down to the first that is found in fewer than nine recordings of ten."""
-    size = begin
-    while True:
-        there = rates([effect], [size], seeds, rate)
-        yield there
-        if there.named < FOUND_SHARE * there.n:
-            return
-        # far above the threshold a longer step costs nothing: chi-square goes with the square of the size
-        size *= STEP if there.sigmas < 40 else 8.0 / there.sigmas
-
-
 def line(r: Rates) -> str:
     """One row of the table."""
     what = " + ".join(r.hidden) or "nothing"
@@ -266,14 +252,13 @@ HEADER = "| hidden | size | named | within 3 sigma | noise left | claim too many
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m disctrack.validate.diagnosis_rates", description=__doc__)
-    parser.add_argument("effects", nargs="*", metavar="EFFECT", help="effects to hide (default: all)")
+    parser.add_argument("effects", nargs="*", metavar="EFFECT[=SIZE]", help="effects to hide (default: all)")
     parser.add_argument("--seeds", type=int, default=6, help="recordings per effect (%(default)s)")
     parser.add_argument("--first-seed", type=int, default=1, help="the others count up from it")
     parser.add_argument("--controls", type=int, default=0, help="recordings in which nothing is hidden")
     parser.add_argument("--pairs", type=int, default=0, help="recordings in which two effects are hidden")
     parser.add_argument("--frame-rate", type=float, default=FRAME_RATE, help="in Hz (%(default)s)")
     parser.add_argument("--factor", type=float, default=1.0, help="on all sizes")
-    parser.add_argument("--smallest", action="store_true", help="go down to the smallest size found in 9 of 10")
     parser.add_argument("-v", "--verbose", action="store_true", help="say what was claimed where something was wrong")
     parser.add_argument("-o", "--output", type=Path, help="JSON file with every trial")
     return parser.parse_args()
@@ -286,9 +271,15 @@ def _pairs(effects: Sequence[HiddenEffect], number: int, seed: int) -> Iterator[
         yield effects[int(a)], effects[int(b)]
 
 
+def _at_size(text: str) -> HiddenEffect:
+    name, _, size = text.partition("=")
+    effect = hidden_effect(name)
+    return replace(effect, size=float(size)) if size else effect
+
+
 def _jobs(a: argparse.Namespace) -> Iterator[Rates]:
     seeds = range(a.first_seed, a.first_seed + a.seeds)
-    effects = [hidden_effect(name) for name in a.effects] or list(HIDDEN_EFFECTS)
+    effects = [_at_size(text) for text in a.effects] or list(HIDDEN_EFFECTS)
     if a.controls:
         yield rates([], [], range(a.first_seed, a.first_seed + a.controls), a.frame_rate)
     if a.pairs:
@@ -297,10 +288,7 @@ def _jobs(a: argparse.Namespace) -> Iterator[Rates]:
             yield rates(pair, [a.factor * e.size for e in pair], [a.first_seed + number], a.frame_rate)
     if not (a.controls or a.pairs) or a.effects:
         for effect in effects if not a.pairs else ():
-            if a.smallest:
-                yield from smallest(effect, seeds, a.factor * effect.size, a.frame_rate)
-            else:
-                yield rates([effect], [a.factor * effect.size], seeds, a.frame_rate)
+            yield rates([effect], [a.factor * effect.size], seeds, a.frame_rate)
 
 
 def _wrong(v: Verdict) -> bool:
@@ -316,7 +304,7 @@ def main() -> None:
     arguments = _arguments()
     done: list[Rates] = []
     print(HEADER, flush=True)
-    for r in _jobs(arguments):
+    for r in _jobs(arguments):  # one after the other: a long run shows what it has
         done.append(r)
         print(line(r), flush=True)
         if arguments.verbose:
@@ -333,4 +321,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except DiscTrackError as error:
+        raise SystemExit(f"disctrack: {error}") from None

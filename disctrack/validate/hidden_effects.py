@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.random import Generator
 
+from disctrack.errors import DiscTrackError
 from disctrack.scene import CameraFault, Faults, Triple
 from disctrack.validate.hidden import Unseen
 
@@ -191,5 +192,9 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
 
 
 def hidden_effect(name: str) -> HiddenEffect:
-    """By its name; raises KeyError."""
-    return next(e for e in HIDDEN_EFFECTS if e.name == name)
+    """By its name. Raises DiscTrackError."""
+    for effect in HIDDEN_EFFECTS:
+        if effect.name == name:
+            return effect
+    known = ", ".join(e.name for e in HIDDEN_EFFECTS)
+    raise DiscTrackError(f"there is no effect '{name}' to hide; there are {known}")
