@@ -117,8 +117,10 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
     until, sense = _end_of_rolling(motion)
     contact = analyse_contact(motion, circle_duration, until)
     if contact.onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
-        motion = differentiate(trajectory, breaks=(contact.onset.time,))
-        contact = replace(analyse_contact(motion, circle_duration, until), onset=contact.onset)
+        onset = contact.onset
+        del motion, contact  # the new ones need not stand beside them
+        motion = differentiate(trajectory, breaks=(onset.time,))
+        contact = replace(analyse_contact(motion, circle_duration, until), onset=onset)
     found = propagate(motion, rates)
     energy = analyse_energy(motion)
     theta_sigma = np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
