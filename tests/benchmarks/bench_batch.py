@@ -29,6 +29,7 @@ import cv2
 from calibration import CalibrationSettings
 from calibration.rig_file import read_rig
 from disctrack.analyse import analyse, run_analyse, write_analysis
+from disctrack.batch import read_summary
 from disctrack.batch.processes import ONE_THREAD
 from disctrack.calibration_stage import calibrate_into, source_of
 from disctrack.pipeline import measure, open_pairs
@@ -83,7 +84,7 @@ def compare(day: list[Path], report: bool, repeats: int) -> None:
         "one process, two threads per recording": lambda: with_two_threads(day, report),
     }
     with_two_threads(day[:1], report)  # compiles
-    best = dict.fromkeys(ways, (float("inf"), float("inf")))
+    best, busy = dict.fromkeys(ways, (float("inf"), float("inf"))), dict.fromkeys(ways, 0.0)
     for _ in range(repeats):
         for way, action in ways.items():
             for results in root.rglob("*results"):
@@ -91,15 +92,26 @@ def compare(day: list[Path], report: bool, repeats: int) -> None:
             used = processor()
             wall = action()
             best[way] = min(best[way][0], wall), min(best[way][1], processor() - used)
+            busy[way] = max(busy[way], in_recordings(root) / wall)
     pairs = sum(len(open_pairs(read_recording(folder))) for folder in day)
     (one, one_core), (two, two_cores), (independent, _), (threads, _) = best.values()
     print(f"{len(day)} recordings, {pairs} pairs, {'with' if report else 'without'} reports")
     for way, (seconds, cores) in best.items():
         rate, gain = f"{pairs / seconds:6.0f} pairs/s", f"{one / seconds:5.2f} x -j 1"
-        print(f"  {way:<44} {seconds:7.1f} s  {cores:7.1f} s of a core  {rate}  {gain}")
+        at_once = f"{busy[way]:4.2f} recordings at once" if busy[way] else ""
+        print(f"  {way:<44} {seconds:7.1f} s  {cores:7.1f} s of a core  {rate}  {gain}  {at_once}")
     print(f"  {'-j 2 / two independent processes, time':<44} {two / independent:7.2f}")
     print(f"  {'-j 2 / -j 1, time of a core':<44} {two_cores / one_core:7.2f}")
     print(f"  {'two threads / -j 2, time':<44} {threads / two:7.2f}")
+
+
+def in_recordings(root: Path) -> float:
+    """Seconds that the single recordings took, summed up: over the time of the whole, how many went side by side.
+
+    It leaves out what a batch costs besides: starting processes, planning, summing up. A busy machine slows both alike.
+    """
+    rows = [row for summary in root.rglob("summary.json") for row in read_summary(summary)]
+    return sum(row["seconds"] for row in rows)
 
 
 def processor() -> float:
