@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from disctrack.batch.jobs import JobQueue, Share
 from disctrack.batch.plan import Job
-from disctrack.batch.reasons import reason_of_death
+from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import Result
 
 # One thread each: side by side, more would wait for one another.
@@ -40,11 +40,20 @@ class Worker:
     """One process that does jobs one after the other; what it says goes into `events`."""
 
     def __init__(self, events: queue.Queue[tuple[Worker, dict[str, Any] | None]]) -> None:
-        """`events` gets (worker, message), and (worker, None) when the process has ended."""
+        """`events` gets (worker, message), and (worker, None) when the process has ended. Raises OSError."""
         self.job: Job | None = None
         self._events = events
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (as long as the process)
-        self._process = subprocess.Popen(
+        try:
+            self._process = self._started()
+        except OSError:
+            self._said.close()
+            raise
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    def _started(self) -> subprocess.Popen[str]:
+        return subprocess.Popen(
             [sys.executable, "-m", "disctrack.batch.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -53,7 +62,6 @@ class Worker:
             text=True,
             encoding="utf-8",
         )
-        threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
         assert self._process.stdout is not None
@@ -92,6 +100,7 @@ class Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._listener.join(1.0)  # it reads to the end of what a dead process has said
         for stream in (self._process.stdin, self._process.stdout, self._said):
             if stream is not None:
                 with contextlib.suppress(OSError):
@@ -108,10 +117,13 @@ def run_here(jobs: JobQueue, side_by_side: int, share: Share) -> None:
                 job = jobs.next()
                 if job is None:
                     break
-                if not idle:
-                    idle = [Worker(events)]
-                    workers += idle
-                idle[0].begin(job)
+                try:
+                    worker = idle[0] if idle else Worker(events)
+                except OSError as error:  # no memory, or no more processes allowed
+                    jobs.finish(job, Result.failed(f"no process could be started for it: {reason_of(error)}"))
+                    continue
+                workers += [] if idle else [worker]
+                worker.begin(job)
             try:
                 worker, message = events.get(timeout=0.1)
             except queue.Empty:

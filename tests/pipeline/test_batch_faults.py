@@ -1,6 +1,7 @@
 """What may go wrong with the processes of a batch: killed, interrupted, doubled, lost with their machine."""
 
 import contextlib
+import errno
 import json
 import os
 import random
@@ -184,6 +185,16 @@ def test_a_killed_worker_is_tried_again_and_a_deadly_recording_fails_alone(day, 
     assert (a["status"], b["status"]) == ("failed", "measured")
     assert "twice" in a["reason"]
     assert "killed (signal 9)" in a["reason"]
+
+
+def test_recordings_for_which_no_process_can_be_started_fail_with_that_reason(day, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(processes.subprocess, "Popen", refused)
+    outcome = run_batch([day], BatchOptions(report=False))
+    assert [row["status"] for row in outcome.rows] == ["failed", "failed"]
+    assert "no process could be started for it: Resource temporarily unavailable" in outcome.rows[0]["reason"]
 
 
 @pytest.mark.slow
