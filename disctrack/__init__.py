@@ -17,10 +17,11 @@ Conventions (frames, angles, units, pixels) have one home: the docstring of disc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from disctrack.analyse import Analysis, run_analyse
+    from disctrack.analyse import run_analyse
+    from disctrack.analysis import Analysis
     from disctrack.batch import run_batch
     from disctrack.chessboard_views import calibrate_recording, calibrate_views, find_views
     from disctrack.derivatives import differentiate
@@ -52,7 +53,8 @@ _HOME = {
     "storage": ("Provenance", "write_trajectory", "read_trajectory", "write_csv", "write_group", "read_group"),
     "overlay": ("write_overlay",),
     "derivatives": ("differentiate",),
-    "analyse": ("Analysis", "run_analyse"),
+    "analysis": ("Analysis",),
+    "analyse": ("run_analyse",),
     "batch": ("run_batch",),
     "errors": ("DiscTrackError",),
 }

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from disctrack.analyse import Analysis
+from disctrack.analysis import Analysis
 from disctrack.propagation import Series
 from disctrack.scaling import MODEL_EXPONENTS, Exponent, PowerLaws
 

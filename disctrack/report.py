@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 
-from disctrack.analyse import Analysis
+from disctrack.analysis import Analysis
 from disctrack.figures import Drawn, all_figures
 from disctrack.propagation import Series
 from disctrack.published import SURFACES, agreement, published_table

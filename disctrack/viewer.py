@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import StereoRig
-from disctrack.analyse import Analysis
+from disctrack.analysis import Analysis
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.frames import quaternion_from_rotation

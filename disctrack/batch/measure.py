@@ -14,7 +14,8 @@ from typing import Any
 from calibration.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack import storage
-from disctrack.analyse import Analysis, analyse, run_analyse, write_analysis
+from disctrack.analyse import run_analyse, write_analysis
+from disctrack.analysis import Analysis, analyse
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job

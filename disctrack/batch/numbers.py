@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.analyse import Analysis
+from disctrack.analysis import Analysis
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.enlarged import declared_model
 from disctrack.diagnosis.fit import fit

@@ -28,7 +28,8 @@ import cv2
 
 from calibration import CalibrationSettings
 from calibration.rig_file import read_rig
-from disctrack.analyse import analyse, run_analyse, write_analysis
+from disctrack.analyse import run_analyse, write_analysis
+from disctrack.analysis import analyse
 from disctrack.batch import read_summary
 from disctrack.batch.processes import ONE_THREAD
 from disctrack.calibration_stage import calibrate_into, source_of

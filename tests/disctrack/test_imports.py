@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PHYSICS = ("frames", "disc", "trajectory", "rolling", "derivatives", "contact", "energy", "least_squares")
+PHYSICS = ("frames", "disc", "trajectory", "rolling", "derivatives", "contact", "energy", "analysis", "least_squares")
 FORBIDDEN = ("cv2", "h5py", "matplotlib", "skimage", "tqdm")
 
 

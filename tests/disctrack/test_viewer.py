@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.analyse import analyse
+from disctrack.analysis import analyse
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.viewer import _cylinder, _normals, write_rerun

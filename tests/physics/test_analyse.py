@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.analyse import analyse, run_analyse, write_analysis
+from disctrack.analyse import run_analyse, write_analysis
+from disctrack.analysis import analyse
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError, TrajectoryFileError
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler

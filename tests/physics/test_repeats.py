@@ -11,7 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import optimize, stats
 
-from disctrack.analyse import analyse, write_analysis
+from disctrack.analyse import write_analysis
+from disctrack.analysis import analyse
 from disctrack.disc import MA_2014
 from disctrack.repeats import compare, write
 from disctrack.repeats.alignment import Curves, align

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from disctrack.analyse import CIRCLE_DURATION, WINDOW
+from disctrack.analysis import CIRCLE_DURATION, WINDOW
 from disctrack.batch import BatchOptions, find_recordings, read_summary, run_batch
 from disctrack.batch import measure as stage
 from disctrack.batch.plan import Places, make_plan
