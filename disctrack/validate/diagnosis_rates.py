@@ -189,13 +189,15 @@ def _class_text(names: Sequence[str]) -> str:
 def _sized(result: DiscDiagnosis, planted: Planted) -> tuple[float, bool] | None:
     """Largest pull of the planted values where the effect, or a class that holds it, is claimed; was it the claim?"""
     truth = planted.truth
+    matches = []
     for found in result.diagnosis.found:
         if set(truth) <= set(found.candidate.names):
-            return _pull(result.diagnosis.after, truth), True
+            matches.append((_pull(result.diagnosis.after, truth), True))
         for rival in found.cannot_be_told_from:
             if set(truth) <= set(rival.candidate.names):
-                return _pull(rival.fit, truth), False
-    return None
+                matches.append((_pull(rival.fit, truth), False))
+    # two claims may have it in their classes: it is in the place of one of them that it fits
+    return min(matches, key=lambda match: (not match[1], match[0]), default=None)
 
 
 def _pull(fit: Fit, truth: Values) -> float:
