@@ -37,17 +37,19 @@ def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
     """
     make_folder(path.parent)
     until = time.monotonic() + wait
-    while (held := _try(path)) is None:
-        if time.monotonic() >= until:
-            raise Busy(f"{path} is held by another process")
-        time.sleep(0.05)
-    descriptor, file = held
+    held = None
     try:
+        while (held := _try(path)) is None:
+            if time.monotonic() >= until:
+                raise Busy(f"{path} is held by another process")
+            time.sleep(0.05)
         yield
     finally:
-        with contextlib.suppress(OSError):
-            file.unlink()  # before it is free: who locks the removed file notices that it is no longer there
-        os.close(descriptor)
+        if held is not None:
+            descriptor, file = held
+            with contextlib.suppress(OSError):
+                file.unlink()  # before it is free: who locks the removed file notices that it is no longer there
+            os.close(descriptor)
 
 
 def _try(path: Path) -> tuple[int, Path] | None:

@@ -33,7 +33,7 @@ ONE_THREAD = {
         "OPENCV_FOR_THREADS_NUM",
     )
 }
-_STOPPING = 5.0  # [s] that a worker has to clear up
+_STOPPING, _ASK_AGAIN = 9.0, 2.0  # [s] that a worker has to clear up, and after which it is asked once more
 
 
 class Worker:
@@ -94,12 +94,15 @@ class Worker:
                 self._process.stdin.close()
 
     def stop(self, until: float) -> None:
-        """Wait for its end until that instant, then end it."""
-        try:
-            self._process.wait(max(0.0, until - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        """Wait for its end until that instant, asking again now and then, and then end it."""
+        while self._process.poll() is None:
+            left = until - time.monotonic()
+            if left <= 0:
+                self._process.kill()
+            try:
+                self._process.wait(min(left, _ASK_AGAIN) if left > 0 else None)
+            except subprocess.TimeoutExpired:  # where it was, the request may have been swallowed
+                self.ask_to_stop()
         self._listener.join(1.0)  # it reads to the end of what a dead process has said
         for stream in (self._process.stdin, self._process.stdout, self._said):
             if stream is not None:
