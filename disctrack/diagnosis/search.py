@@ -246,7 +246,10 @@ class _Search:
     def _next(self, current: Trial, linear: Linearisation, scores: list[Score] | None) -> Trial | None:
         """The best admissible enlargement, or None."""
         trials = []
-        for extra in self._shortlist(current, linear, scores):
+        # beyond thresholds the prediction has kinks and a refit is long: last, and only where no other will do
+        for extra in sorted(self._shortlist(current, linear, scores), key=lambda e: any(c.threshold for c in e)):
+            if any(c.threshold for c in extra) and any(self._nearly_all(current, t) for _, t in trials):
+                continue
             refitted = self._best_fit(current, extra)
             trial = Trial((*current.candidates, *extra), refitted, self._cost(current.fit) - self._cost(refitted))
             trials.append((extra, trial))
@@ -263,6 +266,11 @@ class _Search:
             if chosen is None and judged.held_out_gain is not None and judged.held_out_gain > 0:
                 chosen = judged
         return chosen
+
+    def _nearly_all(self, before: Trial, after: Trial) -> bool:
+        """Does the enlargement remove nine tenths of what exceeds the noise?"""
+        excess = [t.fit.chi_square / self.noise - t.fit.degrees_of_freedom for t in (before, after)]
+        return after.fit.converged and excess[1] < 0.1 * excess[0]
 
     def _shortlist(
         self, current: Trial, linear: Linearisation, scores: list[Score] | None
@@ -283,7 +291,6 @@ class _Search:
         shortlist: list[tuple[Candidate, ...]] = [(s.candidate,) for s in worth]
         if self._at_noise(current.fit, best):
             return shortlist
-        # beyond thresholds the prediction has kinks and a refit is long: only where nothing else will do
         shortlist += [(c,) for c in self.system.candidates if c.threshold and c.name not in taken]
         room = len(taken) + 2 <= self.settings.max_effects
         if room and worth:
