@@ -15,12 +15,13 @@ from disctrack.diagnosis.dots import with_declared_dots
 from disctrack.diagnosis.enlarged import PAPER, declared_model, model_toml
 from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
-from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn
+from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn, without_idle_terms
 from disctrack.diagnosis.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.search import Diagnosis, Settings
 from disctrack.diagnosis.separation import Separation, separations
 from disctrack.diagnosis.shape import refine_shapes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
+from disctrack.diagnosis.system import System
 from disctrack.diagnosis.words import sentence
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.storage import read_findings, read_provenance, read_trajectory
@@ -123,6 +124,11 @@ def diagnose_trajectory(
     )
 
 
+def _with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    return fit(system, (*base.quantities, *law.candidate.quantities), start)
+
+
 def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[MissingMoment | None, Learned | None]:
     """The missing moment, and its law if that describes the data better, for its length, than the catalogue does."""
     if diagnosis.verdict == "nothing missing" or (diagnosis.verdict == "found" and len(diagnosis.found) < 2):
@@ -131,9 +137,11 @@ def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Mis
     moment, law = learn(system, base, diagnosis.noise)
     if law is None or diagnosis.held_out_before is None:
         return moment, None
-    start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
     judged = diagnosis.judged or system
-    fitted = fit(judged, (*base.quantities, *law.candidate.quantities), start)
+    fitted = _with_law(judged, base, law)
+    shorter = without_idle_terms(law, fitted)
+    if fitted.converged and shorter is not law:
+        law, fitted = shorter, _with_law(judged, base, shorter)
     price = float(np.log(np.sum(system.weights)))
     lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
     saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])

@@ -31,6 +31,7 @@ PARTS = 10  # of the recording, half of which are drawn for each resample
 RESAMPLES = 40
 KEPT_SHARE = 0.6  # of the resamples in which a term must be chosen
 MAX_TERMS = 3
+MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped the smoothed moment may not help the motion
 # Names of records.KINEMATICS in formulas; a term locked to an angle has it as an argument.
 LIBRARY = {
     "constant": "1.0",
@@ -76,11 +77,12 @@ class MissingMoment:
 class LearnedLaw:
     """Terms that describe the missing moment."""
 
-    candidate: Candidate  # of the effect by formula, registered in the rolling catalogue
+    candidate: Candidate  # of the effect by formula
     formulas: dict[str, str]  # component of the wrench -> formula
     terms: tuple[tuple[str, str], ...]  # (axis, function)
     share: tuple[float, ...]  # of the resamples that chose each term
     locked: bool  # to an angle of the body or of the table
+    laws: dict[str, str]  # function of each term -> formula
 
 
 @dataclass(frozen=True)
@@ -300,7 +302,19 @@ def _law(
         unique, unique, "motion", effect.title, effect.source, quantities, tuple(float(v) for v in scale)
     )
     locked = any(mark in laws[term] for _, term in terms for mark in _LOCKED)
-    return LearnedLaw(candidate, formulas, tuple(terms), tuple(share), locked)
+    return LearnedLaw(candidate, formulas, tuple(terms), tuple(share), locked, {term: laws[term] for _, term in terms})
+
+
+def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
+    """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same."""
+    names = law.candidate.names
+    kept = [i for i, n in enumerate(names) if abs(fitted.values[n]) > MIN_SIGMAS * fitted.sigma(n)]
+    if not kept or len(kept) == len(names):
+        return law
+    scale = np.array([fitted.values[names[i]] for i in kept])
+    name = law.candidate.name
+    del FORMULAS[name]  # the shorter law takes its place
+    return _law([law.terms[i] for i in kept], [law.share[i] for i in kept], scale, name, law.laws)
 
 
 def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:

@@ -245,7 +245,7 @@ class _Search:
 
     def _next(self, current: Trial, linear: Linearisation, scores: list[Score] | None) -> Trial | None:
         """The best admissible enlargement, or None."""
-        trials = []
+        trials: list[tuple[tuple[Candidate, ...], Trial]] = []
         # beyond thresholds the prediction has kinks and a refit is long: last, and only where no other will do
         for extra in sorted(self._shortlist(current, linear, scores), key=lambda e: any(c.threshold for c in e)):
             if any(c.threshold for c in extra) and any(self._nearly_all(current, t) for _, t in trials):

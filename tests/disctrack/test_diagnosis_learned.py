@@ -1,12 +1,14 @@
 """What is in no catalogue is read from the residual: as a moment over time, and as a law."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
 from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import fit
-from disctrack.diagnosis.learned import learn, learned_moment, missing_moment, probe
+from disctrack.diagnosis.fit import Fit, fit
+from disctrack.diagnosis.learned import _law, learn, learned_moment, missing_moment, probe, without_idle_terms
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import measured
 
@@ -69,3 +71,20 @@ def test_in_noise_no_law_is_learned():
     system = DiscSystem(trajectory, declared_model(trajectory).model)
     base = fit(system, system.base, system.start())
     assert learn(system, base, 1.0)[1] is None
+
+
+def test_a_term_that_the_refit_finds_to_be_zero_is_dropped():
+    laws = {"sin 2 phi": "sin(2.0 * phi)", "hum": "sin(134.67 * time)"}
+    law = _law([("z", "sin 2 phi"), ("z", "hum")], [1.0, 0.8], np.array([-4e-4, 1e-6]), "test_idle", laws)
+    first, second = law.candidate.quantities
+    covariance = np.diag([6e-6, 7e-6]) ** 2
+    fitted = Fit((first, second), {first.name: -3.9e-4, second.name: 4e-7}, covariance, 1.0, 0.0, 100, True, 3)
+    shorter = without_idle_terms(law, fitted)
+    assert shorter.terms == (("z", "sin 2 phi"),)
+    assert shorter.formulas == {"M_z": "c_0 * (sin(2.0 * phi))"}
+    assert shorter.candidate.start == (-3.9e-4,)
+    assert shorter.candidate.name == "test_idle"
+    again = _law([("z", "sin 2 phi"), ("z", "hum")], [1.0, 0.8], np.array([-4e-4, 1e-6]), "test_both", laws)
+    values = dict(zip(again.candidate.names, (-3.9e-4, 4e-5), strict=True))
+    busy = replace(fitted, quantities=again.candidate.quantities, values=values)
+    assert without_idle_terms(again, busy) is again
