@@ -109,13 +109,13 @@ def _link(target: str | None, text: str) -> str:
 
 _STYLE = """
 :root{color:#1d2733;background:#f5f7f9;font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
-body{margin:0}main{max-width:1280px;margin:0 auto;padding:2rem 1.5rem 4rem}
+body{margin:0}main{max-width:1400px;margin:0 auto;padding:2rem 1.5rem 4rem}
 h1{font-size:1.7rem;margin:.2rem 0 1rem}h2{font-size:1.25rem;margin:1.6rem 0 .6rem}
 .warn{background:#fff6e5;border:1px solid #e6c27a;border-radius:10px;padding:.9rem 1.2rem;margin:1.2rem 0}
 .warn ul{margin:.4rem 0 0;padding-left:1.2rem;overflow-wrap:anywhere}
 .scroll{overflow-x:auto}.card{background:#fff;border:1px solid #dfe5ea;border-radius:10px;padding:.6rem 1rem}
-table{border-collapse:collapse;font-size:.88rem}
-th,td{text-align:left;padding:.3rem .9rem .3rem 0;border-bottom:1px solid #e8edf1;white-space:nowrap;
+table{border-collapse:collapse;font-size:.82rem}
+th,td{text-align:left;padding:.3rem .7rem .3rem 0;border-bottom:1px solid #e8edf1;white-space:nowrap;
 font-variant-numeric:tabular-nums}
 th{color:#5c6a77;font-weight:600}a{color:#1f6f8b}tr.failed td,tr.not td{color:#a3462f}
 figure{margin:1rem 0}figure img{max-width:100%}figcaption{color:#3c4a57;font-size:.88rem}
