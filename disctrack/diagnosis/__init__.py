@@ -5,7 +5,8 @@ and the rolling model; `run_diagnose` is the stage from file to file. Systems th
 for their noise there is `coloured`, for their diagnosis.json `general`.
 """
 
-from disctrack.diagnosis.diagnose import DiagnoseOutcome, DiscDiagnosis, diagnose_trajectory, run_diagnose
+from disctrack.diagnosis.diagnose import DiagnoseOutcome, diagnose_trajectory, run_diagnose
+from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.system import Candidate, Quantity, System

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from disctrack.diagnosis.disc_errors import Errors, energy_balance, errors
+from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis, Learned
+from disctrack.diagnosis.disc_errors import energy_balance, errors
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.dots import with_declared_dots
 from disctrack.diagnosis.enlarged import PAPER, declared_model, model_toml
 from disctrack.diagnosis.fit import Fit, fit
-from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
+from disctrack.diagnosis.held_out import held_out, training_rows
 from disctrack.diagnosis.learned import LearnedLaw, MissingMoment, learn, without_idle_terms
 from disctrack.diagnosis.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.search import Diagnosis, Settings
-from disctrack.diagnosis.separation import Separation, separations
+from disctrack.diagnosis.separation import separations
 from disctrack.diagnosis.shape import refine_shapes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.system import System
@@ -27,50 +27,6 @@ from disctrack.errors import AnalysisError, OutputError
 from disctrack.storage import read_findings, read_provenance, read_trajectory
 from disctrack.trajectory import Trajectory
 from disctrack.whole_files import write_whole
-
-
-@dataclass(frozen=True)
-class Learned:
-    """A law outside the catalogue, fitted like an effect."""
-
-    law: LearnedLaw
-    fit: Fit
-    held_out: HeldOut
-    gain: float  # decrease of chi-square in units of the noise found
-    held_out_gain: float
-    power: float  # mean over the recording [W]; negative where it takes energy from the disc
-
-
-@dataclass(frozen=True)
-class DiscDiagnosis:
-    """Diagnosis of one trajectory of the disc."""
-
-    system: DiscSystem
-    diagnosis: Diagnosis
-    model: str
-    sentence: str
-    before: Errors | None  # None where the base fit did not converge
-    after: Errors | None
-    energy: dict[str, float]  # [J]
-    moment: MissingMoment | None = None  # that the model fails to supply, where it was asked for
-    learned: Learned | None = None
-    separated_by: dict[str, dict[str, Separation | None]] = field(default_factory=dict)  # effect -> rival -> recording
-    notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
-
-    @property
-    def after_fit(self) -> Fit:
-        """Fit of the enlarged model."""
-        return self.learned.fit if self.learned else self.diagnosis.after
-
-    @property
-    def after_held_out(self) -> HeldOut | None:
-        """Its free run."""
-        return self.learned.held_out if self.learned else self.diagnosis.held_out_after
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """What diagnosis.json says."""
-        return as_json(self)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from disctrack.contact import K
 from disctrack.derivatives import Motion, differentiate
-from disctrack.diagnosis.diagnose import DiscDiagnosis
+from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc_errors import HALF_WINDOW, HORIZONS, Ahead, energy_balance, free_run, simulated
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.fit import Fit

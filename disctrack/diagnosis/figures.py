@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from disctrack.diagnosis.diagnose import DiscDiagnosis
+from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc_errors import frequencies, simulated
 from disctrack.diagnosis.evidence import Evidence, Measured, force_of
 from disctrack.diagnosis.held_out import HeldOut

@@ -19,7 +19,7 @@ from disctrack.labelled import Variable
 from disctrack.storage import write_group
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.diagnose import DiscDiagnosis, Learned
+    from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis, Learned
     from disctrack.diagnosis.evidence import Evidence
 
 GROUP = "diagnosis"

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from disctrack.diagnosis.diagnose import DiscDiagnosis
+from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc_errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.evidence import Evidence
 from disctrack.diagnosis.figures import all_figures

@@ -7,6 +7,7 @@ from disctrack.diagnosis import DiscSystem, Settings, diagnose, diagnose_traject
 from disctrack.diagnosis.disc_motion import motion_candidates
 from disctrack.diagnosis.enlarged import declared_model
 from disctrack.diagnosis.fit import fit
+from disctrack.diagnosis.output import as_json
 from disctrack.rolling import CATALOGUE
 from disctrack.scene import CameraFault, Faults
 from tests.oracles.measured_disc import measured
@@ -152,7 +153,7 @@ def test_slip_is_found_by_the_friction_at_which_it_sets_in():
     """Slip has no derivative where the disc does not slip yet: it is fitted from where it would begin."""
     result = diagnose_trajectory(measured({"slip.mu": 0.1}, seed=100, n=300, theta_deg=20.0))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip"]
-    mu = result.document["effects"][0]["parameters"][0]
+    mu = as_json(result)["effects"][0]["parameters"][0]
     assert mu["name"] == "mu"
     # switches between rolling and slip are instants of the noise too: a thousandth, far above sigma
     assert abs(mu["value"] - 0.1) < 1e-4

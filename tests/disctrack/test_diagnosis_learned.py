@@ -9,6 +9,7 @@ from disctrack.diagnosis import DiscSystem, diagnose_trajectory
 from disctrack.diagnosis.enlarged import declared_model
 from disctrack.diagnosis.fit import Fit, fit
 from disctrack.diagnosis.learned import _law, learn, learned_moment, missing_moment, probe, without_idle_terms
+from disctrack.diagnosis.output import as_json
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import measured
 
@@ -37,7 +38,7 @@ def test_an_effect_in_no_catalogue_is_described_by_a_learned_law(name, component
     # 10 000 numbers: 1 +- 0.014, and the hum's frequency is known to a tenth of a line only
     assert result.after.reduced_chi_square < 1.05
     assert result.after.ratio_to_floor < 1.2 < result.before.ratio_to_floor
-    first = result.document["effects"][0]
+    first = as_json(result)["effects"][0]
     assert first["kind"] == "learned"
     assert first["phase_locked"] == locked
 

@@ -7,6 +7,7 @@ import pytest
 
 from disctrack.diagnosis import diagnose_trajectory
 from disctrack.diagnosis.disc_stretch import free_stretch
+from disctrack.diagnosis.output import as_json
 from disctrack.errors import AnalysisError
 from disctrack.rolling import Model, Regime, simulate, steady_precession
 from disctrack.scene import Faults, Scene
@@ -81,7 +82,7 @@ def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
     motion, n = sliding(0.2, (0.08, 0.04)), 220
     result = diagnose_trajectory(measured(motion=motion, seed=41, n=n))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
-    (effect,) = result.document["effects"]
+    (effect,) = as_json(result)["effects"]
     mu = effect["parameters"][0]
     assert (effect["name"], mu["name"]) == ("slip", "mu")
     assert abs(mu["value"] - 0.2) < 4 * mu["sigma"]
