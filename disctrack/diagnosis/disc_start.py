@@ -73,10 +73,10 @@ def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
     q = system.trajectory.q[system.rows]
     names = {quantity.name for quantity in system.base}
     values = dict(known) | {k: v for k, v in first_state(system.time, q).items() if k in names}
-    values |= {law.name: system.model.values[law.name] for law in model_quantities(system.model)}
+    laws = model_quantities(system.model)
+    values |= {law.name: system.model.values[law.name] for law in laws}
     if SLIP in names:
         values[SLIP] = 1.0 / first_friction(system.time, q, system.model.gravity)
-    laws = model_quantities(system.model)
     state = tuple(quantity for quantity in system.base if quantity.name.startswith("state.") or quantity.name == SLIP)
     for stretch in STRETCHES:
         if stretch >= system.time[-1] - system.time[0]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.diagnosis.fit import Fit
-from disctrack.diagnosis.system import Candidate, Quantity, System, Values
+from disctrack.diagnosis.system import System, Values, Wrapped
 
 Array = NDArray[np.float64]
 
@@ -21,40 +21,17 @@ MARGIN = 1.5  # over the largest eigenvalue that independent noise brings (March
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
 
 
-class RowWhitened:
+class RowWhitened(Wrapped):
     """A system whose rows are multiplied by a matrix, so that noise common to their numbers counts once."""
 
     def __init__(self, system: System, matrix: Array) -> None:
         """Matrix (w, w) acts on the numbers of every row."""
-        self._system, self._matrix = system, matrix
-
-    @property
-    def time(self) -> Array:
-        """(n,) instants [s]."""
-        return self._system.time
-
-    @property
-    def base(self) -> tuple[Quantity, ...]:
-        """As the system's."""
-        return self._system.base
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """As the system's."""
-        return self._system.candidates
-
-    @property
-    def weights(self) -> Array:
-        """As the system's."""
-        return self._system.weights
-
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
-        """As the system's."""
-        return self._system.starts(candidate, values)
+        super().__init__(system)
+        self._matrix = matrix
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the system's, every row multiplied."""
-        residual, derivative = self._system.linearise(values, names)
+        residual, derivative = super().linearise(values, names)
         return residual @ self._matrix.T, self._matrix @ derivative
 
 

@@ -82,12 +82,11 @@ class System(Protocol):
         """Values from which refits of a candidate with a threshold begin, given a fit without it."""
 
 
-class Subset:
-    """The first samples of a system, or any others: the rest counts as missing."""
+class Wrapped:
+    """A system as another sees it: all as it is, but for what a subclass changes."""
 
-    def __init__(self, system: System, rows: NDArray[np.bool_]) -> None:
-        """Rows (n,) True where the sample belongs to the subset."""
-        self._system, self._rows = system, rows
+    def __init__(self, system: System) -> None:
+        self._system = system
 
     @property
     def time(self) -> Array:
@@ -96,26 +95,44 @@ class Subset:
 
     @property
     def base(self) -> tuple[Quantity, ...]:
-        """As the whole system's."""
+        """As the system's."""
         return self._system.base
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """As the whole system's."""
+        """As the system's."""
         return self._system.candidates
 
     @property
     def weights(self) -> Array:
-        """(n,) zero outside the subset."""
-        return np.where(self._rows, self._system.weights, 0)
+        """As the system's."""
+        return self._system.weights
 
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
-        """As the whole system's."""
+        """As the system's."""
         return self._system.starts(candidate, values)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """As the system's."""
+        return self._system.linearise(values, names)
+
+
+class Subset(Wrapped):
+    """The first samples of a system, or any others: the rest counts as missing."""
+
+    def __init__(self, system: System, rows: NDArray[np.bool_]) -> None:
+        """Rows (n,) True where the sample belongs to the subset."""
+        super().__init__(system)
+        self._rows = rows
+
+    @property
+    def weights(self) -> Array:
+        """(n,) zero outside the subset."""
+        return np.where(self._rows, super().weights, 0)
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the whole system's, zeros outside the subset, even where there is no prediction."""
-        residual, derivative = self._system.linearise(values, names)
+        residual, derivative = super().linearise(values, names)
         outside = ~self._rows
         residual, derivative = residual.copy(), derivative.copy()
         residual[outside], derivative[outside] = 0.0, 0.0
