@@ -20,19 +20,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from disctrack.analyse import run_analyse
-    from disctrack.analysis import Analysis
+    from disctrack.analyse.analysis import Analysis
+    from disctrack.analyse.derivatives import differentiate
+    from disctrack.analyse.stage import run_analyse
     from disctrack.batch import run_batch
-    from disctrack.chessboard_views import calibrate_recording, calibrate_views, find_views
-    from disctrack.derivatives import differentiate
+    from disctrack.calibrate.views import calibrate_recording, calibrate_views, find_views
     from disctrack.disc import Disc
     from disctrack.errors import DiscTrackError
-    from disctrack.overlay import write_overlay
-    from disctrack.pipeline import Measurement, measure, open_pairs, trajectory_provenance
-    from disctrack.readers import FrameReader, open_frames
-    from disctrack.readers.blocks import iter_pair_blocks
-    from disctrack.recording import Recording, read_recording
-    from disctrack.storage import (
+    from disctrack.files.trajectory_file import (
         Provenance,
         read_group,
         read_trajectory,
@@ -40,21 +35,33 @@ if TYPE_CHECKING:
         write_group,
         write_trajectory,
     )
+    from disctrack.readers import FrameReader, open_frames
+    from disctrack.readers.blocks import iter_pair_blocks
+    from disctrack.recording.declaration import Recording, read_recording
+    from disctrack.track.overlay import write_overlay
+    from disctrack.track.stage import Measurement, measure, open_pairs, trajectory_provenance
     from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 _HOME = {
-    "recording": ("Recording", "read_recording"),
+    "recording.declaration": ("Recording", "read_recording"),
     "readers": ("FrameReader", "open_frames"),
     "readers.blocks": ("iter_pair_blocks",),
-    "chessboard_views": ("find_views", "calibrate_views", "calibrate_recording"),
+    "calibrate.views": ("find_views", "calibrate_views", "calibrate_recording"),
     "disc": ("Disc",),
-    "pipeline": ("open_pairs", "Measurement", "measure", "trajectory_provenance"),
+    "track.stage": ("open_pairs", "Measurement", "measure", "trajectory_provenance"),
     "trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
-    "storage": ("Provenance", "write_trajectory", "read_trajectory", "write_csv", "write_group", "read_group"),
-    "overlay": ("write_overlay",),
-    "derivatives": ("differentiate",),
-    "analysis": ("Analysis",),
-    "analyse": ("run_analyse",),
+    "files.trajectory_file": (
+        "Provenance",
+        "write_trajectory",
+        "read_trajectory",
+        "write_csv",
+        "write_group",
+        "read_group",
+    ),
+    "track.overlay": ("write_overlay",),
+    "analyse.derivatives": ("differentiate",),
+    "analyse.analysis": ("Analysis",),
+    "analyse.stage": ("run_analyse",),
     "batch": ("run_batch",),
     "errors": ("DiscTrackError",),
 }

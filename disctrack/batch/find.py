@@ -9,7 +9,7 @@ from pathlib import Path
 
 from disctrack.errors import RecordingError
 from disctrack.readers.files import natural_key
-from disctrack.recording import FILE_NAME
+from disctrack.recording.declaration import FILE_NAME
 
 RESULTS = "results"  # beside a recording's images
 

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 from disctrack.batch.columns import LACKS_SOMETHING
 from disctrack.batch.reasons import reason_of
-from disctrack.whole_files import write_whole
+from disctrack.files.whole import write_whole
 
 Row = dict[str, Any]
 
@@ -32,7 +32,7 @@ def _comparison(folder: Path, rows: Sequence[Row]) -> tuple[str, str]:
     if len(trajectories) < 2:
         return "", ""
     from disctrack import repeats  # draws figures: only where they are wanted
-    from disctrack.report import STYLE
+    from disctrack.analyse.report import STYLE
 
     try:
         written = repeats.write(repeats.compare(trajectories), folder / "repeats")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from disctrack.whole_files import make_folder, output_error, process_lives
+from disctrack.files.whole import make_folder, output_error, process_lives
 
 try:
     import fcntl

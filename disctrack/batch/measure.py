@@ -13,9 +13,8 @@ from typing import Any
 
 from calibration.camera import StereoRig
 from calibration.rig_file import read_rig
-from disctrack import storage
-from disctrack.analyse import run_analyse, write_analysis
-from disctrack.analysis import Analysis, analyse
+from disctrack.analyse.analysis import Analysis, analyse
+from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job
@@ -32,13 +31,14 @@ from disctrack.batch.records import (
     stages_asked,
     write_record,
 )
-from disctrack.calibration_stage import calibrate_into, is_rig_of, source_of
+from disctrack.calibrate.stage import calibrate_into, is_rig_of, source_of
 from disctrack.errors import AnalysisError, DiscTrackError, OutputError
-from disctrack.pipeline import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
-from disctrack.recording import Recording, read_recording
-from disctrack.storage import Provenance
+from disctrack.files import trajectory_file as storage
+from disctrack.files.trajectory_file import Provenance
+from disctrack.files.whole import write_whole
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.track.stage import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
-from disctrack.whole_files import write_whole
 
 Progress = Callable[[float], None]  # is told the share of the job that is done
 

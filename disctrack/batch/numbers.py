@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.analysis import Analysis
+from disctrack.analyse.analysis import Analysis
 from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import fit
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.engine.fit import fit
 from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory

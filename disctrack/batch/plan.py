@@ -12,9 +12,9 @@ from typing import Any
 from calibration import CalibrationSettings
 from disctrack.batch.find import RESULTS, Found
 from disctrack.batch.reasons import reason_of
-from disctrack.calibration_stage import source_of
-from disctrack.pipeline import open_pairs
-from disctrack.recording import Recording, read_recording
+from disctrack.calibrate.stage import source_of
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.track.stage import open_pairs
 
 FOLDER = "batch_results"  # for what belongs to no single recording
 # Work in units of one tracked pair, from timings; it only sets how the progress bar is divided.

@@ -10,8 +10,8 @@ from typing import Any
 
 from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
-from disctrack.storage import read_provenance
-from disctrack.whole_files import write_whole
+from disctrack.files.trajectory_file import read_provenance
+from disctrack.files.whole import write_whole
 
 RECORD = "batch.json"
 SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
@@ -84,7 +84,7 @@ def is_done(folder: Path, record: Record | None, asked: dict[str, Any]) -> bool:
     """True if the record tells of a measured recording with all stages asked for, and all its files are there.
 
     The trajectory must be the record's; whether that is the result of the present inputs is another question
-    (`storage.is_result_of`).
+    (`trajectory_file.is_result_of`).
     """
     if record is None or record.status != MEASURED or "trajectory" not in record.files:
         return False

@@ -16,8 +16,8 @@ from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
 from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
 from disctrack.errors import ClusterError, OutputError
+from disctrack.files.whole import check_writable
 from disctrack.readers.blocks import default_threads
-from disctrack.whole_files import check_writable
 
 INTERRUPTED = "interrupted before it was done"
 

@@ -17,7 +17,7 @@ from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places, options_as_json
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
 from disctrack.errors import OutputError
-from disctrack.whole_files import write_whole
+from disctrack.files.whole import write_whole
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
 _PATHS = ("trajectory", "report", "diagnosis_report")

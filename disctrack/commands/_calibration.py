@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 
 from calibration import Board, CalibrationSettings
-from disctrack.calibration_stage import CalibrationSource, calibrate_into, given_rig, source_of
-from disctrack.chessboard_views import find_views
+from disctrack.calibrate.stage import CalibrationSource, calibrate_into, given_rig, source_of
+from disctrack.calibrate.views import find_views
 from disctrack.errors import RecordingError
-from disctrack.recording import read_recording
+from disctrack.recording.declaration import read_recording
 
 __all__ = ["calibrate_into", "given_rig", "settings_of", "source_of", "source_of_patterns", "source_of_recording"]
 

@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import StereoRig
-from disctrack import storage, summary
 from disctrack.errors import OutputError, RecordingError
-from disctrack.pipeline import ImagePairs, check_rig, measure, trajectory_provenance
+from disctrack.files import trajectory_file as storage
+from disctrack.files.whole import check_writable as check_writable
 from disctrack.progress import progress_bar
-from disctrack.recording import Recording
-from disctrack.tracking import TrackingSettings
+from disctrack.recording.declaration import Recording
+from disctrack.track import summary
+from disctrack.track.stage import ImagePairs, check_rig, measure, trajectory_provenance
+from disctrack.track.tracking import TrackingSettings
 from disctrack.trajectory import Trajectory
-from disctrack.whole_files import check_writable as check_writable
 
 RESULTS = "results"
 
@@ -134,7 +135,7 @@ def _companions(
         storage.write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
         yield path.with_suffix(".csv")
     if options.figures:
-        from disctrack.plots import FIGURES, save_figure
+        from disctrack.track.figures import FIGURES, save_figure
 
         for name, make in FIGURES.items():
             picture = path.with_name(f"{prefix}{name}.png")
@@ -149,7 +150,7 @@ def _companions(
 
 
 def _write_video(path: Path, trajectory: Trajectory, pairs: ImagePairs) -> None:
-    from disctrack.overlay import shown_rows, write_overlay
+    from disctrack.track.overlay import shown_rows, write_overlay
 
     rows = shown_rows(pairs.start, pairs.stop)
     with progress_bar("video", len(rows), "frame") as advance:

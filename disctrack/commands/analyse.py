@@ -33,7 +33,7 @@ def _seconds(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
-    from disctrack.analyse import run_analyse
+    from disctrack.analyse.stage import run_analyse
     from disctrack.cli import DONE
 
     outcome = run_analyse(
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print("\n".join(outcome.lines()))
     if arguments.rerun:
-        from disctrack.viewer import write_rerun
+        from disctrack.analyse.viewer import write_rerun
 
         recording = outcome.report.with_name("motion.rrd")
         write_rerun(recording, outcome.analysis)

@@ -26,10 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
-    from disctrack import summary
     from disctrack.cli import DONE
     from disctrack.commands import _calibration as calibration
     from disctrack.commands import _outputs as outputs
+    from disctrack.track import summary
 
     if arguments.recording is None:
         source = calibration.source_of_patterns(arguments)

@@ -17,10 +17,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; returns the exit code."""
-    from disctrack import summary
     from disctrack.cli import DONE
     from disctrack.commands import _outputs as outputs
     from disctrack.diagnosis import run_diagnose
+    from disctrack.track import summary
 
     path = arguments.trajectory
     folder = arguments.output or path.with_name(f"{path.stem}_diagnosis")

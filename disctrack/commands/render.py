@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     from disctrack.errors import SceneError
 
     if arguments.defaults:
-        from disctrack.scene import Scene, scene_toml
+        from disctrack.scene.description import Scene, scene_toml
 
         print(scene_toml(Scene()), end="")
         return DONE

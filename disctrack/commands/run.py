@@ -19,12 +19,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate unless the recording names a rig, track, draw; returns the exit code."""
-    from disctrack import pipeline, summary
     from disctrack.cli import DONE, INCOMPLETE
     from disctrack.commands import _calibration as calibration
     from disctrack.commands import _outputs as outputs
-    from disctrack.recording import read_recording
-    from disctrack.whole_files import write_whole
+    from disctrack.files.whole import write_whole
+    from disctrack.recording.declaration import read_recording
+    from disctrack.track import stage as pipeline
+    from disctrack.track import summary
 
     recording = read_recording(arguments.recording)
     folder = arguments.output or recording.folder / outputs.RESULTS

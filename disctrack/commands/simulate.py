@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         return DONE
     if arguments.scene is None:
         raise SceneError("no scene given: name a TOML file, or ask for the effects with --list-effects")
-    from disctrack.rolling.run import run_simulate
+    from disctrack.scene.simulation import run_simulate
 
     output = arguments.output or arguments.scene.with_name(f"{arguments.scene.stem}_motion.h5")
     done = run_simulate(

@@ -20,11 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Track; returns the exit code."""
     from calibration.rig_file import read_rig
-    from disctrack import pipeline, summary
     from disctrack.cli import DONE, INCOMPLETE
     from disctrack.commands import _outputs as outputs
     from disctrack.errors import RecordingError
-    from disctrack.recording import read_recording
+    from disctrack.recording.declaration import read_recording
+    from disctrack.track import stage as pipeline
+    from disctrack.track import summary
 
     recording = read_recording(arguments.recording)
     path = arguments.output or recording.folder / outputs.RESULTS / "trajectory.h5"

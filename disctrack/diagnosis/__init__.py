@@ -1,15 +1,15 @@
 """Which effect is missing from the model of the motion, or of the measurement?
 
-`diagnose` (search) is the engine: it works on any `System` (system). `DiscSystem` makes one of a trajectory of the disc
+`diagnose` (engine) works on any `System`. `DiscSystem` makes one of a trajectory of the disc
 and the rolling model; `run_diagnose` is the stage from file to file. Systems that are no disc: `disctrack.examples`;
-for their noise there is `coloured`, for their diagnosis.json `general`.
+for their noise there is `engine.noise_with_memory`, for their diagnosis.json `pages.general`.
 """
 
-from disctrack.diagnosis.diagnose import DiagnoseOutcome, diagnose_trajectory, run_diagnose
-from disctrack.diagnosis.disc_diagnosis import DiscDiagnosis
-from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.search import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.system import Candidate, Quantity, System
+from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System
+from disctrack.diagnosis.stage import DiagnoseOutcome, diagnose_trajectory, run_diagnose
 
 __all__ = [
     "Candidate",

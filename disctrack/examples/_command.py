@@ -16,9 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from disctrack.analyse.figures import GRID, INK
 from disctrack.errors import DiscTrackError, OutputError
-from disctrack.figures import GRID, INK
-from disctrack.whole_files import write_whole
+from disctrack.files.whole import write_whole
 
 DPI = 150
 

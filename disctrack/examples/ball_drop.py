@@ -19,16 +19,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from disctrack.analyse.figures import AMBER, BLUE, GREEN, MUTED, RED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.coloured import SmoothNoise
-from disctrack.diagnosis.fit import Fit, fit
-from disctrack.diagnosis.general import document, fit_errors
-from disctrack.diagnosis.held_out import held_out
-from disctrack.diagnosis.search import CLASS_GAIN
-from disctrack.diagnosis.system import Quantity, Subset
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import held_out
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
+from disctrack.diagnosis.engine.search import CLASS_GAIN
+from disctrack.diagnosis.engine.system import Quantity, Subset
+from disctrack.diagnosis.pages.general import document, fit_errors
 from disctrack.examples._command import Outcome, command, dress
 from disctrack.examples.ball_system import GRAVITY, BallDrops, Drop, height_noise, read_drops
-from disctrack.figures import AMBER, BLUE, GREEN, MUTED, RED
 
 Array = NDArray[np.float64]
 

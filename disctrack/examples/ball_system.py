@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.diagnosis.coloured import SmoothNoise, Stretch, estimate
-from disctrack.diagnosis.system import Candidate, Quantity, Values
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.diagnosis.system import Candidate, Quantity
+from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.diagnosis.coloured import SmoothNoise, Stretch, estimate
-from disctrack.diagnosis.system import Candidate, Quantity, Values
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies
 from disctrack.examples.cube_effects import CANDIDATES, GRAVITY, columns, resting_columns

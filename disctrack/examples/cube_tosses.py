@@ -19,13 +19,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from disctrack.analyse.figures import BLUE, MUTED, RED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.fit import Fit, fit
-from disctrack.diagnosis.general import document, fit_errors, memory, portmanteau
-from disctrack.diagnosis.held_out import held_out
-from disctrack.diagnosis.search import CLASS_GAIN
-from disctrack.diagnosis.system import Subset, Values
-from disctrack.diagnosis.words import quantity_text
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import held_out
+from disctrack.diagnosis.engine.search import CLASS_GAIN
+from disctrack.diagnosis.engine.system import Subset, Values
+from disctrack.diagnosis.pages.general import document, fit_errors, memory, portmanteau
+from disctrack.diagnosis.pages.words import quantity_text
 from disctrack.examples._command import Outcome, command, dress
 from disctrack.examples.cube_checks import checks
 from disctrack.examples.cube_data import (
@@ -36,7 +37,6 @@ from disctrack.examples.cube_data import (
 )
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import CHANNELS, GROUPS, HELD_OUT, CubeTosses, white_chi_square
-from disctrack.figures import BLUE, MUTED, RED
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from disctrack.diagnosis.fit import Fit, fit
-from disctrack.diagnosis.held_out import HeldOut, held_out, training_rows
-from disctrack.diagnosis.system import Candidate, Values
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
+from disctrack.diagnosis.engine.system import Candidate, Values
 from disctrack.examples.exponent_model import LastStage, Reading, Setup
 from disctrack.examples.exponent_system import ExponentSystem, Series
 from disctrack.published import PREDICTED

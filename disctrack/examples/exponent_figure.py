@@ -8,12 +8,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from disctrack.diagnosis.system import Values
+from disctrack.analyse.figures import AMBER, BLUE, GREEN, INK, MUTED, RED
+from disctrack.diagnosis.engine.system import Values
 from disctrack.examples._command import dress
 from disctrack.examples.exponent_analysis import THIN_DISC, Explanation
 from disctrack.examples.exponent_report import Answer
 from disctrack.examples.exponent_system import ExponentSystem, Series
-from disctrack.figures import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 Array = NDArray[np.float64]
 

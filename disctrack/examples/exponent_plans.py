@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.diagnosis.fit import compress, fit, prior_rows, solve_bounded
-from disctrack.diagnosis.system import Quantity, Values
+from disctrack.analyse.power_laws import fit_power_laws
+from disctrack.diagnosis.engine.fit import compress, fit, prior_rows, solve_bounded
+from disctrack.diagnosis.engine.system import Quantity, Values
 from disctrack.disc import Disc
 from disctrack.examples.exponent_analysis import Explanation
 from disctrack.examples.exponent_model import FRAME, Setup
 from disctrack.examples.exponent_system import SPIN, ExponentSystem, Series, sample_covariance
 from disctrack.rolling import CATALOGUE, Model, simulate, steady_precession
-from disctrack.scaling import fit_power_laws
 
 Array = NDArray[np.float64]
 

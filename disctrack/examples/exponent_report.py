@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from disctrack.diagnosis import Diagnosis
-from disctrack.diagnosis.fit import Fit
-from disctrack.diagnosis.general import document as diagnosis_document
-from disctrack.diagnosis.general import fit_errors
-from disctrack.diagnosis.words import quantity_text
+from disctrack.diagnosis.engine.fit import Fit
+from disctrack.diagnosis.pages.general import document as diagnosis_document
+from disctrack.diagnosis.pages.general import fit_errors
+from disctrack.diagnosis.pages.words import quantity_text
 from disctrack.examples.exponent_analysis import Explanation, Fixed, Misfit, Scatter
 from disctrack.examples.exponent_system import STATED_T_F
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.diagnosis import Candidate, Quantity
-from disctrack.diagnosis.disc_motion import SLIP, motion_candidates
-from disctrack.diagnosis.system import Values
+from disctrack.diagnosis.disc.motion import SLIP, motion_candidates
+from disctrack.diagnosis.engine.system import Values
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import LastStage, Reading, Setup

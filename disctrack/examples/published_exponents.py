@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from disctrack.diagnosis import Settings, diagnose
-from disctrack.diagnosis.fit import Fit
+from disctrack.diagnosis.engine.fit import Fit
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_analysis import (
     THIN_DISC,

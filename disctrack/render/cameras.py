@@ -11,7 +11,7 @@ from calibration.camera import Camera, StereoRig
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
 from disctrack.render.rays import View, image_of
-from disctrack.scene import CameraFault, Scene
+from disctrack.scene.description import CameraFault, Scene
 
 Array = NDArray[np.float64]
 

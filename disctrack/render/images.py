@@ -19,7 +19,7 @@ from disctrack.render.board_raster import draw_board
 from disctrack.render.disc_raster import draw_disc
 from disctrack.render.rays import View, corner_rays, image_of
 from disctrack.render.sensor import digitise, hot_pixels
-from disctrack.scene import (
+from disctrack.scene.description import (
     AppearanceSettings,
     LightSettings,
     Occluder,

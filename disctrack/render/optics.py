@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from disctrack.render.rays import View, table_points
-from disctrack.scene import Scene
+from disctrack.scene.description import Scene
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.scene import SensorSettings
+from disctrack.scene.description import SensorSettings
 
 Grey = NDArray[np.float32]
 

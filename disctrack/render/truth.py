@@ -14,7 +14,7 @@ from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_vector, vector_from_rotation
 from disctrack.render.rays import View, image_of
-from disctrack.scene import Scene, scene_toml
+from disctrack.scene.description import Scene, scene_toml
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from disctrack.figures import AMBER, BLUE, GREEN, INK, INSET_DURATION, MIN_INSET_SHARE, MUTED, RED, Drawn, dress
+from disctrack.analyse.figures import AMBER, BLUE, GREEN, INK, INSET_DURATION, MIN_INSET_SHARE, MUTED, RED, Drawn, dress
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import ExponentTable, RepeatGroup
 from disctrack.repeats.runs import INDEX, QUANTITIES, Run

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from disctrack.analyse.report import STYLE, draw, gallery, html_table
+from disctrack.files.whole import write_whole
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import Comparison, ExponentTable, RepeatGroup
 from disctrack.repeats.figures import FITTED_SCALES, fitted_figure, group_figures, slug, with_sigma
 from disctrack.repeats.runs import FITTED, INDEX, QUANTITIES, Measured, Run
 from disctrack.repeats.spread import Spread
-from disctrack.report import STYLE, draw, gallery, html_table
-from disctrack.whole_files import write_whole
 
 MOST_ROWS = 2000  # of a table of spread: a person plots it, the figures have every frame
 

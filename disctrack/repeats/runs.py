@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
-from disctrack.storage import read_group, read_provenance, read_setup
+from disctrack.files.trajectory_file import read_group, read_provenance, read_setup
 
 Array = NDArray[np.float64]
 

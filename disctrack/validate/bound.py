@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from calibration.camera import Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_euler, rotation_from_vector
-from disctrack.markers import face_edge, normalised_maps
 from disctrack.render import expected_disc
-from disctrack.scene import Scene, SensorSettings
+from disctrack.scene.description import Scene, SensorSettings
+from disctrack.track.dots import face_edge, normalised_maps
 
 Array = NDArray[np.float64]
 Maps = tuple[tuple[Array, Array], tuple[Array, Array]]

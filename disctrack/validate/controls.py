@@ -15,8 +15,8 @@ from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.render import render_disc, rig_after_faults
-from disctrack.scene import CameraFault, Faults, Scene
-from disctrack.tracking import Tracking
+from disctrack.scene.description import CameraFault, Faults, Scene
+from disctrack.track.tracking import Tracking
 from disctrack.validate.comparison import Comparison, compare
 from disctrack.validate.poses import centre_height
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, LOST_ALLOWED, stress_poses

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.camera import StereoRig
 from disctrack.frames import euler_jacobian
 from disctrack.render.sensor import digitise
-from disctrack.scene import Scene
+from disctrack.scene.description import Scene
 from disctrack.trajectory import MarkerStatus
 from disctrack.validate.bound import camera_maps, inverse_information, pose_bound
 from disctrack.validate.comparison import QUANTITIES, Comparison, compare

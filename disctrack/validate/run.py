@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from disctrack.scene import BoardSettings, CameraSettings, RigSettings, Scene
+from disctrack.files.whole import make_folder, whole_file, write_whole
+from disctrack.scene.description import BoardSettings, CameraSettings, RigSettings, Scene
 from disctrack.validate.controls import Control, planted_faults
 from disctrack.validate.efficiency import measure_efficiency
 from disctrack.validate.stress import DISTURBANCES, apply_stress, stress_poses
 from disctrack.validate.summary import Summary, summarise
 from disctrack.validate.tables import as_json, markdown
 from disctrack.validate.trial import Trial, run_trial
-from disctrack.whole_files import make_folder, whole_file, write_whole
 
 FIRST_SEED = 2014
 

@@ -18,7 +18,7 @@ from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.render import render_disc
 from disctrack.rolling import precession_rate
-from disctrack.scene import GlareSettings, Occluder, Scene
+from disctrack.scene.description import GlareSettings, Occluder, Scene
 from disctrack.validate.comparison import compare
 from disctrack.validate.poses import cameras_in_sight, centre_height
 from disctrack.validate.trial import every, locate

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from calibration import StereoCalibration
 from calibration.camera import StereoRig
-from disctrack.chessboard_views import calibrate_recording
+from disctrack.calibrate.views import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
 from disctrack.readers import open_frames
 from disctrack.readers.blocks import iter_pair_blocks
-from disctrack.recording import Recording, read_recording
+from disctrack.recording.declaration import Recording, read_recording
 from disctrack.render import Truth, rig_of, write_recording
-from disctrack.scene import MotionSettings, RollingMotion, Scene
-from disctrack.scene_motion import SceneMotion, motion_of
-from disctrack.tracking import Tracking, track
+from disctrack.scene.description import MotionSettings, RollingMotion, Scene
+from disctrack.scene.motion import SceneMotion, motion_of
+from disctrack.track.tracking import Tracking, track
 from disctrack.trajectory import Trajectory
 from disctrack.validate.comparison import Comparison, compare
 from disctrack.validate.poses import cameras_in_sight, static_poses

@@ -28,15 +28,15 @@ import cv2
 
 from calibration import CalibrationSettings
 from calibration.rig_file import read_rig
-from disctrack.analyse import run_analyse, write_analysis
-from disctrack.analysis import analyse
+from disctrack.analyse.analysis import analyse
+from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.batch import read_summary
 from disctrack.batch.processes import ONE_THREAD
-from disctrack.calibration_stage import calibrate_into, source_of
-from disctrack.pipeline import measure, open_pairs
-from disctrack.recording import read_recording
-from disctrack.storage import Provenance, write_trajectory
-from disctrack.tracking import prepare
+from disctrack.calibrate.stage import calibrate_into, source_of
+from disctrack.files.trajectory_file import Provenance, write_trajectory
+from disctrack.recording.declaration import read_recording
+from disctrack.track.stage import measure, open_pairs
+from disctrack.track.tracking import prepare
 
 PACKAGE = str(Path(__file__).resolve().parents[2])
 

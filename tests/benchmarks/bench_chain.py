@@ -21,10 +21,10 @@ import numpy as np
 from bench_tracking import Timing, plain_script
 
 from calibration.rig_file import read_rig
-from disctrack.pipeline import ImagePairs, measure, open_pairs
 from disctrack.readers.blocks import default_threads
 from disctrack.readers.images import ImageSequence
-from disctrack.recording import Recording, read_recording
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.track.stage import ImagePairs, measure, open_pairs
 
 
 class MappedFrames:

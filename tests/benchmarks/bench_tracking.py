@@ -22,10 +22,10 @@ from scipy.optimize import least_squares
 from calibration.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
-from disctrack.pipeline import ImagePairs, open_pairs
 from disctrack.readers.blocks import PairBlock, default_threads, iter_pair_blocks
-from disctrack.recording import Recording, read_recording
-from disctrack.tracking import Tracking, track
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.track.stage import ImagePairs, open_pairs
+from disctrack.track.tracking import Tracking, track
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from disctrack import render
 from disctrack.disc import MA_2014
-from disctrack.scene import Scene
+from disctrack.scene.description import Scene
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration import CalibrationError, Terms
-from disctrack.dot_target import DotTarget, calibrate_dots, find_dots
+from disctrack.calibrate.dot_target import DotTarget, calibrate_dots, find_dots
 
 TARGET = DotTarget(pitch=3.5e-3, diameter=1.5e-3, x_mark=5, y_mark=3)
 

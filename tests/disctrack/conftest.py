@@ -9,7 +9,7 @@ from calibration.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.render import render_disc, rig_of
-from disctrack.scene import Scene
+from disctrack.scene.description import Scene
 
 
 @dataclass(frozen=True)

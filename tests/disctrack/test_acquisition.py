@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from disctrack import frames
-from disctrack.acquisition import acquire, acquire_from_blobs, dot_blobs, symmetry_order
 from disctrack.disc import MA_2014, disc_from_mm
-from disctrack.pose import marker_pixels
+from disctrack.track.acquisition import acquire, acquire_from_blobs, dot_blobs, symmetry_order
+from disctrack.track.pose import marker_pixels
 
 
 def distance(found, R, t):
@@ -44,7 +44,7 @@ def test_one_camera_is_enough(rendered_pairs):
 
 def test_clutter_and_missing_dots_do_not_mislead(rng):
     from disctrack.render import rig_of
-    from disctrack.scene import Scene
+    from disctrack.scene.description import Scene
 
     rig, disc = rig_of(Scene()), MA_2014
     for trial in range(6):

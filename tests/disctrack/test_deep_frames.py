@@ -8,12 +8,12 @@ from numpy.testing import assert_allclose
 
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
-from disctrack.overlay import draw_pair
 from disctrack.readers.blocks import PairBlock
 from disctrack.render import render_disc, rig_of
-from disctrack.scene import Scene, load_scene
-from disctrack.scene_motion import motion_of
-from disctrack.tracking import Tracking, track
+from disctrack.scene.description import Scene, load_scene
+from disctrack.scene.motion import motion_of
+from disctrack.track.overlay import draw_pair
+from disctrack.track.tracking import Tracking, track
 
 N = 24
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, Settings, diagnose, diagnose_trajectory
-from disctrack.diagnosis.disc_motion import motion_candidates
-from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import fit
-from disctrack.diagnosis.output import as_json
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.pages.output import as_json
 from disctrack.rolling import CATALOGUE
-from disctrack.scene import CameraFault, Faults
+from disctrack.scene.description import CameraFault, Faults
 from tests.oracles.measured_disc import measured
 
 # hidden effect, faults, names of which one must be given (the effect or its class), and the planted values

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose
-from disctrack.diagnosis.disc_motion import motion_candidates
-from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import fit
-from disctrack.diagnosis.row_noise import common_modes
-from disctrack.diagnosis.score import Linearisation, score_all
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.engine.row_noise import common_modes
+from disctrack.diagnosis.engine.score import Linearisation, score_all
 from tests.disctrack.test_diagnosis_engine import START, Oscillator, oscillator
 from tests.oracles.measured_disc import measured
 

@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
-from disctrack.diagnosis.fit import compress, fit, solve_bounded, triangle
-from disctrack.diagnosis.held_out import held_out, training_rows
-from disctrack.diagnosis.score import Linearisation, angle, score_all
-from disctrack.diagnosis.whiteness import ljung_box, whiteness
+from disctrack.diagnosis.engine.fit import compress, fit, solve_bounded, triangle
+from disctrack.diagnosis.engine.held_out import held_out, training_rows
+from disctrack.diagnosis.engine.score import Linearisation, angle, score_all
+from disctrack.diagnosis.engine.whiteness import ljung_box, whiteness
 
 SIGMA = 0.01
 

@@ -5,16 +5,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
-from disctrack.diagnosis.disc_optics import measurement_candidates, predict
-from disctrack.diagnosis.disc_start import first_state
-from disctrack.diagnosis.enlarged import declared_model, model_toml
+from disctrack.diagnosis.disc.model_file import declared_model, model_toml
+from disctrack.diagnosis.disc.optics import measurement_candidates, predict
+from disctrack.diagnosis.disc.start import first_state
 from disctrack.frames import rotation_from_euler
 from disctrack.render import rig_of
 from disctrack.render.cameras import rig_after_faults
 from disctrack.render.recording import true_disc_of
 from disctrack.rolling import simulate
-from disctrack.scene import Faults, load_scene
-from disctrack.scene_motion import rolling_model, rolling_start
+from disctrack.scene.description import Faults, load_scene
+from disctrack.scene.motion import rolling_model, rolling_start
 from tests.oracles.measured_disc import measured
 
 

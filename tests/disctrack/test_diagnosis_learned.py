@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
-from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import Fit, fit
-from disctrack.diagnosis.learned import _law, learn, learned_moment, missing_moment, probe, without_idle_terms
-from disctrack.diagnosis.output import as_json
+from disctrack.diagnosis.disc.learned_law import _law, learn, learned_moment, missing_moment, probe, without_idle_terms
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.pages.output import as_json
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import measured
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import fit
-from disctrack.validate.diagnosis_power import power
-from disctrack.validate.diagnosis_rates import draw, trajectory_of, trial
-from disctrack.validate.hidden_effects import HIDDEN_EFFECTS, Planted, hidden_effect
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, Planted, hidden_effect
+from disctrack.diagnosis.trials.power import power
+from disctrack.diagnosis.trials.rates import draw, trajectory_of, trial
 
 # whose planting takes another way than the prediction: through the renderer's faults, instants, frames, areas
 MEASUREMENT = {e.name for e in HIDDEN_EFFECTS if e.visible and not e.plant(e.size, np.random.default_rng(1)).effects}

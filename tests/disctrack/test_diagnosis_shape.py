@@ -3,10 +3,10 @@
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose, diagnose_trajectory
-from disctrack.diagnosis.disc_motion import motion_candidates
-from disctrack.diagnosis.enlarged import declared_model
-from disctrack.diagnosis.fit import fit
-from disctrack.diagnosis.shape import profiled, refine_shapes
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.engine.shape import profiled, refine_shapes
 from tests.oracles.measured_disc import measured
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc_stretch import free_stretch
-from disctrack.diagnosis.output import as_json
+from disctrack.diagnosis.disc.stretch import free_stretch
+from disctrack.diagnosis.pages.output import as_json
 from disctrack.errors import AnalysisError
 from disctrack.rolling import Model, Regime, simulate, steady_precession
-from disctrack.scene import Faults, Scene
+from disctrack.scene.description import Faults, Scene
 from disctrack.trajectory import MarkerStatus
 from tests.oracles.measured_disc import K_M, measured
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.coloured import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
 from disctrack.examples.ball_drop import analyse_drops, main, settings_for
 from disctrack.examples.ball_system import GRAVITY, STEP, Ball, BallDrops, Drop, fall, read_drops
 

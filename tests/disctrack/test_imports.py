@@ -8,7 +8,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PHYSICS = ("frames", "disc", "trajectory", "rolling", "derivatives", "contact", "energy", "analysis", "least_squares")
+PHYSICS = (
+    "frames",
+    "disc",
+    "trajectory",
+    "rolling",
+    "analyse.derivatives",
+    "analyse.contact",
+    "analyse.energy",
+    "analyse.analysis",
+    "track.least_squares",
+    "track.pose",
+)
 FORBIDDEN = ("cv2", "h5py", "matplotlib", "skimage", "tqdm")
 
 
@@ -17,7 +28,7 @@ def run(code: str) -> subprocess.CompletedProcess:
 
 
 def is_there(module: str) -> bool:
-    base = ROOT / "disctrack" / module
+    base = ROOT / "disctrack" / module.replace(".", "/")
     return base.with_suffix(".py").is_file() or (base / "__init__.py").is_file()
 
 
@@ -29,7 +40,7 @@ def test_physics_imports_no_image_file_or_plot_library(module):
 
 
 def test_the_block_is_felt_where_such_a_library_is_needed():
-    done = run("import sys\nsys.modules['h5py'] = None\nimport disctrack.storage")
+    done = run("import sys\nsys.modules['h5py'] = None\nimport disctrack.files.trajectory_file")
     assert "ModuleNotFoundError" in done.stderr
 
 

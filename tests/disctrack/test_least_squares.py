@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
-from disctrack.least_squares import levenberg_marquardt
+from disctrack.track.least_squares import levenberg_marquardt
 
 
 def rosenbrock(state):

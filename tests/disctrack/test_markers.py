@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack import _kernels as kernels
 from disctrack import frames
-from disctrack.markers import (
+from disctrack.render import expected_disc, render_disc
+from disctrack.track import _kernels as kernels
+from disctrack.track.dots import (
     NoiseModel,
     locate_on_disc,
     locate_on_plane,
     measure_noise,
     normalised_maps,
 )
-from disctrack.render import expected_disc, render_disc
 from disctrack.trajectory import MarkerStatus
 
 SENSOR_NOISE = NoiseModel(0.64 + 1 / 12, 0.02)  # of the default scene: read noise, rounding, 50 electrons per grey

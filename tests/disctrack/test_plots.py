@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from calibration.camera import Camera, StereoRig, rotation_from_vector
-from disctrack import overlay, plots
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, quaternion_from_rotation, rotation_from_euler
+from disctrack.track import figures as plots
+from disctrack.track import overlay
 from disctrack.trajectory import FrameStatus, Trajectory
 
 SIZE = (160, 120)

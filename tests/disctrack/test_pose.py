@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 from disctrack import frames
-from disctrack.pose import fit_poses, marker_pixels, whitening
+from disctrack.track.pose import fit_poses, marker_pixels, whitening
 
 SIGMA_PX = 0.01
 
@@ -28,7 +28,7 @@ def poses(rng, n, theta_max=0.8):
 @pytest.fixture(scope="module")
 def rig():
     from disctrack.render import rig_of
-    from disctrack.scene import Scene
+    from disctrack.scene.description import Scene
 
     return rig_of(Scene())
 

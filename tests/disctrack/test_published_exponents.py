@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.fit import fit
+from disctrack.diagnosis.engine.fit import fit
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents

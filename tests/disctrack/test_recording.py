@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.recording import KEYS, read_recording
+from disctrack.recording.declaration import KEYS, read_recording
 
 REFERENCE = """
 name = "clip"

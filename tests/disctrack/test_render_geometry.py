@@ -11,7 +11,14 @@ from scipy.spatial import ConvexHull
 from disctrack import render
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_euler
-from disctrack.scene import AppearanceSettings, CameraSettings, LightSettings, OpticsSettings, RigSettings, Scene
+from disctrack.scene.description import (
+    AppearanceSettings,
+    CameraSettings,
+    LightSettings,
+    OpticsSettings,
+    RigSettings,
+    Scene,
+)
 
 PLAIN = Scene(
     appearance=AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0),

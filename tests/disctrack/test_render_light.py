@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from disctrack import render
 from disctrack.disc import MA_2014
 from disctrack.render.sensor import digitise
-from disctrack.scene import (
+from disctrack.scene.description import (
     AppearanceSettings,
     CameraSettings,
     GlareSettings,

@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack import render
 from disctrack.errors import OutputError, SceneError
-from disctrack.recording import read_recording
+from disctrack.recording.declaration import read_recording
 from disctrack.render.truth import SCHEMA
-from disctrack.scene import (
+from disctrack.scene.description import (
     BoardSettings,
     CameraFault,
     CameraSettings,
@@ -28,7 +28,7 @@ from disctrack.scene import (
     scene_from_tree,
     scene_toml,
 )
-from disctrack.scene_motion import motion_of
+from disctrack.scene.motion import motion_of
 
 SMALL = Scene(
     name="small",

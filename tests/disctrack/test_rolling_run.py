@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from disctrack.cli import main
 from disctrack.errors import OutputError, SceneError
 from disctrack.rolling import CATALOGUE, effects_from_tables, effects_toml
-from disctrack.rolling.run import run_simulate
+from disctrack.scene.simulation import run_simulate
 
 SCENE = """
 name = "roll"

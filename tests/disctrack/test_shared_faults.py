@@ -7,11 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from disctrack.as_built import declared_places_kept
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion
-from disctrack.scene import CameraFault, Faults
-from disctrack.shared_faults import without_shared_faults
+from disctrack.scene.description import CameraFault, Faults
+from disctrack.track.as_printed import declared_places_kept
+from disctrack.track.own_scatter import without_shared_faults
 from tests.oracles.measured_disc import measured
 
 N = 160

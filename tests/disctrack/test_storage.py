@@ -18,12 +18,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.camera import N_RIG, Camera, StereoRig
-from disctrack import storage
 from disctrack.disc import MA_2014
 from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
-from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
-from disctrack.labelled import Variable
-from disctrack.storage import (
+from disctrack.files import trajectory_file as storage
+from disctrack.files.labelled_arrays import Variable
+from disctrack.files.trajectory_file import (
     Provenance,
     is_result_of,
     read_group,
@@ -33,6 +32,7 @@ from disctrack.storage import (
     write_group,
     write_trajectory,
 )
+from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.trajectory import FrameStatus, Trajectory
 
 PROVENANCE = Provenance("clip", {"images": "ab" * 32}, {"refine": True})
@@ -297,7 +297,7 @@ def test_a_file_cut_off_by_the_system_is_removed(file, trajectory):
         import resource, signal, sys
         from pathlib import Path
         from disctrack.errors import OutputError
-        from disctrack.storage import read_provenance, read_trajectory, write_trajectory
+        from disctrack.files.trajectory_file import read_provenance, read_trajectory, write_trajectory
         path = Path(sys.argv[1])
         trajectory, provenance = read_trajectory(path), read_provenance(path)
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -320,7 +320,7 @@ def test_a_killed_writer_leaves_nothing_that_looks_whole(file, trajectory):
     code = """
         import os, sys, time
         from pathlib import Path
-        from disctrack.storage import read_provenance, read_trajectory, write_trajectory
+        from disctrack.files.trajectory_file import read_provenance, read_trajectory, write_trajectory
         path = Path(sys.argv[1])
         trajectory, provenance = read_trajectory(path), read_provenance(path)
         def wait(descriptor):

@@ -8,7 +8,7 @@ import pytest
 from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.render import render_disc
-from disctrack.tracking import TrackingSettings, track
+from disctrack.track.tracking import TrackingSettings, track
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 N = 60
@@ -76,7 +76,7 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
 def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pairs, monkeypatch):
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    monkeypatch.setattr("disctrack.tracking.SHORTEST_SPLIT", 20)
+    monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 20)
     one, two = (
         track(blocks_of(images, size=15), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=workers)
         for workers in (1, 2)
@@ -93,7 +93,7 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
 
 
 def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
-    monkeypatch.setattr("disctrack.tracking.SHORTEST_SPLIT", 4)
+    monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 4)
     images = rolling[0].copy()
     images[:20] = 85  # no disc in the first of four stretches of 15 pairs, nor at the start of the second
     runs = [
@@ -109,11 +109,11 @@ def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first
 
 def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rolling, rendered_pairs, monkeypatch):
     """Without the dot that breaks the symmetry, the search takes the layout as it comes; the motion tells better."""
-    from disctrack import tracking
+    from disctrack.track import tracking
 
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    monkeypatch.setattr("disctrack.tracking.SHORTEST_SPLIT", 20)
+    monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 20)
     found, third = tracking.acquire, np.array([[-0.5, -np.sqrt(0.75), 0], [np.sqrt(0.75), -0.5, 0], [0, 0, 1.0]])
     starts = {images[k, 0].tobytes() for k in (30, 31)}
 
@@ -134,7 +134,7 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
 
 
 def test_an_empty_scene_is_searched_once_and_a_disc_put_there_is_found_at_once(rolling, rendered_pairs, monkeypatch):
-    from disctrack import tracking
+    from disctrack.track import tracking
 
     searched = []
     found = tracking.acquire

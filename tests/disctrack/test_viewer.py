@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.analysis import analyse
+from disctrack.analyse.analysis import analyse
+from disctrack.analyse.viewer import _cylinder, _normals, write_rerun
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
-from disctrack.viewer import _cylinder, _normals, write_rerun
 from tests.oracles.measured_disc import measured
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.render.recording import write_recording
-from disctrack.scene import (
+from disctrack.scene.description import (
     BoardSettings,
     CameraSettings,
     Faults,
@@ -19,7 +19,7 @@ from disctrack.scene import (
     RigSettings,
     Scene,
 )
-from disctrack.scene_motion import SceneMotion
+from disctrack.scene.motion import SceneMotion
 from tests.oracles import newton_euler
 
 K_M = 0.381e-7

@@ -1,6 +1,6 @@
-"""Measured trajectories of a disc without rendering, for tests: see disctrack.validate.hidden."""
+"""Measured trajectories of a disc without rendering, for tests: see disctrack.diagnosis.trials.recordings."""
 
-from disctrack.validate.hidden import (
+from disctrack.diagnosis.trials.recordings import (
     CORNER_SIGMA_PX,
     K_M,
     SIGMA_PX,

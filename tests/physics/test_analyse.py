@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.analyse import run_analyse, write_analysis
-from disctrack.analysis import analyse
+from disctrack.analyse.analysis import analyse
+from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError, TrajectoryFileError
+from disctrack.files.trajectory_file import Provenance, read_group, read_trajectory, write_trajectory
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
-from disctrack.pipeline import at_full_length
-from disctrack.storage import Provenance, read_group, read_trajectory, write_trajectory
+from disctrack.track.stage import at_full_length
 from disctrack.trajectory import FrameStatus
 
 

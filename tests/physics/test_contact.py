@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.contact import analyse_contact, contact_quantities
-from disctrack.derivatives import differentiate
+from disctrack.analyse.contact import analyse_contact, contact_quantities
+from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.propagation import State
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_euler
-from disctrack.propagation import State
 from disctrack.rolling import CATALOGUE, Model, simulate
 from disctrack.rolling import State as RollingState
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.derivatives import differentiate
+from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.propagation import propagate, rates
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_vector, vector_from_rotation
-from disctrack.propagation import propagate, rates
 
 QUANTITIES = ("position", "rotation", "velocity", "omega", "acceleration", "alpha")
 MOTIONS = {

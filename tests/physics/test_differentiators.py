@@ -17,7 +17,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 
-from disctrack.derivatives import differentiate
+from disctrack.analyse.derivatives import differentiate
 
 INTERVAL = 1e-3
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.derivatives import differentiate
+from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.energy import analyse_energy, energy_quantities, steady_precession_rate
+from disctrack.analyse.propagation import State
 from disctrack.disc import MA_2014
-from disctrack.energy import analyse_energy, energy_quantities, steady_precession_rate
-from disctrack.propagation import State
 
 TOTAL, POWER, ADIABATIC, LEVEL = 5, 6, 7, 8
 

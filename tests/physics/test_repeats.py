@@ -11,15 +11,15 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import optimize, stats
 
-from disctrack.analyse import write_analysis
-from disctrack.analysis import analyse
+from disctrack.analyse.analysis import analyse
+from disctrack.analyse.stage import write_analysis
 from disctrack.disc import MA_2014
+from disctrack.files.trajectory_file import Provenance, write_trajectory
 from disctrack.repeats import compare, write
 from disctrack.repeats.alignment import Curves, align
 from disctrack.repeats.averages import average
 from disctrack.repeats.runs import INDEX, QUANTITIES, UNKNOWN, Measured, Run, k_m_of_energy
 from disctrack.repeats.spread import independent_samples, spread
-from disctrack.storage import Provenance, write_trajectory
 
 # of one smoothed frame, in the order of QUANTITIES: what the analysis of a recorded motion states at 5 degrees
 SIGMA = np.array([0.15e-6, 0.15e-6, 0.15e-6, 1e-4, 6e-6, 1e-4, 0.03, 1e-6])

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from disctrack.analyse import run_analyse
-from disctrack.storage import Provenance, write_trajectory
+from disctrack.analyse.stage import run_analyse
+from disctrack.files.trajectory_file import Provenance, write_trajectory
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BLUE_BGR = np.array([0x8B, 0x6F, 0x1F])  # of the curves

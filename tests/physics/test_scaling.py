@@ -7,11 +7,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
 
-from disctrack.derivatives import differentiate
+from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.energy import analyse_energy, energy_quantities
+from disctrack.analyse.power_laws import (
+    count_nutation,
+    exponents_by_window,
+    fit_power_laws,
+    nutation_ratio,
+    power_law_end,
+)
+from disctrack.analyse.propagation import State, propagate, rates
 from disctrack.disc import MA_2014
-from disctrack.energy import analyse_energy, energy_quantities
-from disctrack.propagation import State, propagate, rates
-from disctrack.scaling import count_nutation, exponents_by_window, fit_power_laws, nutation_ratio, power_law_end
 
 
 def known_law(n, rng, nutation=0.1, duration=0.6, unseen=0.03):

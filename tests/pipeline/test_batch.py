@@ -15,15 +15,15 @@ import cv2
 import numpy as np
 import pytest
 
-from disctrack.analysis import CIRCLE_DURATION, WINDOW
+from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOW
 from disctrack.batch import BatchOptions, find_recordings, read_summary, run_batch
 from disctrack.batch import measure as stage
 from disctrack.batch.plan import Places, make_plan
 from disctrack.batch.records import read_record
 from disctrack.cli import main
-from disctrack.storage import read_trajectory
-from disctrack.tracking import prepare
-from disctrack.whole_files import output_error
+from disctrack.files.trajectory_file import read_trajectory
+from disctrack.files.whole import output_error
+from disctrack.track.tracking import prepare
 
 FAST = ["--no-report"]
 MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
@@ -161,7 +161,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_that_looks_whole(one, recording,
     def full(path, *_, **__):
         raise output_error(path, OSError(28, "No space left on device"))
 
-    monkeypatch.setattr("disctrack.storage.write_whole", full)
+    monkeypatch.setattr("disctrack.files.trajectory_file.write_whole", full)
     result = stage.do(one)
     assert result.status == "failed"
     assert "disk is full" in result.record.reason

@@ -9,10 +9,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.rig_file import read_rig
-from disctrack.chessboard_views import find_views
+from disctrack.calibrate.views import find_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
-from disctrack.storage import read_findings, read_trajectory
+from disctrack.files.trajectory_file import read_findings, read_trajectory
 from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]

@@ -13,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.cli import COMMANDS, main
-from disctrack.storage import read_findings, read_trajectory
+from disctrack.files.trajectory_file import read_findings, read_trajectory
 from disctrack.trajectory import FrameStatus
 
 QUICK = ["--no-figures", "--no-video"]

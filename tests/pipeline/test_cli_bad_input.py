@@ -14,9 +14,9 @@ import h5py
 import numpy as np
 import pytest
 
-from disctrack import whole_files
 from disctrack.cli import main
-from disctrack.storage import read_trajectory
+from disctrack.files import whole as whole_files
+from disctrack.files.trajectory_file import read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 

@@ -1,9 +1,9 @@
 """`disctrack render` from the command line."""
 
 from disctrack.cli import main
-from disctrack.recording import read_recording
+from disctrack.recording.declaration import read_recording
 from disctrack.render import read_truth
-from disctrack.scene import load_scene, scene_toml
+from disctrack.scene.description import load_scene, scene_toml
 
 SCENE = """
 name = "tiny"

@@ -7,7 +7,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.render.recording import write_recording
-from disctrack.scene import CameraSettings, Faults, MotionSettings, RollingMotion, Scene
+from disctrack.scene.description import CameraSettings, Faults, MotionSettings, RollingMotion, Scene
 
 
 def render_hidden(folder, effects, seed, n_frames=90, faults=None, **start):

@@ -1,0 +1,286 @@
+"""What happens where the disc touches the table: slip, locus, forces, and since when it rolls.
+
+A is the lowest point of the lower edge, r_OA = -r e2 - h e3. Components are along n0 = e1, m0 = k x n0 and k.
+Against the printed equation (2.3) of Ma et al. 2014: its first line is the n0 component and its second the m0 component
+(the labels are exchanged), and its third line has r thetadot cos theta, because z = r sin theta + h cos theta.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.analyse.derivatives import Motion
+from disctrack.analyse.propagation import Propagated, Series, State, propagate
+from disctrack.disc import Disc
+
+Array = NDArray[np.float64]
+
+K = np.array([0.0, 0.0, 1.0])
+CONTACT = (
+    ("contact_x", "m", "contact point, x"),
+    ("contact_y", "m", "contact point, y"),
+    ("contact_z", "m", "lowest point of the edge above the table"),
+    ("slip_n", "m s-1", "velocity of the material point at the contact along n0 = e1"),
+    ("slip_m", "m s-1", "velocity of the material point at the contact along m0 = k x n0"),
+    ("slip_z", "m s-1", "velocity of the material point at the contact, upwards"),
+    ("locus_n", "m s-1", "velocity of the point of touch along n0"),
+    ("locus_m", "m s-1", "velocity of the point of touch along m0"),
+    ("force_n", "N", "contact force along n0"),
+    ("force_m", "N", "contact force along m0"),
+    ("force_z", "N", "normal contact force"),
+    ("friction_needed", "1", "horizontal over normal contact force"),
+)
+PLANE, SLIP = slice(0, 2), slice(3, 5)
+
+# What a calibrated radius, thickness and table (1e-4 each) leave of slip at the rates of a rolling disc (1 to 5 m/s at
+# the edge) is a few tenths of a millimetre per second: slip below this is rolling for every purpose.
+SLIP_TOLERANCE = 0.5e-3  # [m/s]
+# Noise of a smoothed velocity is independent after about 0.6 l (half a period of the smoother's cut-off).
+INDEPENDENT_AFTER_LENGTHS = 0.6
+
+
+@dataclass(frozen=True)
+class RollingOnset:
+    """Since when the disc rolls without slip, as a probability over the frames."""
+
+    time: float  # [s] median; the first frame when slip before it is not shown; NaN when it does not roll
+    low: float  # [s] 2.5 % point
+    high: float  # [s] 97.5 % point
+    probability: float  # that there is pure rolling at the end of the recording
+    slip_distance: float  # [m] path of slip before the onset (of the whole recording when it never rolls)
+    slip_distance_sigma: float  # [m]
+    chi_square_rolling: float  # mean squared slip over its variance from the onset on; 1 when the model holds
+    n_late_slips: int  # frames after the onset whose slip exceeds 5 sigma
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Circle fitted to the contact locus in the plane of the table."""
+
+    centre: Array  # (2,) [m]; NaN when the arc does not determine it
+    radius: float  # [m]
+    sigma: float  # [m] of the radius, noise and what the locus does beside a circle
+    sigma_calibration: float  # [m]
+    rms: float  # [m] of the distances from the circle
+    arc: float  # [rad] travelled
+    expected: float  # [m] mean of r cos theta - h sin theta, the radius when the centre rests
+    start: float  # [s]
+    end: float  # [s]
+
+
+def r_OA(state: State, disc: Disc) -> Array:
+    """Arm (n, 3) from the centre to the contact, world axes [m]."""
+    _, e2, e3 = state.axes()
+    return -disc.radius * e2 - disc.half_thickness * e3
+
+
+def contact_velocity_material(state: State, disc: Disc) -> Array:
+    """Velocity (n, 3) of the disc's own point at the contact, world axes [m/s]: v_O + omega x r_OA, eq. (2.3)."""
+    return state.velocity + np.cross(state.omega_world, r_OA(state, disc))
+
+
+def contact_velocity_locus(state: State, disc: Disc) -> Array:
+    """Velocity (n, 3) of the moving point of touch, world axes [m/s]: v_O + Omega_R x r_OA.
+
+    Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant.
+    """
+    e1, e2, _ = state.axes()
+    thetadot = np.sum(state.omega_world * e1, axis=1)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        psidot = (np.sum(state.omega_world * e2, axis=1) / state.sine)[:, None]
+    return state.velocity + np.cross(thetadot * e1 + psidot * K, r_OA(state, disc))
+
+
+def contact_force(state: State, disc: Disc, gravity: float) -> Array:
+    """Force (n, 3) of the table on the disc, world axes [N], from Newton's law with nothing else acting: eq. (2.6)."""
+    return disc.mass * (state.acceleration + gravity * K)
+
+
+def contact_quantities(state: State, disc: Disc, gravity: float) -> Array:
+    """All of CONTACT, (n, 12)."""
+    n0, _, _ = state.axes()
+    m0 = np.cross(K, n0)
+    point = state.position + r_OA(state, disc)
+    slip, locus = contact_velocity_material(state, disc), contact_velocity_locus(state, disc)
+    force = contact_force(state, disc, gravity)
+    along = [np.sum(v * axis, axis=1) for v, axis in ((slip, n0), (slip, m0))]
+    along += [slip[:, 2]]
+    along += [np.sum(v * axis, axis=1) for v, axis in ((locus, n0), (locus, m0), (force, n0), (force, m0))]
+    needed = np.where(force[:, 2] > 0, np.hypot(along[-2], along[-1]) / np.abs(force[:, 2]), np.nan)
+    return np.column_stack([point, *along, force[:, 2], needed])
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact of a recording."""
+
+    series: tuple[Series, ...]
+    onset: RollingOnset
+    circle: Circle
+    propagated: Propagated
+
+
+def analyse_contact(motion: Motion, circle_duration: float = 0.6, until: float = np.inf) -> Contact:
+    """Contact point, slip, locus, forces; onset of rolling; circle through the locus of the last `circle_duration`.
+
+    until : end of the rolling motion [s]; a disc that is being stopped, or lies still, says nothing about rolling
+    """
+    found = propagate(motion, lambda state: contact_quantities(state, motion.disc, motion.gravity))
+    return Contact(
+        series=found.series(CONTACT),
+        onset=rolling_onset(motion, found, until=until),
+        circle=locus_circle(motion, found, circle_duration, until),
+        propagated=found,
+    )
+
+
+def rolling_onset(
+    motion: Motion, found: Propagated, tolerance: float = SLIP_TOLERANCE, until: float = np.inf
+) -> RollingOnset:
+    """Change from slip to rolling: posterior over the first rolling frame, flat prior, slip of unknown size before it.
+
+    Before the onset each slip component has variance s^2 + noise, s unknown between 4 `tolerance` and 10 m/s, after
+    it tolerance^2 + noise. Neighbouring frames share noise: their likelihoods are weighed by the independent share.
+    """
+    frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1) & (motion.time <= until))
+    if frames.size < 2:
+        return _no_onset("the contact velocity is not known in any two frames")
+    v = found.value[frames, SLIP]
+    C = found.covariance_at(frames, SLIP) + found.calibration_covariance_at(frames, SLIP)
+    interval = float(np.median(np.diff(motion.time)))
+    share = np.minimum(1.0, interval / (INDEPENDENT_AFTER_LENGTHS * motion.length.min(axis=1)[frames]))
+    sizes = np.geomspace(max(4 * tolerance, 1e-5), 10.0, 60)
+    slipping = np.stack([_log_normal(v, C, s) * share for s in sizes])
+    rolling = _log_normal(v, C, tolerance) * share
+    before = np.concatenate([np.zeros((len(sizes), 1)), np.cumsum(slipping, axis=1)], axis=1)
+    after = np.concatenate([np.cumsum(rolling[::-1])[::-1], [0.0]])
+    log_joint = before + after  # (sizes, frames + 1): rolling from frame k on; the last entry is "never"
+    peak = log_joint.max()
+    posterior = np.exp(log_joint - peak).mean(axis=0)
+    posterior /= posterior.sum()
+    return _describe_onset(motion, frames, v, C, posterior, share, tolerance)
+
+
+def _log_normal(v: Array, C: Array, extra: float) -> Array:
+    """Logarithm of the density of v (n, 2) with covariance C + extra^2 I."""
+    a, b, d = C[:, 0, 0] + extra**2, C[:, 0, 1], C[:, 1, 1] + extra**2
+    det = a * d - b * b
+    misfit = (d * v[:, 0] ** 2 - 2 * b * v[:, 0] * v[:, 1] + a * v[:, 1] ** 2) / det
+    return -0.5 * (misfit + np.log(det))
+
+
+def _describe_onset(
+    motion: Motion,
+    frames: NDArray[np.int64],
+    v: Array,
+    C: Array,
+    posterior: Array,
+    share: Array,
+    tolerance: float,
+) -> RollingOnset:
+    probability = float(1.0 - posterior[-1])
+    index = np.searchsorted(np.cumsum(posterior), [0.025, 0.5, 0.975])
+    times = np.append(motion.time[frames], np.nan)
+    low, median, high = (float(times[min(i, len(frames))]) for i in index)
+    first = 0 if index[0] == 0 else int(min(index[1], len(frames)))
+    distance, distance_sigma = _slip_distance(motion.time[frames[:first]], v[:first], C[:first], share[:first])
+    total = C + tolerance**2 * np.eye(2)
+    squared = np.einsum("ni,nij,nj->n", v, np.linalg.inv(total), v)
+    late = squared[first:]
+    if probability < 0.5:
+        verdict = "slips to the end of the recording; no pure rolling was reached"
+        low = median = high = np.nan
+    elif index[0] == 0:
+        median = low
+        verdict = f"rolls without slip from the first frame on (95 %: at the latest from {high:.4f} s)"
+    else:
+        verdict = f"rolls without slip from {median:.4f} s on (95 %: {low:.4f} to {high:.4f} s)"
+    return RollingOnset(
+        time=median,
+        low=low,
+        high=high,
+        probability=probability,
+        slip_distance=distance,
+        slip_distance_sigma=distance_sigma,
+        chi_square_rolling=float(late.mean() / 2) if late.size else float("nan"),
+        n_late_slips=int(np.sum(late > 25.0)),
+        verdict=verdict,
+    )
+
+
+def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float, float]:
+    """Integral of |v| and its sigma; the square of the noise, which adds to |v|, is taken off first."""
+    if len(time) < 2:
+        return 0.0, 0.0
+    noise2 = np.trace(C, axis1=1, axis2=2)
+    speed = np.sqrt(np.maximum(np.sum(v * v, axis=1) - noise2, 0.0))
+    step = np.diff(time)
+    weight = 0.5 * (np.append(step, 0.0) + np.append(0.0, step))  # trapezoidal rule
+    variance = np.sum(weight**2 * noise2 / 2 / share)
+    return float(np.sum(speed * weight)), float(np.sqrt(variance))
+
+
+def _no_onset(reason: str) -> RollingOnset:
+    nan = float("nan")
+    return RollingOnset(nan, nan, nan, nan, nan, nan, nan, 0, f"not determined: {reason}")
+
+
+def locus_circle(motion: Motion, found: Propagated, duration: float, until: float = np.inf) -> Circle:
+    """Circle through the contact points of the last `duration` seconds before `until`, least squares of distances.
+
+    Its sigma comes from the scatter about the circle with as many independent points as half turns; radii of arcs
+    below a quarter turn are not given.
+    """
+    known = np.flatnonzero(np.isfinite(found.value[:, :2]).all(axis=1) & (motion.time <= until))
+    nan = float("nan")
+    nothing = Circle(np.full(2, nan), nan, nan, nan, nan, nan, nan, nan, nan)
+    if known.size < 8:
+        return nothing
+    frames = known[motion.time[known] >= motion.time[known[-1]] - duration]
+    points = found.value[frames, :2]
+    arc = float(np.ptp(motion.euler[frames, 0]))
+    if arc < np.pi / 2:
+        return nothing
+    centre, radius = _fit_circle(points)
+    offset = points - centre
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    J = np.column_stack([offset / distance[:, None], np.ones(len(frames))])
+    gain = np.linalg.solve(J.T @ J, J.T)
+    residual = distance - radius
+    independent = min(len(frames), max(4.0, arc / np.pi))
+    noise = np.einsum("i,nij,j->n", [1.0, 1.0], found.covariance_at(frames, PLANE), [1.0, 1.0]).mean() / 2
+    variance = (gain[2] @ gain[2]) * len(frames) / independent * max(float(np.mean(residual**2)), float(noise))
+    per_rig = gain[2] @ np.einsum("ni,nir->nr", J[:, :2], found.sensitivity_at(frames, PLANE))
+    theta = motion.euler[frames, 1]
+    expected = motion.disc.radius * np.cos(theta) - motion.disc.half_thickness * np.sin(theta)
+    return Circle(
+        centre=centre,
+        radius=float(radius),
+        sigma=float(np.sqrt(variance)),
+        sigma_calibration=float(np.sqrt(max(0.0, per_rig @ found.rig_covariance @ per_rig))),
+        rms=float(np.sqrt(np.mean(residual**2))),
+        arc=arc,
+        expected=float(np.mean(expected)),
+        start=float(motion.time[frames[0]]),
+        end=float(motion.time[frames[-1]]),
+    )
+
+
+def _fit_circle(points: Array, iterations: int = 50) -> tuple[Array, float]:
+    """Centre (2,) and radius: algebraic start, then Gauss-Newton on the distances."""
+    A = np.column_stack([2 * points, np.ones(len(points))])
+    a, b, c = np.linalg.lstsq(A, np.sum(points**2, axis=1), rcond=None)[0]
+    centre, radius = np.array([a, b]), float(np.sqrt(max(c + a * a + b * b, 0.0)))
+    for _ in range(iterations):
+        offset = points - centre
+        distance = np.hypot(offset[:, 0], offset[:, 1])
+        J = np.column_stack([offset / distance[:, None], np.ones(len(points))])
+        step = np.linalg.lstsq(J, distance - radius, rcond=None)[0]
+        centre, radius = centre + step[:2], radius + step[2]
+        if np.abs(step).max() < 1e-14:
+            break
+    return centre, float(radius)

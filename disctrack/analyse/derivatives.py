@@ -1,0 +1,355 @@
+"""From poses to velocities and accelerations, with their covariance.
+
+Position is differentiated in R^3. Rotation is differentiated on its own manifold: relative to the pose of the frame in
+question, M_k = R_k R_i^T, the vector s_k = vee((M_k - M_k^T) / 2) is the rotation vector to second order, a linear
+function of R_k, regular at every angle; at frame i its first two derivatives are the angular velocity and the angular
+acceleration in world axes. Euler rates are then read off the angular velocity, never off the Euler angles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from calibration.camera import N_RIG
+from disctrack.analyse.smoothing import (
+    HALF_WINDOW_LENGTHS,
+    SEGMENT,
+    Process,
+    fit_process,
+    joined,
+    moving_weights,
+)
+from disctrack.disc import Disc
+from disctrack.errors import AnalysisError
+from disctrack.frames import (
+    euler_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    skew,
+    unwrap_euler,
+)
+from disctrack.trajectory import FrameStatus, Trajectory
+
+Array = NDArray[np.float64]
+
+STATE = (
+    *(f"position_{axis}" for axis in "xyz"),
+    *(f"rotation_{axis}" for axis in "xyz"),
+    *(f"velocity_{axis}" for axis in "xyz"),
+    *(f"omega_{axis}" for axis in "xyz"),
+    *(f"acceleration_{axis}" for axis in "xyz"),
+    *(f"alpha_{axis}" for axis in "xyz"),
+)
+N_STATE = len(STATE)  # 18
+CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
+GROUP_OF_CHANNEL = np.array([0, 0, 1, 2, 2, 3])
+GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
+FRAMES_AT_ONCE = 1024
+MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
+KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Pose and its first two derivatives in every frame; NaN where the samples do not determine them."""
+
+    time: Array  # (n,) [s]
+    position: Array  # (n, 3) centre, world axes [m]
+    R_world_body: Array  # (n, 3, 3)
+    velocity: Array  # (n, 3) of the centre [m/s]
+    omega_world: Array  # (n, 3) [rad/s]
+    acceleration: Array  # (n, 3) [m/s^2]
+    alpha_world: Array  # (n, 3) d omega / dt [rad/s^2]
+    covariance: Array  # (n, 18, 18) in the order of STATE, from the noise of the poses; rotation as in frames.py
+    calibration_sensitivity: Array  # (n, 18, 30) d STATE / d RIG_PARAMETERS, common to all frames
+    measured: NDArray[np.bool_]  # (n,) False where the frame was bridged
+    euler: Array  # (n, 3) psi, theta, phi [rad], unwrapped
+    length: Array  # (n, 4) length of the process per group [s]
+    noise_scale: Array  # (4,) variance found in the data over variance stated, per group
+    disc: Disc
+    gravity: float  # [m/s^2]
+    rig_covariance: Array  # (30, 30)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(n,) True where the motion is a number."""
+        return np.asarray(np.isfinite(self.omega_world).all(axis=1))
+
+    @property
+    def state(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Position, rotation, velocity, omega, acceleration, alpha."""
+        return self.position, self.R_world_body, self.velocity, self.omega_world, self.acceleration, self.alpha_world
+
+
+def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Motion:
+    """Velocities and accelerations of a measured trajectory.
+
+    breaks : instants [s] at which the acceleration jumps (slip ends, something is hit); before and after are
+    differentiated apart, with the larger sigmas that ends have. A break that leaves fewer than MIN_FRAMES poses on a
+    side is passed over.
+    Raises AnalysisError when too few frames have a pose, or time does not increase.
+    """
+    time = np.asarray(trajectory.time, float)
+    good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))
+    _require_samples(time, good)
+    interval = float(np.median(np.diff(time)))
+    samples = _Samples(
+        ticks=(time - time[0]) / interval,
+        position=np.where(good[:, None], trajectory.q[:, :3], 0.0),
+        R=_bridged_rotations(time, trajectory.quaternion, good),
+        covariance=np.where(good[:, None, None], trajectory.pose_covariance, 0.0),
+        sensitivity=_usable_sensitivity(trajectory, good),
+        good=good,
+        part=_parts(time, good, breaks),
+    )
+    processes = _fit_groups(samples)
+    state, R, covariance, sensitivity = _smoothed(samples, processes)
+    per_order = interval ** -np.arange(3.0)
+    state *= per_order[:, None]
+    scale = np.repeat(per_order, 6)
+    covariance *= np.outer(scale, scale)
+    sensitivity *= scale[:, None]
+    _rates_of_turned_frame(sensitivity, state)
+    return Motion(
+        time=time,
+        position=state[:, 0, :3],
+        R_world_body=R,
+        velocity=state[:, 1, :3],
+        omega_world=state[:, 1, 3:],
+        acceleration=state[:, 2, :3],
+        alpha_world=state[:, 2, 3:],
+        covariance=covariance,
+        calibration_sensitivity=sensitivity,
+        measured=good,
+        euler=_euler_near(R, trajectory.q[:, 3:]),
+        length=np.stack([p.length for p in processes], axis=1) * interval,
+        noise_scale=np.array([p.noise_scale for p in processes]),
+        disc=trajectory.disc,
+        gravity=trajectory.gravity,
+        rig_covariance=trajectory.rig.covariance,
+    )
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """What is differentiated; time in frame intervals."""
+
+    ticks: Array  # (n,)
+    position: Array  # (n, 3), 0 where not measured
+    R: Array  # (n, 3, 3), gaps bridged along the shortest arc
+    covariance: Array  # (n, 6, 6), 0 where not measured
+    sensitivity: Array  # (n, 6, 30)
+    good: NDArray[np.bool_]  # (n,)
+    part: NDArray[np.int64]  # (n,) number of the stretch between breaks
+
+    @property
+    def variance(self) -> Array:
+        """(n, 6), infinite where not measured."""
+        return np.where(self.good[:, None], np.diagonal(self.covariance, axis1=1, axis2=2), np.inf)
+
+
+def _require_samples(time: Array, good: NDArray[np.bool_]) -> None:
+    if good.sum() < MIN_FRAMES:
+        raise AnalysisError(
+            f"only {int(good.sum())} of {len(good)} frames have a pose, but at least {MIN_FRAMES} are needed to tell "
+            "motion from noise: track more frames, or look at frame_status for why the poses are missing."
+        )
+    backwards = np.flatnonzero(~(np.diff(time) > 0))
+    if backwards.size:
+        raise AnalysisError(
+            f"time does not increase from frame {backwards[0]} to {backwards[0] + 1} "
+            f"({time[backwards[0]]} s to {time[backwards[0] + 1]} s): sort the frames, or correct the frame rate."
+        )
+
+
+def _parts(time: Array, good: NDArray[np.bool_], breaks: Sequence[float]) -> NDArray[np.int64]:
+    """Number of the stretch (n,) that each frame belongs to."""
+    kept: list[float] = []
+    for instant in sorted(breaks):
+        since_last = good & (time < instant) & (time >= (kept[-1] if kept else -np.inf))
+        if min(since_last.sum(), (good & (time >= instant)).sum()) >= MIN_FRAMES:
+            kept.append(instant)
+    return np.searchsorted(np.array(kept), time, side="right")
+
+
+def _bridged_rotations(time: Array, quaternion: Array, good: NDArray[np.bool_]) -> Array:
+    """R_world_body (n, 3, 3), missing frames on the shortest arc between their neighbours, held at the ends."""
+    R = rotation_from_quaternion(np.where(good[:, None], quaternion, np.array([1.0, 0.0, 0.0, 0.0])))
+    missing = ~good
+    if missing.any():
+        arc = Slerp(time[good], Rotation.from_matrix(R[good]))
+        R[missing] = arc(np.clip(time[missing], time[good][0], time[good][-1])).as_matrix()
+    return R
+
+
+def _usable_sensitivity(trajectory: Trajectory, good: NDArray[np.bool_]) -> Array:
+    """Sensitivity (n, 6, 30) to the rig; where a camera was missing, that of the nearest complete frame.
+
+    A pose from one camera depends on the rig in another way, and the jump must not be differentiated.
+    """
+    S = trajectory.calibration_sensitivity
+    complete = good & np.isfinite(S).all(axis=(1, 2)) & (trajectory.frame_status == FrameStatus.MEASURED)
+    if not complete.any():
+        return np.full((len(good), 6, N_RIG), np.nan)
+    frames = np.flatnonzero(complete)
+    after = np.clip(np.searchsorted(frames, np.arange(len(good))), 0, len(frames) - 1)
+    before = np.clip(after - 1, 0, None)
+    nearer_before = np.arange(len(good)) - frames[before] < frames[after] - np.arange(len(good))
+    return S[frames[np.where(nearer_before, before, after)]]
+
+
+def _fit_groups(samples: _Samples) -> tuple[Process, ...]:
+    """One process per group of CHANNEL_GROUPS, fitted to each stretch between breaks."""
+    by_part = []
+    for number in np.unique(samples.part):
+        frames = np.flatnonzero(samples.part == number)
+        segments, centres = _segments(samples, frames)
+        by_part.append(
+            [
+                fit_process([(t, d[list(g)], v[list(g)]) for t, d, v in segments], centres, len(frames))
+                for g in CHANNEL_GROUPS
+            ]
+        )
+    return tuple(joined(fits) for fits in zip(*by_part, strict=True))
+
+
+def _segments(samples: _Samples, frames: NDArray[np.int64]) -> tuple[list[tuple[Array, Array, Array]], Array]:
+    """Overlapping segments (times, data, variance) of a stretch of frames, and the middles that they stand for."""
+    n = len(frames)
+    starts = np.arange(0, max(1, n - SEGMENT // 2), SEGMENT // 2)
+    segments, centres = [], []
+    for start in starts:
+        stop = n if start == starts[-1] else start + SEGMENT
+        used = frames[start:stop][samples.good[frames[start:stop]]]
+        if len(used) < MIN_FRAMES:
+            continue
+        s, gain = _sine_vectors(samples.R[used], samples.R[used[len(used) // 2]])
+        data = np.concatenate([samples.position[used], s], axis=1).T
+        noise = gain @ samples.covariance[used] @ gain.swapaxes(1, 2)
+        segments.append((samples.ticks[used] - samples.ticks[used[0]], data, np.diagonal(noise, axis1=1, axis2=2).T))
+        centres.append((start + stop) / 2)
+    if not segments:
+        raise AnalysisError(
+            f"nowhere do {MIN_FRAMES} of {SEGMENT} neighbouring frames have a pose: the motion between them cannot be "
+            "told. Track the recording again with better exposure, or look at frame_status for the reasons."
+        )
+    return segments, np.array(centres)
+
+
+def _sine_vectors(R: Array, R_reference: Array) -> tuple[Array, Array]:
+    """Antisymmetric part of M = R R_reference^T as a vector (..., 3), sin(angle) times the axis; and its gain.
+
+    A rotation error e (R' = exp(e) R) enters as (tr(M) I - M) e / 2; the gain (..., 6, 6) has this block for the
+    rotation and the identity for the position.
+    """
+    M = R @ np.swapaxes(R_reference, -1, -2)
+    s = 0.5 * np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], -1)
+    gain = np.zeros((*M.shape[:-2], 6, 6))
+    gain[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    gain[..., 3:, 3:] = 0.5 * (np.trace(M, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - M)
+    return s, gain
+
+
+def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array, Array, Array, Array]:
+    """State (n, 3 orders, 6), R (n, 3, 3), covariance (n, 18, 18), sensitivity (n, 18, 30), all per interval.
+
+    NaN in a gap where the samples around it leave more than KNOWN_FRACTION of the slope's own variance open.
+    """
+    n = len(samples.ticks)
+    half = int(np.ceil(HALF_WINDOW_LENGTHS * max(p.length.max() for p in processes)))
+    scale = np.zeros(6)
+    for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
+        scale[list(group)] = np.sqrt(process.noise_scale)
+    noise = samples.covariance * np.outer(scale, scale)
+    out = (
+        np.empty((n, 3, 6)),
+        np.empty((n, 3, 3)),
+        np.empty((n, 18, 18)),
+        np.empty((n, 18, samples.sensitivity.shape[2])),
+    )
+    for first in range(0, n, FRAMES_AT_ONCE):  # the windows of all frames at once would be as large as all the rest
+        rows = np.arange(first, min(first + FRAMES_AT_ONCE, n))
+        weights, prior, unknown = _weights_and_prior(samples, processes, half, rows)
+        for k in range(0, len(rows), FRAMES_AT_ONCE // 8):
+            some = slice(k, k + FRAMES_AT_ONCE // 8)
+            parts = _smoothed_rows(samples, noise, rows[some], weights[some][:, GROUP_OF_CHANNEL], half)
+            for whole, part in zip(out, parts, strict=True):
+                whole[rows[some]] = part
+        for channel in range(6):
+            entries = channel + 6 * np.arange(3)
+            out[2][rows[:, None, None], entries[:, None], entries] += prior[:, channel]
+        for whole in out:
+            whole[rows[unknown]] = np.nan
+    return out
+
+
+def _weights_and_prior(
+    samples: _Samples, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """For k rows: weights (k, groups, 3, w), prior covariance (k, 6, 3, 3), True where that leaves too much open."""
+    k = len(rows)
+    weights, prior = np.zeros((k, len(CHANNEL_GROUPS), 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
+    unknown = np.zeros(k, bool)
+    for number, (group, process) in enumerate(zip(CHANNEL_GROUPS, processes, strict=True)):
+        channels = list(group)
+        variance = samples.variance[:, channels].mean(axis=1)
+        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, samples.part, rows)
+        prior[:, channels] = P[:, None]
+        open_fraction = P[:, 1, 1] * process.length[rows] ** 2 / process.amplitude2[rows]
+        unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))
+    return weights, prior, unknown
+
+
+def _smoothed_rows(
+    samples: _Samples, noise: Array, rows: NDArray[np.int64], weights: Array, half: int
+) -> tuple[Array, Array, Array, Array]:
+    """Apply the weights (k, 6, 3, w) of some frames to the samples round them."""
+    window = np.clip(rows[:, None] + np.arange(-half, half + 1), 0, len(samples.ticks) - 1)
+    R = samples.R[rows]
+    for _ in range(2):  # the second time relative to the smoothed pose itself, where s and the rotation vector agree
+        s, _ = _sine_vectors(samples.R[window], R[:, None])
+        R = rotation_from_vector(np.einsum("kcw,kwc->kc", weights[:, 3:, 0], s)) @ R
+    s, gain = _sine_vectors(samples.R[window], R[:, None])
+    noise_window = gain @ noise[window] @ gain.swapaxes(-1, -2)
+    data = np.concatenate([samples.position[window], s], axis=-1)
+    state = np.einsum("kcow,kwc->koc", weights, data)
+    channel = np.repeat(np.arange(6), 3)
+    by_order = np.arange(18).reshape(6, 3).T.ravel()  # to order-major, as STATE
+    covariance = np.empty((len(rows), 18, 18))
+    for c in range(6):
+        for d in range(c, 6):
+            a, b = channel == c, channel == d
+            block = (weights[:, c] * noise_window[..., c, d][:, None]) @ weights[:, d].swapaxes(1, 2)
+            covariance[:, np.ix_(a, b)[0], np.ix_(a, b)[1]] = block
+            covariance[:, np.ix_(b, a)[0], np.ix_(b, a)[1]] = block.swapaxes(1, 2)
+    sensitivity = np.concatenate([weights[:, c] @ samples.sensitivity[window, c] for c in range(6)], axis=1)
+    return state, R, covariance[:, by_order][:, :, by_order], sensitivity[:, by_order]
+
+
+def _rates_of_turned_frame(sensitivity: Array, state: Array) -> None:
+    """Complete, in place, d omega and d alpha for a rotation error delta(t) that turns the frame: R' = exp(delta) R.
+
+    omega' = omega + delta' + delta x omega,  alpha' = alpha + delta'' + delta' x omega + delta x alpha.
+    """
+    turn, rate = sensitivity[:, 3:6].copy(), sensitivity[:, 9:12].copy()
+    omega, alpha = skew(state[:, 1, 3:]), skew(state[:, 2, 3:])
+    sensitivity[:, 9:12] -= omega @ turn
+    sensitivity[:, 15:18] -= omega @ rate + alpha @ turn
+
+
+def _euler_near(R: Array, reference: Array) -> Array:
+    """Unwrapped psi, theta, phi (n, 3) on the branch of the first measured reference angles."""
+    euler = unwrap_euler(euler_from_rotation(R))
+    both = np.flatnonzero(np.isfinite(euler).all(axis=1) & np.isfinite(reference).all(axis=1))
+    if both.size:
+        turns = np.round((reference[both[0]] - euler[both[0]]) / (2 * np.pi))
+        euler = euler + 2 * np.pi * np.array([turns[0], 0.0, turns[2]])
+    return euler

@@ -1,0 +1,121 @@
+"""Mechanical energy of the disc, where it sits, and how fast it goes.
+
+Equation (2.10) of Ma et al. 2014 with the datum at rest: m g (z - h) instead of m g z, or a power law in the time to
+the end is not possible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.analyse.contact import K
+from disctrack.analyse.derivatives import Motion
+from disctrack.analyse.propagation import Propagated, Series, State, propagate
+from disctrack.disc import Disc
+
+Array = NDArray[np.float64]
+
+ENERGY = (
+    ("translation", "J", "kinetic energy of the centre"),
+    ("rotation_1", "J", "kinetic energy of the rotation about e1"),
+    ("rotation_2", "J", "kinetic energy of the rotation about e2"),
+    ("rotation_3", "J", "kinetic energy of the rotation about e3"),
+    ("potential", "J", "potential energy, zero at rest (z = h)"),
+    ("total", "J", "mechanical energy, zero at rest"),
+    ("power", "W", "rate of change of the mechanical energy"),
+    ("adiabatic", "J", "3/2 m g r sin theta, the energy of slow steady precession of a thin disc"),
+    ("precession_level", "s-2", "psidot^2 sin theta; 4 g / r in slow steady precession of a thin disc"),
+)
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energy of a recording."""
+
+    series: tuple[Series, ...]
+    propagated: Propagated
+    loss: float  # [J] from the first to the last known frame, positive when lost
+    loss_sigma: float  # [J] noise
+    loss_sigma_calibration: float  # [J]; most of the calibration's error is common to both ends and cancels
+    level_ratio: float  # mean of psidot^2 sin theta over 4 g / r, over whole nutation periods if there are any
+    level_ratio_sigma: float  # from the scatter about it
+    level_ratio_steady: float  # what steady precession of this disc with its centre at rest has at the median theta
+
+
+def energy_quantities(state: State, disc: Disc, gravity: float) -> Array:
+    """All of ENERGY, (n, 9)."""
+    m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
+    e1, e2, e3 = state.axes()
+    omega = [np.sum(state.omega_world * e, axis=1) for e in (e1, e2, e3)]
+    translation = 0.5 * m * np.sum(state.velocity**2, axis=1)
+    rotation = [0.5 * J * w**2 for J, w in zip((J1, J1, J3), omega, strict=True)]
+    potential = m * gravity * (state.position[:, 2] - disc.half_thickness)
+    # omega . d(J omega)/dt = omega . J alpha, since omega . (omega x J omega) = 0
+    inertia_alpha = J1 * state.alpha_world + (J3 - J1) * np.sum(state.alpha_world * e3, axis=1)[:, None] * e3
+    power = m * np.sum(state.velocity * (state.acceleration + gravity * K), axis=1)
+    power = power + np.sum(state.omega_world * inertia_alpha, axis=1)
+    s = state.sine
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = omega[1] ** 2 / s
+    total = translation + rotation[0] + rotation[1] + rotation[2] + potential
+    return np.column_stack(
+        [translation, *rotation, potential, total, power, 1.5 * m * gravity * disc.radius * s, level]
+    )
+
+
+def analyse_energy(motion: Motion) -> Energy:
+    """Energies with both uncertainties, loss over the recording, and the adiabatic level."""
+    found = propagate(motion, lambda state: energy_quantities(state, motion.disc, motion.gravity))
+    loss, noise, common = _loss(found)
+    ratio, ratio_sigma = _level_ratio(motion, found.value[:, 8])
+    theta = motion.euler[np.isfinite(found.value[:, 8]), 1]
+    steady = float("nan")
+    if theta.size:
+        typical = float(np.median(theta))
+        steady = steady_precession_rate(typical, motion.disc, motion.gravity) ** 2 * np.sin(typical)
+        steady = float(steady / (4 * motion.gravity / motion.disc.radius))
+    return Energy(found.series(ENERGY), found, loss, noise, common, ratio, ratio_sigma, steady)
+
+
+def steady_precession_rate(theta: float, disc: Disc, gravity: float) -> float:
+    """Precession rate [rad/s] at constant nutation theta [rad] with the centre at rest: omega_3 = h psidot s / r.
+
+    First of equations (2.9) with all rates constant: (2.11) with I2 in place of J1 and one sin theta less in its
+    mixed term than printed.
+    """
+    m, r, h = disc.mass, disc.radius, disc.half_thickness
+    I2, I3 = disc.moment_diametral + m * h * h, disc.moment_axial + m * r * r
+    s, c = np.sin(theta), np.cos(theta)
+    stiffness = I2 * s * c - (I3 * s + m * r * h * c) * h * s / r + m * r * h * s * s
+    return float(np.sqrt(m * gravity * (r * c - h * s) / stiffness))
+
+
+def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:
+    known = np.flatnonzero(np.isfinite(found.value[:, column]))
+    if known.size < 2:
+        return (float("nan"),) * 3
+    first, last = known[0], known[-1]
+    ends, this = known[[0, -1]], slice(column, column + 1)
+    noise = found.covariance_at(ends, this).sum()
+    before, after = found.sensitivity_at(ends, this)[:, 0]
+    difference = after - before
+    common = max(0.0, float(difference @ found.rig_covariance @ difference))
+    return float(found.value[first, column] - found.value[last, column]), float(np.sqrt(noise)), float(np.sqrt(common))
+
+
+def _level_ratio(motion: Motion, level: Array) -> tuple[float, float]:
+    """Mean of level / (4 g / r) weighted evenly over the turns of precession, and its scatter per turn."""
+    known = np.flatnonzero(np.isfinite(level))
+    if known.size < 2:
+        return float("nan"), float("nan")
+    ratio = level[known] / (4 * motion.gravity / motion.disc.radius)
+    turns = np.floor((motion.euler[known, 0] - motion.euler[known[0], 0]) / (2 * np.pi)).astype(int)
+    turns = turns - turns.min()
+    counts = np.bincount(turns)
+    means = np.bincount(turns, ratio)[counts > 0] / counts[counts > 0]
+    if len(means) < 2:
+        return float(ratio.mean()), float(ratio.std())
+    return float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means)))

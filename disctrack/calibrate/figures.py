@@ -1,0 +1,98 @@
+"""Pictures of a calibration: what the corners leave unexplained, and which part of the images they cover."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from calibration import StereoCalibration
+from disctrack.frames import CAMERAS
+from disctrack.track.figures import COLOURS, INK
+
+COVERAGE_CELLS = 8
+
+
+def residuals_figure(found: StereoCalibration) -> Figure:
+    """Observed - predicted corners as arrows in each image, and their root mean square per view."""
+    figure = Figure(figsize=(12, 9), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
+    refinement = found.refinement
+    lengths = np.linalg.norm(refinement.residuals[refinement.kept], axis=1)
+    typical = float(np.median(lengths)) or 1.0
+    for camera, name in enumerate(CAMERAS):
+        axes = figure.add_subplot(grid[0, camera])
+        _arrows(axes, found, camera, typical)
+        axes.set_title(f"{name}: rms {found.rms_per_camera_px[camera]:.4f} px", color=INK, fontsize=10)
+    _views(figure.add_subplot(grid[1, :]), found)
+    figure.suptitle(f"Calibration residuals (arrows {_magnification(found, typical):.0f} times longer; red: not used)")
+    return figure
+
+
+def _magnification(found: StereoCalibration, typical: float) -> float:
+    """So that the typical arrow is about 1/40 of the image's width; one leading digit, to be read at a glance."""
+    wanted = found.rig.left.image_size[0] / 40 / typical
+    return float(f"{wanted:.0e}")
+
+
+def _arrows(axes: Axes, found: StereoCalibration, camera: int, typical: float) -> None:
+    refinement, scale = found.refinement, _magnification(found, typical)
+    mine = refinement.observations.camera == camera
+    for select, colour, most in ((refinement.kept, COLOURS[CAMERAS[camera]], np.inf), (~refinement.kept, "red", 4.0)):
+        pixels = refinement.observations.pixels[mine & select]
+        arrows = refinement.residuals[mine & select] * scale
+        length = np.linalg.norm(arrows, axis=1, keepdims=True)
+        arrows = arrows * np.minimum(1.0, most * typical * scale / np.maximum(length, 1e-12))
+        axes.quiver(*pixels.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=colour, width=0.0015, alpha=0.7)
+    _image_frame(axes, found, camera)
+
+
+def _views(axes: Axes, found: StereoCalibration) -> None:
+    rms = found.rms_per_view_px
+    place = np.arange(len(rms))
+    for camera, name in enumerate(CAMERAS):
+        axes.bar(place + 0.4 * (camera - 0.5), np.nan_to_num(rms[:, camera]), 0.38, color=COLOURS[name], label=name)
+    for view in found.rejected_views:
+        axes.text(view, 0, "not used", rotation=90, ha="center", va="bottom", fontsize=7, color="red")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("view")
+    axes.set_ylabel("rms (px)")
+    axes.set_xlim(-0.6, len(rms) - 0.4)
+    axes.legend(frameon=False, fontsize=8)
+    axes.grid(alpha=0.25, axis="y")
+
+
+def coverage_figure(found: StereoCalibration) -> Figure:
+    """Used corners in each image over the cells that hold any; distortion is a guess where there is none."""
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    observations, kept = found.refinement.observations, found.refinement.kept
+    for camera, (name, axes) in enumerate(zip(CAMERAS, figure.subplots(1, 2), strict=True)):
+        pixels = observations.pixels[kept & (observations.camera == camera)]
+        width, height = found.rig.cameras[camera].image_size
+        edges = [np.linspace(-0.5, size - 0.5, COVERAGE_CELLS + 1) for size in (width, height)]
+        counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)
+        shading = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, cmap="GnBu", vmin=-0.2 * counts.max())
+        figure.colorbar(shading, ax=axes, label="corners in the cell", shrink=0.7)
+        axes.plot(*pixels.T, ".", color=INK, markersize=1.5, alpha=0.5)
+        _image_frame(axes, found, camera)
+        axes.set_title(f"{name}: {np.mean(counts > 0):.0%} of the cells hold a corner", color=INK, fontsize=10)
+    figure.suptitle("Coverage of the images by calibration corners")
+    return figure
+
+
+def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
+    width, height = found.rig.cameras[camera].image_size
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (px)")
+    axes.set_ylabel("y (px)")
+
+
+FIGURES: dict[str, Callable[[StereoCalibration], Figure]] = {
+    "residuals": residuals_figure,
+    "coverage": coverage_figure,
+}

@@ -1,0 +1,162 @@
+"""Calibration from files to a file: where the views come from, reuse of a rig, the rig file, the pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+
+from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
+from calibration.rig_file import read_rig, write_rig
+from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
+from disctrack.errors import OutputError, RecordingError, RigFileError
+from disctrack.files.trajectory_file import Provenance
+from disctrack.files.whole import whole_file
+from disctrack.progress import progress_bar
+from disctrack.recording.declaration import Recording
+from disctrack.track import summary
+
+
+@dataclass(frozen=True)
+class CalibrationSource:
+    """Everything that a calibration depends on."""
+
+    name: str
+    views: ChessboardImages
+    board: Board
+    table_view: int | None
+    board_thickness: float  # [m]
+    settings: CalibrationSettings
+
+    @property
+    def provenance(self) -> Provenance:
+        """Reads the views' content."""
+        return Provenance(
+            recording=self.name,
+            inputs={"calibration views": self.views.sha256()},
+            settings={
+                "inner_corners": list(self.board.inner_corners),
+                "square_m": self.board.square,
+                "table_view": self.table_view,
+                "board_thickness_m": self.board_thickness,
+                "distortion": self.settings.distortion,
+                "board": self.settings.board,
+                "equal_aspect": self.settings.equal_aspect,
+            },
+        )
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The rig, what to tell about it, and the files it went to."""
+
+    rig: StereoRig
+    lines: list[str]
+    files: list[Path]
+
+
+def source_of(recording: Recording, settings: CalibrationSettings) -> CalibrationSource:
+    """Views, board and table of a recording that has them."""
+    chessboard, table = recording.chessboard, recording.table
+    if chessboard is None or table is None:
+        raise RecordingError(
+            f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
+            "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
+        )
+    return CalibrationSource(
+        recording.name,
+        find_views(chessboard.left, chessboard.right, recording.folder),
+        Board(chessboard.inner_corners, chessboard.square),
+        table.view,
+        table.board_thickness,
+        settings,
+    )
+
+
+def given_rig(file: Path) -> CalibrationResult:
+    """A rig that a recording shares with others. Raises RigFileError."""
+    rig = read_rig(file)
+    return CalibrationResult(rig, [f"{'calibration':<13} {file}: baseline {rig.baseline * 1e3:.3f} mm"], [])
+
+
+def calibrate_into(path: Path, source: CalibrationSource, overwrite: bool, figures: bool) -> CalibrationResult:
+    """Calibrate, or reuse the rig that is there; write rig and pictures.
+
+    Raises OutputError if `path` holds something else and may not be replaced.
+    """
+    provenance = source.provenance
+    if path.exists() and not overwrite:
+        lines = _reusable(path, provenance)
+        if lines is None:
+            raise OutputError(
+                f"{path}: exists, and is not the complete result of these views, settings and version. Keep it and "
+                "choose another place with -o, or replace it with --overwrite."
+            )
+        reused = f"{'reused':<13} {path}: complete result of the same views, settings and version"
+        return CalibrationResult(read_rig(path), [reused, *lines], [path])
+    found, problems = _calibrate(source)
+    lines = summary.calibration_lines(found, problems)
+    with whole_file(path, suffix=".h5") as part:
+        write_rig(part, found)
+        buffer = io.BytesIO(part.read_bytes())  # a disk that fills up fails in one plain write, not inside HDF5
+        with h5py.File(buffer, "r+") as file:
+            file.attrs["fingerprint"] = provenance.fingerprint
+            file.attrs["inputs_sha256"] = json.dumps(dict(provenance.inputs))
+            file.attrs["settings"] = json.dumps(dict(provenance.settings))
+            file.attrs["software_version"] = provenance.version
+            file.attrs["summary"] = json.dumps(lines)
+            file.attrs["complete"] = 1
+        part.write_bytes(buffer.getbuffer())
+    files = [path]
+    if figures:
+        from disctrack.calibrate.figures import FIGURES
+        from disctrack.track.figures import save_figure
+
+        prefix = "calibration" if path.stem == "rig" else f"{path.stem}_calibration"
+        files += [save_figure(make(found), path.with_name(f"{prefix}_{name}.png")) for name, make in FIGURES.items()]
+    return CalibrationResult(found.rig, lines, files)
+
+
+def is_rig_of(path: Path, source: CalibrationSource) -> bool:
+    """True if `path` is the complete rig of these views, settings and version, so that it can be reused."""
+    try:
+        return path.is_file() and _reusable(path, source.provenance) is not None
+    except RigFileError:
+        return False
+
+
+def _reusable(path: Path, provenance: Provenance) -> list[str] | None:
+    """Summary of the rig in `path` if it was made, completely, from the same; None otherwise."""
+    try:
+        with h5py.File(path, "r") as file:
+            same = file.attrs.get("fingerprint") == provenance.fingerprint and int(file.attrs.get("complete", 0)) == 1
+            return list(json.loads(file.attrs["summary"])) if same else None
+    except Exception as error:  # the HDF5 library raises many kinds on damaged files
+        raise RigFileError(
+            f"{path}: exists and is not a readable rig file ({' '.join(str(error).split())[:120]}). Move it away, or "
+            "replace it with --overwrite."
+        ) from error
+
+
+def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:
+    with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
+        done = 0
+
+        def report(stage: str, now: int, total: int) -> None:
+            nonlocal done
+            if total:
+                advance(now - done)
+                done = now
+
+        return calibrate_views(
+            source.views,
+            source.board,
+            source.table_view,
+            source.board_thickness,
+            dataclasses.replace(source.settings),
+            report,
+        )

@@ -1,0 +1,179 @@
+"""The calibration views of a recording, or of two file patterns, brought to the calibration."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from numpy.typing import NDArray
+
+from calibration import Board, CalibrationSettings, StereoCalibration, calibrate_stereo
+from calibration.stereo import Progress
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.readers import IMAGE_SUFFIXES, FrameReader, open_frames, split_member
+from disctrack.readers.files import file_number, match_files
+from disctrack.readers.images import decode
+from disctrack.recording.declaration import Recording
+
+MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """A view that is one frame of a file that holds many."""
+
+    file: Path
+    reader: FrameReader
+    index: int
+
+    def __str__(self) -> str:
+        return self.reader.describe(self.index)
+
+    @property
+    def name(self) -> str:
+        """The frame, for messages that name the file apart."""
+        return f"frame {self.index}"
+
+
+View = Path | FrameView
+
+
+@dataclass(frozen=True)
+class ChessboardImages:
+    """Synchronised views; number i of the left and of the right show the board in the same place."""
+
+    left: tuple[View, ...]
+    right: tuple[View, ...]
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    @property
+    def place(self) -> Path:
+        """Where the left views lie, for messages."""
+        first = self.left[0]
+        return first.file if isinstance(first, FrameView) else first.parent
+
+    def sha256(self) -> str:
+        """SHA-256 (hex) of all views' content, in order."""
+        digest = hashlib.sha256()
+        for side in (self.left, self.right):
+            for view in side:
+                if not isinstance(view, FrameView):
+                    digest.update(hashlib.sha256(_content(view)).digest())
+                elif view.index == 0:
+                    digest.update(view.reader.content_sha256(0, len(side)).encode())
+        return digest.hexdigest()
+
+
+def find_views(left: str, right: str, folder: Path) -> ChessboardImages:
+    """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
+
+    Raises RecordingError if they do not pair up.
+    """
+    sides = [_views_of(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
+    views = ChessboardImages(*sides)
+    numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
+    if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
+        _refuse_unpaired(views, numbers)
+    return views
+
+
+def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
+    files = match_files(split_member(pattern)[0], folder, camera)
+    suffix = files[0].suffix.lower()
+    if suffix in IMAGE_SUFFIXES and not (len(files) == 1 and suffix in (".tif", ".tiff")):
+        return tuple(files)
+    reader = open_frames(pattern, folder, camera)
+    if suffix in IMAGE_SUFFIXES and len(reader) == 1:
+        return tuple(files)
+    if len(reader) > MOST_VIEWS:
+        raise RecordingError(
+            f"{files[0]}: {len(reader)} frames for the {camera} camera, and every frame is a view of the chessboard. "
+            f"Export at most {MOST_VIEWS} of them; 20 to 40 in different places are enough."
+        )
+    return tuple(FrameView(files[0], reader, index) for index in range(len(reader)))
+
+
+def _refuse_unpaired(views: ChessboardImages, numbers: Sequence[Sequence[int | None]]) -> None:
+    """Different counts are an error; equal counts are, too, where the numbers overlap but for a few."""
+    files = views.left, views.right
+    alone = [
+        [file for file, number in zip(files[c], numbers[c], strict=True) if number not in numbers[1 - c]]
+        for c in (0, 1)
+    ]
+    if len(files[0]) == len(files[1]) and len(alone[0]) in (0, len(files[0])):
+        return  # no number in common: the two cameras count from different starts
+    odd = [f"{CAMERAS[c]} {', '.join(file.name for file in alone[c][:3])}" for c in (0, 1) if alone[c]]
+    raise RecordingError(
+        f"{views.place}: {len(files[0])} left and {len(files[1])} right calibration views do not pair up"
+        + (f": without a partner are {' and '.join(odd)}" if odd else "")
+        + ". Views are pairs, one image of each camera: add the missing ones, or move these away."
+    )
+
+
+def calibrate_recording(
+    recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
+) -> tuple[StereoCalibration, tuple[str, ...]]:
+    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
+    chessboard, table = recording.chessboard, recording.table
+    if chessboard is None or table is None:
+        raise RecordingError(
+            f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
+            "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
+        )
+    views = find_views(chessboard.left, chessboard.right, recording.folder)
+    board = Board(chessboard.inner_corners, chessboard.square)
+    return calibrate_views(views, board, table.view, table.board_thickness, settings, progress)
+
+
+def calibrate_views(
+    views: ChessboardImages,
+    board: Board,
+    table_view: int | None = None,
+    board_thickness: float = 0.0,
+    settings: CalibrationSettings | None = None,
+    progress: Progress | None = None,
+) -> tuple[StereoCalibration, tuple[str, ...]]:
+    """Calibrate from files; views that cannot be read are left out, and named in the second item.
+
+    table_view : index among all views; board_thickness [m]
+    Raises RecordingError if the table view cannot be read, CalibrationError if the views do not allow a calibration.
+    """
+    if table_view is not None and table_view >= len(views):
+        raise RecordingError(
+            f"{views.place}: [table] view = {table_view}, but there are {len(views)} calibration views, "
+            "counted from 0. Name the view whose board lies flat on the table."
+        )
+    images: tuple[list[NDArray], list[NDArray]] = ([], [])
+    used, problems = [], []
+    for i, pair in enumerate(zip(views.left, views.right, strict=True)):
+        try:
+            left, right = (_pixels(view, f"{view} (calibration view {i})") for view in pair)
+        except RecordingError as error:
+            if i == table_view:
+                raise RecordingError(f"{error} It is the table view: without it there is no lab frame.") from error
+            problems.append(f"calibration view {i} is left out: {error}")
+            continue
+        used.append(i)
+        images[0].append(left)
+        images[1].append(right)
+    names = [(str(views.left[i]), str(views.right[i])) for i in used]
+    position = None if table_view is None else used.index(table_view)
+    found = calibrate_stereo(*images, board, settings, position, board_thickness, names, progress)
+    return found, tuple(problems)
+
+
+def _pixels(view: View, where: str) -> NDArray:
+    """Grey values or colours of a view. Raises RecordingError, which begins with `where` or names the frame."""
+    return view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), where)
+
+
+def _content(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}. Copy it again.") from error

@@ -1,0 +1,52 @@
+"""What the diagnosis of a trajectory of the disc holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from disctrack.diagnosis.disc.errors import Errors
+from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment
+from disctrack.diagnosis.disc.separation import Separation
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.engine.fit import Fit
+from disctrack.diagnosis.engine.held_out import HeldOut
+from disctrack.diagnosis.engine.search import Diagnosis
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A law outside the catalogue, fitted like an effect."""
+
+    law: LearnedLaw
+    fit: Fit
+    held_out: HeldOut
+    gain: float  # decrease of chi-square in units of the noise found
+    held_out_gain: float
+    power: float  # mean over the recording [W]; negative where it takes energy from the disc
+
+
+@dataclass(frozen=True)
+class DiscDiagnosis:
+    """Diagnosis of one trajectory of the disc."""
+
+    system: DiscSystem
+    diagnosis: Diagnosis
+    model: str
+    sentence: str
+    before: Errors | None  # None where the base fit did not converge
+    after: Errors | None
+    energy: dict[str, float]  # [J]
+    moment: MissingMoment | None = None  # that the model fails to supply, where it was asked for
+    learned: Learned | None = None
+    separated_by: dict[str, dict[str, Separation | None]] = field(default_factory=dict)  # effect -> rival -> recording
+    notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
+
+    @property
+    def after_fit(self) -> Fit:
+        """Fit of the enlarged model."""
+        return self.learned.fit if self.learned else self.diagnosis.after
+
+    @property
+    def after_held_out(self) -> HeldOut | None:
+        """Its free run."""
+        return self.learned.held_out if self.learned else self.diagnosis.held_out_after

@@ -1,0 +1,95 @@
+"""Effects of the motion, from the rolling model's catalogue, as candidates of the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.rolling import CATALOGUE, Effect, Model, Parameter, State
+from disctrack.rolling.effects import FORMULAS
+
+# Parameters of one effect that act so differently that each part is a question of its own.
+_PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
+SLIP = "slip.inverse_mu"
+STATE_SCALES = {
+    "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,
+}  # fmt: skip
+_STATE_UNITS = dict(zip(STATE_SCALES, ("m", "m", "rad", "rad", "rad", "rad/s", "rad/s", "rad/s"), strict=True))
+
+
+def state_quantities() -> tuple[Quantity, ...]:
+    """The eight numbers of the initial state."""
+    return tuple(
+        Quantity(f"state.{name}", _STATE_UNITS[name], scale, meaning="at the first instant")
+        for name, scale in STATE_SCALES.items()
+    )
+
+
+def state_of(values: Values) -> State:
+    """Initial state among the values; with v_x, v_y the disc may slip at first."""
+    return State(**{k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")})
+
+
+SLIP_VELOCITY = ("state.v_x", "state.v_y")
+
+
+def slipping_start_quantities(model: Model) -> tuple[Quantity, ...]:
+    """Velocity of the centre at the first instant, and 1/mu unless the model has a coefficient of friction already."""
+    velocity = tuple(
+        Quantity(name, "m/s", 1e-3, meaning="velocity of the centre at the first instant") for name in SLIP_VELOCITY
+    )
+    return velocity if model.effect("slip") else (*velocity, *slip_candidate(CATALOGUE["slip"]).quantities)
+
+
+def effect_quantity(effect: type[Effect], parameter: Parameter) -> Quantity:
+    """A parameter of an effect as the engine wants it."""
+    null = parameter.nominal if parameter.is_shape else parameter.null
+    return Quantity(
+        f"{effect.name}.{parameter.name}",
+        parameter.unit,
+        0.01 * abs(parameter.nominal),
+        null=null,
+        lower=parameter.lower,
+        upper=parameter.upper,
+        meaning=parameter.meaning,
+        typical=abs(parameter.nominal),
+    )
+
+
+def model_quantities(model: Model) -> tuple[Quantity, ...]:
+    """Parameters of the effects that the model declares: they are fitted, in their bounds."""
+    return tuple(
+        effect_quantity(type(effect), p) for effect in model.effects for p in effect.parameters if not p.is_shape
+    )
+
+
+def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple[Candidate, ...]:
+    """Every effect of the catalogue that may be proposed and that the model does not have yet.
+
+    names : only these effects, if given
+    """
+    present = {effect.name for effect in model.effects}
+    found = []
+    for effect in (*CATALOGUE.values(), *(FORMULAS[n] for n in names or () if n in FORMULAS)):
+        wanted = names is None or effect.name in names
+        if not (wanted and effect.candidate) or effect.name in present:
+            continue
+        amounts = [p for p in effect.parameters if not p.is_shape and np.isfinite(p.null)]
+        if not amounts and effect.name != "slip":
+            continue
+        parts = _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)} if amounts else {})
+        for name, members in parts.items():
+            quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
+            shape = tuple(effect_quantity(effect, p) for p in effect.parameters if p.is_shape)
+            found.append(Candidate(name, effect.name, "motion", effect.title, effect.source, quantities, shape=shape))
+        if effect.name == "slip":
+            found.append(slip_candidate(effect))
+    return tuple(found)
+
+
+def slip_candidate(effect: type[Effect]) -> Candidate:
+    """Slip by 1/mu, which is zero where the disc never slips; without a derivative until it slips somewhere."""
+    inverse = Quantity(SLIP, "1", 0.1, lower=0.0, upper=1e3, typical=10.0, meaning="1 / coefficient of friction")
+    return Candidate(effect.name, effect.name, "motion", effect.title, effect.source, (inverse,), threshold=True)

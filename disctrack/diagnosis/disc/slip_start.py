@@ -1,0 +1,181 @@
+"""Recordings that begin in slip: the disc was hit, and rolls only after friction has stopped its sliding.
+
+Rolling from the first frame on is tried first. Where that fails, the contact's velocity decides, which needs no model
+of the motion; slip is then fitted by its coefficient and the velocity at the first instant, and where no coefficient
+describes it, the diagnosis begins where rolling does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from disctrack.analyse.contact import RollingOnset, analyse_contact
+from disctrack.analyse.derivatives import differentiate
+from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, slip_candidate
+from disctrack.diagnosis.disc.start import first_slip
+from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
+from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
+from disctrack.diagnosis.engine.system import Candidate
+from disctrack.errors import AnalysisError
+from disctrack.rolling import CATALOGUE, Model
+from disctrack.trajectory import Trajectory, part
+
+LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
+MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
+SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
+
+
+@dataclass(frozen=True)
+class SlipStart:
+    """Slip at the beginning as a finding: what the model without it makes of the recording."""
+
+    without: Fit  # rolling from the first frame on
+    held_out: HeldOut
+    candidate: Candidate
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Diagnosis of a motion that may begin in slip."""
+
+    system: DiscSystem
+    diagnosis: Diagnosis  # of the model with slip, where the disc slips
+    slip: SlipStart | None = None
+    notes: tuple[str, ...] = ()
+
+
+def diagnose_motion(
+    trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings | None = None
+) -> Answer:
+    """Diagnose the motion, rolling or slipping at its start. Raises AnalysisError."""
+    settings = settings or Settings()
+    stretch = free_stretch(trajectory)
+    rolling = DiscSystem(trajectory, model, stretch=stretch)
+    base = fit(rolling, rolling.base, rolling.start(faults))
+    may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
+    onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
+    if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
+        return _slipping(trajectory, model, faults, settings, rolling, base, onset)
+    if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
+        slipping = DiscSystem(trajectory, model, stretch=stretch, starts_in_slip=True)
+        alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
+        if _at_noise(slipping, alone, settings):
+            return _slipping(trajectory, model, faults, settings, rolling, base, onset)
+    return Answer(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
+
+
+def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:
+    return fit_.converged and fit_.reduced_chi_square <= settings.at_noise * noise_variance(system, fit_)
+
+
+def _onset(trajectory: Trajectory, stretch: Stretch) -> RollingOnset | None:
+    """When rolling begins, from the contact's velocity; None where the velocities cannot be had."""
+    try:
+        return analyse_contact(differentiate(part(trajectory, stretch.rows))).onset
+    except AnalysisError:
+        return None
+
+
+def _slipping(
+    trajectory: Trajectory,
+    model: Model,
+    faults: Mapping[str, float],
+    settings: Settings,
+    rolling: DiscSystem,
+    base: Fit,
+    onset: RollingOnset,
+) -> Answer:
+    """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
+    system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True)
+    diagnosis = diagnose(system, system.start(faults), settings)
+    if diagnosis.verdict == "unexplained" and np.isfinite(onset.high):
+        later = _after_slip(trajectory, model, faults, settings, onset, diagnosis)
+        if later is not None:
+            return later
+    if diagnosis.held_out_after is None or not _declares(system):
+        return Answer(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis)))
+    rows = training_rows(system, settings.train_fraction)
+    judged = diagnosis.judged or system
+    slip = SlipStart(base, held_out(judged, base.quantities, base.values, rows), _candidate(system))
+    return Answer(system, diagnosis, slip, (*system.stretch.notes, *_in_words(system, diagnosis)))
+
+
+def _declares(system: DiscSystem) -> bool:
+    """Is friction part of what was fitted, and not of the model that was given?"""
+    return SLIP in {q.name for q in system.base}
+
+
+def _after_slip(
+    trajectory: Trajectory,
+    model: Model,
+    faults: Mapping[str, float],
+    settings: Settings,
+    onset: RollingOnset,
+    slipping: Diagnosis,
+) -> Answer | None:
+    """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
+    try:
+        system = DiscSystem(trajectory, model, stretch=free_stretch(trajectory, onset.high))
+    except AnalysisError:
+        return None
+    diagnosis = diagnose(system, system.start(faults), settings)
+    if diagnosis.verdict == "unexplained":
+        return None
+    left = f"chi-square {slipping.after.reduced_chi_square:.3g}" if slipping.after.converged else "no fit"
+    note = (
+        f"the disc slips until {onset.time:.4f} s (95 %: {onset.low:.4f} to {onset.high:.4f} s), and no coefficient of "
+        f"friction describes that ({left}): this is the diagnosis of what comes after it"
+    )
+    return Answer(system, diagnosis, notes=(*system.stretch.notes, note))
+
+
+def _candidate(system: DiscSystem) -> Candidate:
+    usual = slip_candidate(CATALOGUE["slip"])
+    fitted = {q.name: q for q in system.base}
+    quantities = tuple(fitted[name] for name in (SLIP, *SLIP_VELOCITY))
+    title = "the disc slips at first, with Coulomb friction |F_t| = mu F_z"
+    return Candidate("slip_start", usual.effect, "motion", title, usual.source, quantities)
+
+
+def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:
+    from disctrack.diagnosis.disc.errors import simulated
+    from disctrack.rolling import Regime
+
+    if not diagnosis.after.converged:
+        return ()
+    motion = simulated(system, diagnosis.after.values)
+    slip = float(np.hypot(*motion.slip_velocity[0]))
+    end = next((s.time for s in motion.switches if s.after is Regime.ROLLING), None)
+    until = "to the end of the recording" if end is None else f"until {end:.4f} s, and rolls after it"
+    return (f"the disc slips at first, with {1e3 * slip:.4g} mm/s at the contact, {until}",)
+
+
+def with_slip(diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
+    """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
+    system_gain = (slip.without.cost - diagnosis.before.cost) / diagnosis.noise
+    held = diagnosis.held_out_before
+    held_gain = 2 * (held.log_density - slip.held_out.log_density) / diagnosis.noise if held else np.nan
+    found = Found(slip.candidate, float(system_gain), float(held_gain), _threshold(diagnosis), ())
+    tried = Tried(slip.candidate, float(system_gain), float(system_gain), float(held_gain), "chosen")
+    verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
+    return replace(
+        diagnosis,
+        verdict=verdict,
+        reason=f"with slip at the start, {diagnosis.reason}",
+        found=(found, *diagnosis.found),
+        before=slip.without,
+        held_out_before=slip.held_out,
+        tried=(tried, *diagnosis.tried),
+    )
+
+
+def _threshold(diagnosis: Diagnosis) -> float:
+    from scipy import stats
+
+    return float(stats.chi2.isf(diagnosis.settings.false_alarm / max(len(diagnosis.tried), 1), 3))

@@ -1,0 +1,177 @@
+"""Gauss-Newton with bounds and priors; it has never heard of discs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from disctrack.diagnosis.engine.system import Quantity, System, Values
+
+Array = NDArray[np.float64]
+
+MAX_ITERATIONS = 40
+TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less
+_HALVINGS = 8
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Minimum of chi-square, data and priors together."""
+
+    quantities: tuple[Quantity, ...]
+    values: dict[str, float]  # of all quantities fitted, and of those that were held
+    covariance: Array  # (k, k) of the fitted ones; zero rows for those at a bound
+    chi_square: float  # of the data alone
+    penalty: float  # of the priors
+    n_data: int
+    converged: bool
+    n_iterations: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Fitted quantities."""
+        return tuple(q.name for q in self.quantities)
+
+    @property
+    def cost(self) -> float:
+        """Chi-square of data and priors."""
+        return self.chi_square + self.penalty
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Data minus quantities without a prior."""
+        return self.n_data - sum(not np.isfinite(q.prior_sigma) for q in self.quantities)
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Chi-square of the data per degree of freedom."""
+        return self.chi_square / max(self.degrees_of_freedom, 1)
+
+    def sigma(self, name: str) -> float:
+        """Standard deviation of one fitted quantity; 0 where it stands at a bound."""
+        i = self.names.index(name)
+        return float(np.sqrt(max(self.covariance[i, i], 0.0)))
+
+
+def compress(residual: Array, derivative: Array) -> tuple[Array, Array]:
+    """Smaller least-squares problem with the same solutions: (right side (m,), matrix (m, k)), m = k + 1 at most.
+
+    The Q of [derivative, residual] is dropped; norms and angles of all combinations of columns stay.
+    """
+    stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
+    R = triangle(stacked)
+    return R[:, -1], R[:, :-1]
+
+
+def triangle(matrix: Array) -> Array:
+    """R of the QR decomposition of a tall matrix (m, k), in blocks of rows that stay in the processor's cache."""
+    m, k = matrix.shape
+    block = 8 * max(k, 1)
+    whole = m // block
+    if whole < 2:
+        return np.asarray(np.linalg.qr(matrix, mode="r"), float)
+    parts = np.asarray(np.linalg.qr(matrix[: whole * block].reshape(whole, block, k), mode="r")).reshape(-1, k)
+    return triangle(np.vstack([parts, matrix[whole * block :]]))
+
+
+def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, Array]:
+    """Rows that priors add to a least-squares problem: (right side (p,), matrix (p, k))."""
+    with_prior = [i for i, q in enumerate(quantities) if np.isfinite(q.prior_sigma)]
+    matrix = np.zeros((len(with_prior), len(quantities)))
+    right = np.zeros(len(with_prior))
+    for row, i in enumerate(with_prior):
+        q = quantities[i]
+        matrix[row, i] = 1.0 / q.prior_sigma
+        right[row] = (q.null - values[q.name]) / q.prior_sigma
+    return right, matrix
+
+
+def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Array:
+    """Argmin |right - matrix x| with lower <= x <= upper; where directions are undetermined, the shortest x."""
+    length = np.linalg.norm(matrix, axis=0)
+    if length.size == 0:
+        return np.zeros(0)
+    scale = np.where(length > 0, 1.0 / np.where(length > 0, length, 1.0), 1.0)
+    scaled = matrix * scale
+    x = np.asarray(np.linalg.lstsq(scaled, right, rcond=1e-12)[0] * scale, float)
+    if bool(np.all((x >= lower) & (x <= upper))):
+        return x
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
+        bounds = (lower / scale, upper / scale)
+        found = np.asarray(lsq_linear(scaled, right, bounds, tol=1e-12).x * scale, float)
+    return found if np.isfinite(found).all() else np.clip(x, lower, upper)
+
+
+def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
+    """Minimise chi-square over `quantities` from `start`; whatever else `start` holds stays as it is.
+
+    A step that leads where there is no prediction, or uphill, is halved. `converged` is False where that does not help
+    or the iterations run out.
+    """
+    quantities = tuple(quantities)
+    names = [q.name for q in quantities]
+    values = {q.name: q.null for q in quantities} | dict(start)
+    for q in quantities:
+        values[q.name] = float(np.clip(values[q.name], q.lower, q.upper))
+    lower, upper = np.array([q.lower for q in quantities]), np.array([q.upper for q in quantities])
+    residual, derivative = system.linearise(values, names)
+    prior, prior_matrix = prior_rows(quantities, values)
+    cost = _cost(residual, prior, derivative)
+    converged, iteration = False, 0
+    matrix = np.zeros((0, len(names)))
+    while np.isfinite(cost) and iteration < max_iterations:
+        iteration += 1
+        right, matrix = compress(residual, derivative)
+        right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
+        x = np.array([values[n] for n in names])
+        step = solve_bounded(right, matrix, lower - x, upper - x)
+        expected = right @ right - np.sum((right - matrix @ step) ** 2)
+        if expected < TOLERANCE:
+            converged = True
+            break
+        for halving in range(_HALVINGS):
+            factor = 0.5**halving
+            trial = values | dict(zip(names, np.clip(x + factor * step, lower, upper).tolist(), strict=True))
+            new_residual, new_derivative = system.linearise(trial, names)
+            new_prior, _ = prior_rows(quantities, trial)
+            new_cost = _cost(new_residual, new_prior, new_derivative)
+            if np.isfinite(new_cost) and new_cost < cost:
+                break
+        else:
+            # rounding of the prediction: no step lowers chi-square although the next one promises next to nothing
+            converged = bool(expected < max(0.1, 1e-7 * cost))
+            break
+        values, residual, derivative, prior, cost = trial, new_residual, new_derivative, new_prior, new_cost
+    penalty = float(prior @ prior)
+    n_data = int(np.sum(system.weights))
+    covariance = _covariance(matrix, np.array([values[n] for n in names]), lower, upper)
+    return Fit(quantities, values, covariance, float(cost - penalty), penalty, n_data, converged, iteration)
+
+
+def _cost(residual: Array, prior: Array, derivative: Array) -> float:
+    """Chi-square with priors; infinite where there is no prediction, or none next to it."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        cost = float(np.sum(residual**2) + prior @ prior)
+        usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
+    return cost if usable else np.inf
+
+
+def _covariance(matrix: Array, x: Array, lower: Array, upper: Array) -> Array:
+    """Inverse of the normal matrix over the quantities that are free."""
+    k = len(x)
+    covariance = np.zeros((k, k))
+    free = np.flatnonzero((x > lower) & (x < upper))
+    if len(matrix) == 0 or free.size == 0:
+        return covariance
+    columns = matrix[:, free]
+    length = np.linalg.norm(columns, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    _, singular, V = np.linalg.svd(columns / length, full_matrices=False)
+    floor = 1e-12 * max(float(singular[0]), 1e-100)  # directions below it are not determined: no variance is invented
+    weight = np.where(singular > floor, 1.0 / np.maximum(singular, floor) ** 2, 0.0)
+    covariance[np.ix_(free, free)] = (V.T * weight) @ V / np.outer(length, length)
+    return covariance

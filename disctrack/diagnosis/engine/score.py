@@ -1,0 +1,143 @@
+"""Score test: what each effect would gain, and which effects look alike, from one linearisation.
+
+Every candidate's derivative columns are cleared of what the fitted quantities can absorb. To first order the best
+value, its sigma and the gain in chi-square follow from inner products, so that a whole catalogue costs one fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.diagnosis.engine.fit import Fit, compress, prior_rows, solve_bounded
+from disctrack.diagnosis.engine.system import Candidate, System
+
+Array = NDArray[np.float64]
+
+INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
+
+
+@dataclass(frozen=True)
+class Score:
+    """First-order answer for one candidate."""
+
+    candidate: Candidate
+    values: Array  # (k,) best values within bounds
+    sigma: Array  # (k,) standard deviations; infinite where the data do not see the quantity
+    gain: float  # decrease of chi-square
+    visible: bool
+
+
+class Linearisation:
+    """All derivatives at one fit, compressed: residual and columns by name, priors included."""
+
+    def __init__(self, system: System, fit: Fit, candidates: Sequence[Candidate]) -> None:
+        """Linearise at the fit for its own quantities and for those of all candidates."""
+        known = set(fit.names)
+        new = {q.name: q for c in candidates for q in c.quantities if q.name not in known}
+        self.fit = fit
+        self.quantities = {q.name: q for q in fit.quantities} | new
+        self.values = {name: q.null for name, q in new.items()} | fit.values
+        names = list(self.quantities)
+        residual, derivative = system.linearise(self.values, names)
+        right, matrix = compress(residual, derivative)
+        prior, prior_matrix = prior_rows(list(self.quantities.values()), self.values)
+        self.right, self.matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
+        self.column = {name: i for i, name in enumerate(names)}
+        self._free = self._free_columns()
+        self._basis = np.linalg.qr(_normalised(self.matrix[:, self._free]))[0]
+
+    def _free_columns(self) -> list[int]:
+        free = []
+        for q in self.fit.quantities:
+            at_bound = not q.lower < self.values[q.name] < q.upper
+            if not at_bound:
+                free.append(self.column[q.name])
+        return free
+
+    def columns(self, names: Sequence[str]) -> Array:
+        """Columns (m, k) as they are."""
+        return self.matrix[:, [self.column[n] for n in names]]
+
+    def cleared(self, columns: Array) -> Array:
+        """Columns without what the fitted quantities can absorb."""
+        for _ in range(2):  # twice is enough (Kahan): the first pass leaves rounding of the size of what it removes
+            columns = columns - self._basis @ (self._basis.T @ columns)
+        return columns
+
+    def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
+        """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
+        fitted = [q.name for q in self.fit.quantities if q.name not in names]
+        everything = [*fitted, *names]
+        A = self.columns(everything)
+        x0 = np.array([self.values[n] for n in everything])
+        lower = np.array([self.quantities[n].lower for n in everything]) - x0
+        upper = np.array([self.quantities[n].upper for n in everything]) - x0
+        step = solve_bounded(self.right, A, lower, upper)
+        gain = self.right @ self.right - np.sum((self.right - A @ step) ** 2)
+        return float(max(gain, 0.0)), (x0 + step)[len(fitted) :]
+
+
+def _normalised(columns: Array) -> Array:
+    length = np.linalg.norm(columns, axis=0)
+    return columns / np.where(length > 0, length, 1.0)
+
+
+def score(linear: Linearisation, candidate: Candidate) -> Score:
+    """Gain, values and sigmas of one candidate to first order."""
+    columns = linear.columns(candidate.names)
+    cleared = linear.cleared(columns)
+    before, after = np.linalg.norm(columns, axis=0), np.linalg.norm(cleared, axis=0)
+    visible = bool((after > INVISIBLE * np.maximum(before, 1e-300)).any() and (after > 0).any())
+    k = len(candidate.names)
+    if not visible:
+        return Score(candidate, np.full(k, np.nan), np.full(k, np.inf), 0.0, False)
+    gain, values = linear.gain_of(candidate.names)
+    return Score(candidate, values, _sigmas(cleared, before), gain, True)
+
+
+def _sigmas(cleared: Array, before: Array) -> Array:
+    length = np.where(before > 0, before, 1.0)
+    normal = (cleared / length).T @ (cleared / length)
+    eigenvalues, vectors = np.linalg.eigh(normal)
+    floor = INVISIBLE**2
+    seen = eigenvalues > floor
+    variance = (vectors[:, seen] ** 2) @ (1.0 / eigenvalues[seen])
+    variance[np.any(np.abs(vectors[:, ~seen]) > INVISIBLE, axis=1)] = np.inf
+    return np.asarray(np.sqrt(variance) / length, float)
+
+
+def score_all(linear: Linearisation, candidates: Sequence[Candidate]) -> list[Score]:
+    """Scores of all candidates, largest gain first."""
+    return sorted((score(linear, c) for c in candidates), key=lambda s: -s.gain)
+
+
+def score_pairs(linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate]]:
+    """Gain of every pair of candidates, largest first."""
+    gains = []
+    for a, b in combinations(candidates, 2):
+        names = list(dict.fromkeys([*a.names, *b.names]))
+        gains.append((linear.gain_of(names)[0], a, b))
+    return sorted(gains, key=lambda item: -item[0])
+
+
+def angle(linear: Linearisation, signal: Array, names: Sequence[str]) -> float:
+    """Angle [rad] between a predicted residual (m,) and what the named quantities can predict, both cleared.
+
+    0: no fit tells them apart; pi/2: nothing in common.
+    """
+    signal = linear.cleared(signal[:, None])[:, 0]
+    columns = linear.columns(names)
+    cleared = linear.cleared(columns)
+    keep = np.linalg.norm(cleared, axis=0) > INVISIBLE * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    length = float(np.linalg.norm(signal))
+    if length == 0 or not keep.any():
+        return float(np.pi / 2)
+    U, singular, _ = np.linalg.svd(_normalised(cleared[:, keep]), full_matrices=False)
+    U = U[:, singular > 1e-9 * singular[0]]
+    within = U @ (U.T @ signal)
+    return float(np.arctan2(np.linalg.norm(signal - within), np.linalg.norm(within)))

@@ -1,0 +1,474 @@
+"""Which effects does the model lack? Forward search with refits, judged by information criterion and held-out data.
+
+Guards against what is known to mislead: nothing is attributed before the base fit has converged; every candidate that
+counts is refitted together with all that the base fit moves, within its bounds; the gain must beat the best of as many
+candidates as were looked at; and a free run over data that the fit has not seen must become more probable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
+from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
+from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_all, score_pairs
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
+
+Array = NDArray[np.float64]
+
+CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
+FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
+MOST_RIVALS = 12
+UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How hard to look, and how sure to be."""
+
+    false_alarm: float = 0.005  # probability that noise alone brings a claim, over all candidates
+    max_effects: int = 3
+    shortlist: int = 8  # candidates that are refitted in full in each round
+    judged: int = 3  # of them, that also have to stand a free run
+    train_fraction: float = TRAIN_FRACTION
+    at_noise: float = 1.1  # reduced chi-square over the noise found in the data, up to which nothing is left
+    unexplained_share: float = UNEXPLAINED_SHARE
+    noise: float | None = None  # variance over that stated; None: from the residual's fast part
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One more candidate fitted together with everything before it."""
+
+    candidates: tuple[Candidate, ...]  # all effects of the fit
+    fit: Fit
+    gain: float  # decrease of chi-square against the fit before, in units of the noise found
+    held_out: HeldOut | None = None  # not asked for where something else decides already
+    held_out_gain: float | None = None  # increase of 2 log density of the test data, in the same units
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another effect that explains the same."""
+
+    candidate: Candidate
+    angle: float  # [rad] between the predicted residuals, cleared of what other quantities absorb
+    loss: float  # chi-square with the rival in place of the effect, minus that with the effect
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that is missing in the model."""
+
+    candidate: Candidate
+    gain: float  # chi-square lost when the effect is taken out again
+    held_out_gain: float
+    threshold: float  # gain that noise alone does not reach
+    cannot_be_told_from: tuple[Rival, ...]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What became of one candidate."""
+
+    candidate: Candidate
+    score: float  # first-order gain against the base fit
+    gain: float | None  # gain of the refit in the last round in which it was refitted
+    held_out_gain: float | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Answer of the search."""
+
+    verdict: str  # "nothing missing", "found" or "unexplained"
+    reason: str  # in words
+    found: tuple[Found, ...]
+    before: Fit
+    after: Fit
+    held_out_before: HeldOut | None
+    held_out_after: HeldOut | None
+    noise: float  # variance of the noise found in the residual's fast part, over that stated
+    tried: tuple[Tried, ...]
+    settings: Settings = field(default_factory=Settings)
+    partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
+    judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
+
+
+def diagnose(
+    system: System, start: Values, settings: Settings | None = None, rows: NDArray[np.bool_] | None = None
+) -> Diagnosis:
+    """Fit the base model, look for what it lacks, and say how sure that is.
+
+    start : values of the base quantities from which Gauss-Newton converges
+    rows : (n,) samples of the fits that are judged by the others; the first part of the time, if not given
+    """
+    settings = settings or Settings()
+    base = fit(system, system.base, start)
+    if not base.converged:
+        return _refusal(base, settings)
+    answer = _Search(system, settings, rows).run(base)
+    if settings.noise is not None or answer.verdict == "unexplained":
+        return answer
+    # looked for only here: what a large effect does from frame to frame would pass for scatter
+    modes = common_modes(system, answer.after)
+    if modes is None:
+        return answer
+    judged = whitened(system, modes)
+    return replace(_Search(judged, settings, rows).run(base), judged=judged)
+
+
+def noise_variance(system: System, fit_: Fit) -> float:
+    """Variance of the fast part of the residual over that stated, from third differences in time.
+
+    1 where there are too few samples for that.
+    """
+    difference, rows = third_differences(system, fit_)
+    if len(rows) < 20:
+        return 1.0
+    return float(np.sum(difference**2) / 20.0 / np.sum(system.weights[rows]))
+
+
+class _Search:
+    def __init__(self, system: System, settings: Settings, rows: NDArray[np.bool_] | None = None) -> None:
+        self.system, self.settings = system, settings
+        self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
+        self.noise = 1.0
+        self.refits: dict[str, Trial] = {}
+        self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
+        self.free_runs: list[tuple[Fit, HeldOut]] = []
+
+    def run(self, start: Fit) -> Diagnosis:
+        base = start
+        if isinstance(self.system, RowWhitened):
+            base = fit(self.system, self.system.base, start.values)
+            if not base.converged:
+                return _refusal(base, self.settings)
+        self.fits[frozenset()] = base
+        self.noise = self._noise(base)
+        current = Trial((), base, 0.0, self._held_out(base), 0.0)
+        before = current
+        linear = Linearisation(self.system, base, self.system.candidates)
+        scores = score_all(linear, self.system.candidates)
+        while len(current.candidates) < self.settings.max_effects:
+            better = self._next(current, linear, scores if not current.candidates else None)
+            if better is None:
+                break
+            current = self._pruned(better)
+            # a large effect reaches into the fast part of the residual: with it in the model, the noise is seen better
+            self.noise = min(self.noise, self._noise(current.fit))
+            linear = Linearisation(self.system, current.fit, self.system.candidates)
+        if current.candidates and not self._worth_naming(before, current):
+            return self._answer(before, before, (), scores, partial=current)
+        current, rivals = self._settled(current)
+        found = tuple(self._found(current, c, rivals[c.name]) for c in current.candidates)
+        return self._answer(before, current, found, scores)
+
+    def _noise(self, fit_: Fit) -> float:
+        stated = self.settings.noise
+        return max(noise_variance(self.system, fit_) if stated is None else stated, 1e-12)
+
+    def _worth_naming(self, before: Trial, after: Trial) -> bool:
+        """Does what was found explain the residual, if not to noise then nearly all of it, in the free run too?
+
+        In a residual that none of them makes, wrong effects gain a lot as well; they leave a good part of it.
+        """
+        if self._at_noise(after.fit):
+            return True
+        excess = [trial.fit.chi_square / self.noise - trial.fit.degrees_of_freedom for trial in (before, after)]
+        free = [(t.held_out.chi_square / self.noise - t.held_out.expected) for t in (before, after) if t.held_out]
+        share = self.settings.unexplained_share
+        return excess[1] < share * excess[0] and free[1] < share * free[0]
+
+    def threshold(self, k: int) -> float:
+        """Gain with k quantities that noise reaches with the allowed probability, over all candidates."""
+        return float(stats.chi2.isf(self.settings.false_alarm / max(len(self.system.candidates), 1), k))
+
+    def _cost(self, trial: Fit) -> float:
+        return trial.cost / self.noise
+
+    def _price(self, candidates: Iterable[Candidate]) -> float:
+        """Bayesian information criterion's price of the quantities."""
+        names = {n for c in candidates for n in c.names}
+        return len(names) * float(np.log(max(np.sum(self.system.weights), 2)))
+
+    def _quantities(self, candidates: Sequence[Candidate]) -> tuple[Quantity, ...]:
+        new = {q.name: q for c in candidates for q in c.quantities}
+        return tuple(q for q in self.system.base if q.name not in new) + tuple(new.values())
+
+    def _held_out(self, fit_: Fit) -> HeldOut:
+        known = next((held for of, held in self.free_runs if of is fit_), None)
+        if known is None:
+            known = held_out(self.system, fit_.quantities, fit_.values, self.rows)
+            self.free_runs.append((fit_, known))
+        return known
+
+    def _fit(self, candidates: Sequence[Candidate], start: Values) -> Fit:
+        key = frozenset(c.name for c in candidates)
+        if key in self.fits:
+            return self.fits[key]
+        values = dict(start)
+        for c in candidates:
+            for name, value in zip(c.names, c.start, strict=False):
+                values.setdefault(name, value)
+        found = fit(self.system, self._quantities(candidates), values)
+        if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
+            self.fits[key] = found
+        return found
+
+    def _best_fit(self, current: Trial, extra: Sequence[Candidate]) -> Fit:
+        """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
+        together = [*current.candidates, *extra]
+        starts: list[dict[str, float]] = [{}]
+        for c in extra:
+            if c.threshold:
+                starts = [dict(zip(c.names, s, strict=True)) for s in self.system.starts(c, current.fit.values)]
+        fits = [self._fit(together, current.fit.values | start) for start in starts]
+        return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else current.fit
+
+    def _judged(self, current: Trial, trial: Trial) -> Trial:
+        """With the free run over held-out data."""
+        assert current.held_out is not None
+        held = self._held_out(trial.fit)
+        gain = 2 * (held.log_density - current.held_out.log_density) / self.noise
+        if np.isnan(gain):  # neither predicts anything
+            gain = -np.inf
+        return replace(trial, held_out=held, held_out_gain=float(gain))
+
+    def _next(self, current: Trial, linear: Linearisation, scores: list[Score] | None) -> Trial | None:
+        """The best admissible enlargement, or None."""
+        trials: list[tuple[tuple[Candidate, ...], Trial]] = []
+        # beyond thresholds the prediction has kinks and a refit is long: last, and only where no other will do
+        for extra in sorted(self._shortlist(current, linear, scores), key=lambda e: any(c.threshold for c in e)):
+            if any(c.threshold for c in extra) and any(self._nearly_all(current, t) for _, t in trials):
+                continue
+            refitted = self._best_fit(current, extra)
+            trial = Trial((*current.candidates, *extra), refitted, self._cost(current.fit) - self._cost(refitted))
+            trials.append((extra, trial))
+            if len(extra) == 1:
+                self.refits.setdefault(extra[0].name, trial)
+        trials.sort(key=lambda item: self._criterion(item[1]))
+        chosen: Trial | None = None
+        for extra, trial in trials[: self.settings.judged]:
+            if not self._enough(trial, extra):
+                continue
+            judged = self._judged(current, trial)
+            if len(extra) == 1 and self.refits[extra[0].name] is trial:
+                self.refits[extra[0].name] = judged
+            if chosen is None and judged.held_out_gain is not None and judged.held_out_gain > 0:
+                chosen = judged
+        return chosen
+
+    def _nearly_all(self, before: Trial, after: Trial) -> bool:
+        """Does the enlargement remove nine tenths of what exceeds the noise?"""
+        excess = [t.fit.chi_square / self.noise - t.fit.degrees_of_freedom for t in (before, after)]
+        return after.fit.converged and excess[1] < 0.1 * excess[0]
+
+    def _shortlist(
+        self, current: Trial, linear: Linearisation, scores: list[Score] | None
+    ) -> list[tuple[Candidate, ...]]:
+        """Candidates, and pairs of them where one alone will not do, that are worth a refit."""
+        taken = {c.name for c in current.candidates}
+        scores = scores or score_all(linear, [c for c in self.system.candidates if c.name not in taken])
+        if not scores:
+            return []
+        ranked = sorted(scores, key=lambda s: self._price([s.candidate]) - s.gain / self.noise)
+        best = ranked[0].gain
+        # near noise the first order is exact; far from it, a nonlinear refit may do better than its score
+        worth = [
+            s
+            for i, s in enumerate(ranked[: self.settings.shortlist])
+            if s.gain / self.noise > 0.5 * self.threshold(len(s.candidate.names)) and (i < 4 or s.gain > 0.3 * best)
+        ]
+        shortlist: list[tuple[Candidate, ...]] = [(s.candidate,) for s in worth]
+        if self._at_noise(current.fit, best):
+            return shortlist
+        shortlist += [(c,) for c in self.system.candidates if c.threshold and c.name not in taken]
+        room = len(taken) + 2 <= self.settings.max_effects
+        if room and worth:
+            shortlist += self._pairs(linear, [s.candidate for s in ranked[:14] if s.visible])
+        return shortlist
+
+    def _pairs(self, linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
+        pairs = score_pairs(linear, candidates)
+        pairs.sort(key=lambda p: self._price(p[1:]) - p[0] / self.noise)
+        return [(a, b) for _, a, b in pairs[:3]]
+
+    def _at_noise(self, fit_: Fit, gain: float = 0.0) -> bool:
+        left = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1)
+        limit = self.settings.at_noise
+        if self.settings.noise is None:  # in a short recording both chi-square and the noise found in it scatter
+            limit = max(limit, 1.0 + 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))))
+        return left <= limit * self.noise
+
+    def _criterion(self, trial: Trial) -> float:
+        return self._cost(trial.fit) + self._price(trial.candidates)
+
+    def _enough(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
+        k = len({n for c in extra for n in c.names})
+        enough = self.threshold(k) if len(extra) == 1 else self.threshold(k) + self.threshold(1)
+        return trial.fit.converged and trial.gain > enough
+
+    def _pruned(self, trial: Trial) -> Trial:
+        """Without effects that have become unnecessary."""
+        for candidate in trial.candidates[:-1]:
+            rest = tuple(c for c in trial.candidates if c is not candidate)
+            smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
+            loss = self._cost(smaller) - self._cost(trial.fit)
+            if smaller.converged and loss < self.threshold(len(candidate.names)):
+                trial = replace(trial, candidates=rest, fit=smaller, held_out=self._held_out(smaller))
+        return trial
+
+    def _settled(self, trial: Trial) -> tuple[Trial, dict[str, list[Rival]]]:
+        """Every effect exchanged for each of its rivals; a better one stays. Returns the rivals per effect too."""
+        rivals: dict[str, list[Rival]] = {}
+        for position in range(len(trial.candidates)):
+            found = self._rivals(trial, position)
+            better = min(found, key=lambda r: self._swapped_criterion(trial, position, r), default=None)
+            if better and self._swapped_criterion(trial, position, better) < self._criterion(trial) - 1e-6:
+                swapped = list(trial.candidates)
+                swapped[position] = better.candidate
+                new = replace(trial, candidates=tuple(swapped), fit=better.fit, held_out=self._held_out(better.fit))
+                if self._log_density(new) > self._log_density(trial) - CLASS_GAIN / 2 * self.noise:
+                    trial = new
+                    found = self._rivals(trial, position)
+            rivals[trial.candidates[position].name] = [r for r in found if r.loss < CLASS_GAIN]
+        return trial, rivals
+
+    @staticmethod
+    def _log_density(trial: Trial) -> float:
+        return trial.held_out.log_density if trial.held_out is not None else -np.inf
+
+    def _swapped_criterion(self, trial: Trial, position: int, rival: Rival) -> float:
+        others = [c for i, c in enumerate(trial.candidates) if i != position]
+        fitted = self._cost(rival.fit) + self._price([*others, rival.candidate])
+        # only against the one that it would replace: how surprising is each value?
+        return fitted + _surprise(rival.candidate, rival.fit) - _surprise(trial.candidates[position], trial.fit)
+
+    def _rivals(self, trial: Trial, position: int) -> list[Rival]:
+        """Effects that predict nearly the same residual, refitted in place of the effect."""
+        effect = trial.candidates[position]
+        rest = tuple(c for c in trial.candidates if c is not effect)
+        reduced = _restricted(trial.fit, self._quantities(rest))
+        linear = Linearisation(self.system, reduced, self.system.candidates)
+        amount = np.array([trial.fit.values[q.name] - q.null for q in effect.quantities])
+        signal = linear.columns(effect.names) @ amount
+        strength = float(np.sum(linear.cleared(signal[:, None]) ** 2)) / self.noise
+        others = [c for c in self.system.candidates if c.name not in {d.name for d in trial.candidates}]
+        angles = {c.name: angle(linear, signal, c.names) for c in others}
+        near = sorted(others, key=lambda c: angles[c.name])
+        near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]
+        near = near[: MOST_RIVALS if strength < FAINT else MOST_RIVALS // 2]
+        found = []
+        for candidate in near:
+            refitted = self._fit((*rest, candidate), _without(trial.fit.values, effect, rest))
+            loss = self._cost(refitted) - self._cost(trial.fit)
+            if refitted.converged:
+                found.append(Rival(candidate, angles[candidate.name], loss, refitted))
+        return found
+
+    def _found(self, trial: Trial, candidate: Candidate, rivals: list[Rival]) -> Found:
+        rest = tuple(c for c in trial.candidates if c is not candidate)
+        without = self._fit(rest, _without(trial.fit.values, candidate, rest))
+        held = self._held_out(without)
+        held_gain = 2 * (self._log_density(trial) - held.log_density) / self.noise
+        gain = self._cost(without) - self._cost(trial.fit)
+        return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(rivals))
+
+    def _answer(
+        self,
+        before: Trial,
+        after: Trial,
+        found: tuple[Found, ...],
+        scores: list[Score],
+        partial: Trial | None = None,
+    ) -> Diagnosis:
+        explained = self._at_noise(after.fit)
+        assert after.held_out is not None
+        ratio = after.held_out.ratio_to_floor / np.sqrt(self.noise)
+        left = f"{after.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {self.noise:.3g}"
+        if explained and found:
+            verdict, reason = "found", f"chi-square falls to {left}; the free run errs by {ratio:.2f} of its floor"
+        elif explained:
+            verdict, reason = "nothing missing", f"chi-square is {left}, and no effect gains more than noise does"
+        else:
+            verdict, reason = (
+                "unexplained",
+                f"chi-square stays at {left}: no effect of the catalogue brings it to noise",
+            )
+        tried = tuple(self._tried(s, after, found) for s in scores)
+        return Diagnosis(
+            verdict,
+            reason,
+            found,
+            before.fit,
+            after.fit,
+            before.held_out,
+            after.held_out,
+            self.noise,
+            tried,
+            self.settings,
+            partial.candidates if partial is not None else (),
+        )
+
+    def _tried(self, score: Score, after: Trial, found: tuple[Found, ...]) -> Tried:
+        c = score.candidate
+        trial = self.refits.get(c.name)
+        gain, held = (trial.gain, trial.held_out_gain) if trial else (None, None)
+        return Tried(c, score.gain / self.noise, gain, held, self._why(score, trial, found))
+
+    def _why(self, score: Score, trial: Trial | None, found: tuple[Found, ...]) -> str:
+        c = score.candidate
+        if any(c.name == f.candidate.name for f in found):
+            return "chosen"
+        for f in found:
+            if any(c.name == r.candidate.name for r in f.cannot_be_told_from):
+                return f"cannot be told from {f.candidate.name}"
+        if c.threshold and trial is None:
+            return "nothing is left that it could explain; beyond its threshold it does nothing"
+        if not score.visible and trial is None:
+            return "leaves no trace in this recording that other fitted quantities do not absorb"
+        threshold = self.threshold(len(c.names))
+        gain = trial.gain if trial else score.gain / self.noise
+        if gain <= threshold:
+            return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}"
+        if trial and not trial.fit.converged:
+            return "its refit does not converge"
+        if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
+            return "the free run over held-out data does not improve"
+        return f"gains {gain:.4g}, less than what was chosen"
+
+
+def _refusal(base: Fit, settings: Settings) -> Diagnosis:
+    reason = (
+        f"the base fit has not converged (chi-square {base.reduced_chi_square:.3g} per degree of freedom after "
+        f"{base.n_iterations} iterations): before it has, every candidate seems to help, so "
+        "that nothing is attributed"
+    )
+    return Diagnosis("unexplained", reason, (), base, base, None, None, np.nan, (), settings)
+
+
+def _surprise(candidate: Candidate, fit_: Fit) -> float:
+    """Minus twice the logarithm of a heavy-tailed (Cauchy) prior as wide as the quantities' typical sizes."""
+    sizes = [abs(fit_.values[q.name] - q.null) / q.typical for q in candidate.quantities]
+    return 2.0 * float(np.log1p(max(sizes) ** 2))
+
+
+def _without(values: Values, candidate: Candidate, rest: Sequence[Candidate]) -> dict[str, float]:
+    """Values with the candidate's quantities back at null, unless another effect has them too."""
+    kept = {n for c in rest for n in c.names}
+    return dict(values) | {q.name: q.null for q in candidate.quantities if q.name not in kept}
+
+
+def _restricted(fit_: Fit, quantities: tuple[Quantity, ...]) -> Fit:
+    """The same fit with fewer quantities counted as free."""
+    index = [fit_.names.index(q.name) for q in quantities]
+    return replace(fit_, quantities=quantities, covariance=fit_.covariance[np.ix_(index, index)])

@@ -1,0 +1,213 @@
+"""Exponents and scales of the laws that were found: refined where the data determine them, and said where not.
+
+The search takes laws as they are written down, with the shape that their sources give. A law of another shape is then
+found as the nearest one, or not at all; so the shape of what was found is fitted along, and where the catalogue leaves
+something unexplained, its laws with a shape get a second trial with the shape free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
+from disctrack.diagnosis.engine.score import Linearisation, score
+from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System
+
+Array = NDArray[np.float64]
+
+MAX_TRIALS = 12  # values of a shape at which the rest is refitted
+ENOUGH = 0.1  # of chi-square: a third of a sigma, beyond which a shape is not pursued
+DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
+
+
+def refine_shapes(system: System, diagnosis: Diagnosis) -> tuple[Diagnosis, tuple[str, ...]]:
+    """The diagnosis with the shapes of the laws fitted along, and remarks on those that the data leave open."""
+    if diagnosis.held_out_before is None or diagnosis.verdict == "nothing missing":
+        return diagnosis, ()
+    system = diagnosis.judged or system
+    notes: list[str] = []
+    if diagnosis.verdict == "unexplained" or len(diagnosis.found) > 1:
+        diagnosis = _second_trial(system, diagnosis)
+    for position, found in enumerate(diagnosis.found):
+        if found.candidate.shape and not set(_names(found.candidate.shape)) & set(diagnosis.after.names):
+            diagnosis, remarks = _refined(system, diagnosis, position)
+            notes += remarks
+    return diagnosis, tuple(notes)
+
+
+def _names(quantities: Sequence[Quantity]) -> list[str]:
+    return [q.name for q in quantities]
+
+
+def _refined(system: System, diagnosis: Diagnosis, position: int) -> tuple[Diagnosis, list[str]]:
+    """One effect with those numbers of its shape fitted that the data determine."""
+    found, fitted = diagnosis.found[position], diagnosis.after
+    known, notes = list[Quantity](), []
+    for q in found.candidate.shape:
+        expected = _first_order(system, fitted, q)
+        trial = profiled(system, fitted, q, expected) if expected < _size(q, q.null) else None
+        if trial is not None and _determined(trial, q):
+            fitted = trial
+            known.append(q)
+        else:
+            sigma = trial.sigma(q.name) if trial is not None else expected
+            size = f"sigma {sigma:.2g} {q.unit if q.unit != '1' else ''}".rstrip() if np.isfinite(sigma) else "unseen"
+            name = q.name.partition(".")[2]
+            notes.append(
+                f"{found.candidate.name}: this recording does not determine {name} ({size}); {q.null:g} is assumed"
+            )
+    if not known:
+        return diagnosis, notes
+    gain = (diagnosis.after.cost - fitted.cost) / diagnosis.noise
+    enlarged = replace(found.candidate, quantities=(*found.candidate.quantities, *known))
+    better = replace(found, candidate=enlarged, gain=found.gain + gain)
+    everything = tuple(better if i == position else f for i, f in enumerate(diagnosis.found))
+    held = _held_out(system, diagnosis, fitted)
+    return replace(diagnosis, found=everything, after=fitted, held_out_after=held), notes
+
+
+def profiled(system: System, fitted: Fit, q: Quantity, step: float) -> Fit:
+    """The fit with one more quantity free, found along its profile: the others are refitted at each value of it.
+
+    An exponent and the amounts of two laws lie in a curved valley in which Gauss-Newton halves its steps for ever.
+    """
+    points: dict[float, Fit] = {}
+
+    def at(value: float) -> None:
+        value = float(np.clip(value, q.lower, q.upper))
+        if value not in points:
+            near = points[min(points, key=lambda v: abs(v - value))] if points else fitted
+            points[value] = fit(system, fitted.quantities, near.values | {q.name: value})
+
+    start = fitted.values.get(q.name, q.null)
+    step = min(step, 0.5 * _size(q, start))
+    for offset in (0.0, -step, step):
+        at(start + offset)
+    for _ in range(MAX_TRIALS):
+        values = np.array(sorted(points))
+        costs = np.array([points[v].cost for v in values])
+        best = int(np.argmin(costs))
+        if 0 < best < len(values) - 1:
+            target, gain = _vertex(values[best - 1 : best + 2], costs[best - 1 : best + 2])
+            if gain < ENOUGH:
+                break
+            at(target)
+        else:
+            outwards = values[best] + 2 * (values[best] - values[1 if best == 0 else -2])
+            at(outwards)
+            if float(np.clip(outwards, q.lower, q.upper)) == values[best]:
+                break
+    lowest = min(points.values(), key=lambda f: f.cost)
+    joint = fit(system, (*fitted.quantities, q), lowest.values, max_iterations=4)
+    # along the profile nothing is left to gain, whatever Gauss-Newton says of the valley
+    return replace(joint, converged=lowest.converged and joint.cost <= lowest.cost + ENOUGH)
+
+
+def _vertex(x: Array, y: Array) -> tuple[float, float]:
+    """Minimum of the parabola through three points, kept between them, and how far it lies below the middle one."""
+    if not np.isfinite(y).all():
+        return float(x[1]), 0.0
+    a, b, _ = np.polyfit((x - x[1]) / (x[2] - x[0]), y - y[1], 2)
+    if a <= 0:
+        return float(x[1]), 0.0
+    move = -b / (2 * a) * (x[2] - x[0])
+    return float(x[1] + move), float(b * b / (4 * a))
+
+
+def _size(q: Quantity, value: float) -> float:
+    return max(abs(value), abs(q.null), abs(q.scale))
+
+
+def _determined(fitted: Fit, q: Quantity) -> bool:
+    value, sigma = fitted.values[q.name], fitted.sigma(q.name)
+    inside = q.lower < value < q.upper
+    return inside and 0 < sigma < DETERMINED * _size(q, value)
+
+
+def _first_order(system: System, after: Fit, q: Quantity) -> float:
+    """Standard deviation to expect; infinite where the data do not see the number at all."""
+    alone = Candidate(q.name, q.name, "shape", "", "", (q,))
+    return float(score(Linearisation(system, after, [alone]), alone).sigma[0])
+
+
+def _held_out(system: System, diagnosis: Diagnosis, fitted: Fit) -> HeldOut:
+    return held_out(system, fitted.quantities, fitted.values, training_rows(system, diagnosis.settings.train_fraction))
+
+
+def _second_trial(system: System, diagnosis: Diagnosis) -> Diagnosis:
+    """A single law with a free shape in place of all that was found, if it leaves noise and is the shorter answer."""
+    best, chosen = diagnosis, _length(system, diagnosis) if diagnosis.found else np.inf
+    for candidate in system.candidates:
+        answer = _with_free_shape(system, diagnosis, candidate) if candidate.shape else None
+        if answer is not None and _length(system, answer) < chosen:
+            best, chosen = answer, _length(system, answer)
+    return best
+
+
+def _length(system: System, answer: Diagnosis) -> float:
+    """Chi-square, price of the fitted numbers, and of having picked each effect out of so many."""
+    free = sum(not np.isfinite(q.prior_sigma) for q in answer.after.quantities)
+    numbers = free * float(np.log(max(np.sum(system.weights), 2)))
+    return answer.after.cost / answer.noise + numbers + 2 * len(answer.found) * float(np.log(len(system.candidates)))
+
+
+def _grid(candidate: Candidate) -> list[dict[str, float]]:
+    """Shapes to begin with: over the range of the first number, where it has one, or over two decades."""
+    q, values = candidate.shape[0], {s.name: s.null for s in candidate.shape}
+    if np.isfinite(q.lower) and np.isfinite(q.upper):
+        steps = q.lower + (q.upper - q.lower) * np.array([0.1, 0.25, 0.4, 0.6, 0.75, 0.9])
+    else:
+        steps = q.null * np.array([0.1, 0.3, 1.0, 3.0, 10.0])
+    return [values | {q.name: float(np.clip(v, q.lower, q.upper))} for v in steps]
+
+
+def _started(system: System, base: Fit, candidate: Candidate, shape: dict[str, float]) -> Fit:
+    return fit(system, (*base.quantities, *candidate.quantities), base.values | shape)
+
+
+def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate) -> Diagnosis | None:
+    base, before = diagnosis.before, diagnosis.held_out_before
+    first = min((_started(system, base, candidate, shape) for shape in _grid(candidate)), key=lambda f: f.cost)
+    expected = {q.name: _first_order(system, first, q) for q in candidate.shape}
+    free = tuple(q for q in candidate.shape if np.isfinite(expected[q.name]))
+    fitted = first
+    for q in free:
+        fitted = profiled(system, fitted, q, expected[q.name])
+    noise, settings = diagnosis.noise, diagnosis.settings
+    at_noise = fitted.reduced_chi_square <= settings.at_noise * noise
+    if not (fitted.converged and at_noise and all(_determined(fitted, q) for q in free)) or before is None:
+        return None
+    quantities = (*candidate.quantities, *free)
+    gain = (base.cost - fitted.cost) / noise
+    threshold = float(stats.chi2.isf(settings.false_alarm / max(len(system.candidates), 1), len(quantities)))
+    held = _held_out(system, diagnosis, fitted)
+    held_gain = 2 * (held.log_density - before.log_density) / noise
+    if not (gain > threshold and held_gain > 0):
+        return None
+    found = Found(replace(candidate, quantities=quantities), float(gain), float(held_gain), threshold, ())
+    reason = f"chi-square falls to {fitted.reduced_chi_square:.3g} per degree of freedom at a noise of {noise:.3g}"
+    tried = tuple(
+        Tried(t.candidate, t.score, float(gain), float(held_gain), "chosen, with its shape free")
+        if t.candidate.name == candidate.name
+        else replace(t, reason="explains less than the law that was chosen")
+        if t.reason == "chosen"
+        else t
+        for t in diagnosis.tried
+    )
+    return replace(
+        diagnosis,
+        verdict="found",
+        reason=reason,
+        found=(found,),
+        after=fitted,
+        held_out_after=held,
+        tried=tried,
+        partial=(),
+    )

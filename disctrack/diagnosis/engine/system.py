@@ -1,0 +1,139 @@
+"""What can be diagnosed: anything with parameters, effects that it may lack, and a prediction with derivatives.
+
+The engine (fit, score, held_out, search) knows no more of the world than this module; what the numbers mean is the
+business of an adapter (`diagnosis.disc`, `examples`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One number that a fit may move."""
+
+    name: str
+    unit: str
+    scale: float  # a sensible step
+    null: float = 0.0  # its value while the effect is absent
+    lower: float = -np.inf
+    upper: float = np.inf
+    prior_sigma: float = np.inf  # about `null`; infinite: nothing is known beforehand
+    meaning: str = ""
+    typical: float = np.inf  # size that would surprise nobody; decides between explanations that fit alike
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that the model may lack, with the numbers that would be fitted."""
+
+    name: str  # unique
+    effect: str  # name in the catalogue of effects; several candidates may be parts of one
+    kind: str  # "motion" or "measurement"
+    title: str
+    source: str
+    quantities: tuple[Quantity, ...]
+    start: tuple[float, ...] = ()  # where a refit begins, if not at null
+    shape: tuple[Quantity, ...] = ()  # of its law (an exponent, a scale): held at null until the effect is found
+    threshold: bool = False  # acts only beyond some value: at null it has no derivative, and the system gives starts
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its quantities."""
+        return tuple(q.name for q in self.quantities)
+
+
+class System(Protocol):
+    """Data, model, and the effects it may lack. Samples are rows in time; a row has one or more whitened numbers."""
+
+    @property
+    def time(self) -> Array:
+        """(n,) instant of each sample [s], not decreasing."""
+
+    @property
+    def base(self) -> tuple[Quantity, ...]:
+        """Quantities that every fit moves: initial conditions, declared laws, nuisances with priors."""
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Effects that the model may lack."""
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """Whitened residual (n, w), data minus prediction, zeros for missing data; its model's derivative (n, w, k).
+
+        The derivative is that of the prediction: the residual after a step d is residual - derivative @ d. Not finite
+        where there is no prediction.
+        """
+
+    @property
+    def weights(self) -> Array:
+        """(n,) how many numbers of each row are data."""
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """Values from which refits of a candidate with a threshold begin, given a fit without it."""
+
+
+class Wrapped:
+    """A system as another sees it: all as it is, but for what a subclass changes."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+
+    @property
+    def time(self) -> Array:
+        """(n,) instants of all samples [s]."""
+        return self._system.time
+
+    @property
+    def base(self) -> tuple[Quantity, ...]:
+        """As the system's."""
+        return self._system.base
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """As the system's."""
+        return self._system.candidates
+
+    @property
+    def weights(self) -> Array:
+        """As the system's."""
+        return self._system.weights
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """As the system's."""
+        return self._system.starts(candidate, values)
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """As the system's."""
+        return self._system.linearise(values, names)
+
+
+class Subset(Wrapped):
+    """The first samples of a system, or any others: the rest counts as missing."""
+
+    def __init__(self, system: System, rows: NDArray[np.bool_]) -> None:
+        """Rows (n,) True where the sample belongs to the subset."""
+        super().__init__(system)
+        self._rows = rows
+
+    @property
+    def weights(self) -> Array:
+        """(n,) zero outside the subset."""
+        return np.where(self._rows, super().weights, 0)
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """As the whole system's, zeros outside the subset, even where there is no prediction."""
+        residual, derivative = super().linearise(values, names)
+        outside = ~self._rows
+        residual, derivative = residual.copy(), derivative.copy()
+        residual[outside], derivative[outside] = 0.0, 0.0
+        return residual, derivative

@@ -1,0 +1,1 @@
+"""What a diagnosis says: words, JSON, figures and the page."""

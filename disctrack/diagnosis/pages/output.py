@@ -1,0 +1,246 @@
+"""A diagnosis as JSON, as a group of the trajectory file, and as lines for people."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from disctrack.diagnosis.disc.errors import Ahead, Errors
+from disctrack.diagnosis.disc.separation import Separation
+from disctrack.diagnosis.engine.fit import Fit
+from disctrack.diagnosis.engine.search import Found, Tried
+from disctrack.diagnosis.pages.words import shown
+from disctrack.files.labelled_arrays import Variable
+from disctrack.files.trajectory_file import write_group
+from disctrack.frames import COORDINATES, POSE_COMPONENTS
+
+if TYPE_CHECKING:
+    from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
+    from disctrack.diagnosis.disc.free_runs import Evidence
+
+GROUP = "diagnosis"
+
+
+def _number(x: float | None) -> float | None:
+    """JSON knows no infinities."""
+    return None if x is None or not np.isfinite(x) else float(x)
+
+
+def _parameters(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
+    found = []
+    for q in quantities:
+        name, value, sigma = shown(q, fit)
+        amount = {"name": name, "value": _number(value), "sigma": _number(sigma)}
+        found.append(amount | {"unit": q.unit, "meaning": q.meaning})
+    return found
+
+
+def _separation(separation: Separation | None) -> dict[str, Any] | None:
+    """The recording that would separate two effects; None where none of those looked at can be made."""
+    if separation is None:
+        return None
+    return {
+        "theta_deg": separation.theta_deg,
+        "omega3_rad_s": separation.omega3,
+        "duration_s": separation.duration,
+        "angle_deg": _number(np.degrees(separation.angle)),
+        "sigmas": _number(separation.sigmas),
+    }
+
+
+def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None] | None = None) -> dict[str, Any]:
+    """One effect found, of any system.
+
+    after : fit of the enlarged model
+    apart : recordings that would separate the effect from its rivals, by their names
+    """
+    apart = apart or {}
+    c = found.candidate
+    return {
+        "name": c.effect,
+        "candidate": c.name,
+        "kind": c.kind,
+        "title": c.title,
+        "source": c.source,
+        "parameters": _parameters(c.quantities, after),
+        "class": [
+            {
+                "name": r.candidate.name,
+                "angle_deg": _number(np.degrees(r.angle)),
+                "delta_chi_square": _number(r.loss),
+                "parameters": _parameters(r.candidate.quantities, r.fit),
+                "separated_by": _separation(apart.get(r.candidate.name)),
+            }
+            for r in found.cannot_be_told_from
+        ],
+        "score": _number(found.gain),
+        "threshold": _number(found.threshold),
+        "significance_sigma": _number(np.sqrt(max(found.gain, 0.0))),
+        "held_out_gain": _number(found.held_out_gain),
+    }
+
+
+def _errors(errors: Errors | None, longer: tuple[Ahead, ...] = ()) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    w = errors.whiteness
+    return {
+        "reduced_chi_square": _number(errors.reduced_chi_square),
+        "reduced_chi_square_pose": _number(errors.reduced_chi_square_pose),
+        "rms_px": _number(errors.rms_px),
+        "rms_position_um": _number(errors.position_um),
+        "rms_theta_mdeg": _number(errors.theta_mdeg),
+        "held_out": {
+            "ratio_to_noise_floor": _number(errors.ratio_to_floor),
+            "free_run": [
+                {
+                    "horizon_s": a.horizon,
+                    "theta_deg": _number(a.theta_deg),
+                    "psi_deg": _number(a.psi_deg),
+                    "position_mm": _number(a.position_mm),
+                    "noise_theta_deg": _number(a.noise_theta_deg),
+                    "noise_psi_deg": _number(a.noise_psi_deg),
+                    "noise_position_mm": _number(a.noise_position_mm),
+                }
+                for a in (*errors.ahead, *longer)
+            ],
+        },
+        "whiteness": {
+            "ljung_box": dict(zip(POSE_COMPONENTS, w.ljung_box.tolist(), strict=True)),
+            "p_value": w.p_value,
+            "peak_frequency_hz": dict(zip(POSE_COMPONENTS, w.peak_frequency.tolist(), strict=True)),
+            "peak_p_value": dict(zip(POSE_COMPONENTS, w.peak_p_value.tolist(), strict=True)),
+            "peak_near": dict(zip(POSE_COMPONENTS, w.peak_near, strict=True)),
+        },
+    }
+
+
+def tried_json(tried: Tried) -> dict[str, Any]:
+    """What became of one candidate, of any system."""
+    return {
+        "name": tried.candidate.name,
+        "kind": tried.candidate.kind,
+        "score": _number(tried.score),
+        "refit_gain": _number(tried.gain),
+        "held_out_gain": _number(tried.held_out_gain),
+        "reason": tried.reason,
+    }
+
+
+def _declared(fit: Fit) -> dict[str, Any]:
+    laws = [q for q in fit.quantities if q.name.partition(".")[0] not in ("state", "rig") and "dot_" not in q.name]
+    return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
+
+
+def _learned(learned: Learned) -> dict[str, Any]:
+    law = learned.law
+    return {
+        "name": law.candidate.effect,
+        "candidate": law.candidate.name,
+        "kind": "learned",
+        "title": law.candidate.title,
+        "source": law.candidate.source,
+        "formulas": law.formulas,
+        "share_of_resamples": list(law.share),
+        "phase_locked": law.locked,
+        "mean_power_W": _number(learned.power),
+        "parameters": _parameters(law.candidate.quantities, learned.fit),
+        "class": [],
+        "score": _number(learned.gain),
+        "held_out_gain": _number(learned.held_out_gain),
+    }
+
+
+def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, Any]:
+    """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
+    diagnosis = result.diagnosis
+    apart = result.separated_by
+    effects = [effect_json(f, diagnosis.after, apart.get(f.candidate.name)) for f in diagnosis.found]
+    rows, longer = result.system.rows, beside.ahead if beside else ()
+    return {
+        "verdict": diagnosis.verdict,
+        "sentence": result.sentence,
+        "reason": diagnosis.reason,
+        "model": result.model,
+        "notes": list(result.notes),
+        "frames": [int(result.system.trajectory.frame[i]) for i in (rows.start, rows.stop - 1)],
+        "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
+        "before": (_errors(result.before, tuple(b for b, _ in longer)) or {})
+        | {"parameters": _declared(diagnosis.before)},
+        "after": (_errors(result.after, tuple(a for _, a in longer)) or {})
+        | {"parameters": _declared(result.after_fit)},
+        "noise_variance_over_stated": _number(diagnosis.noise),
+        "energy_J": result.energy,
+        "energy_before_J": beside.energy_before if beside else {},
+        "tried": [tried_json(t) for t in diagnosis.tried],
+        "settings": vars(diagnosis.settings),
+    }
+
+
+def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, document: dict[str, Any]) -> None:
+    """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
+    system = result.system
+    n = len(system.trajectory)
+    variables = {}
+    for name, fit in (("before", result.diagnosis.before), ("after", result.after_fit)):
+        residual, predicted = np.full((2, n, 6), np.nan)
+        if result.before is not None:
+            whitened = system.pose_residual(fit.values)
+            residual[system.rows] = np.where((system.weights >= 6)[:, None], whitened, np.nan)
+            predicted[system.rows] = system.poses(fit.values)
+        what = f"whitened pose residual {name} the missing effects were added; variance 1 if only noise is left"
+        variables[f"residual_{name}"] = Variable(residual, ("time", "pose_component"), "1", what)
+        what = f"x, y, z, psi, theta, phi of the model {name}"
+        variables[f"q_{name}"] = Variable(predicted, ("time", "coordinate"), "m and rad", what)
+    axes = {"coordinate": Variable(np.array(COORDINATES), ("coordinate",), "1", "coordinate")}
+    axes["contact_axis"] = Variable(np.array(["n0", "m0", "k"]), ("contact_axis",), "1", "axis of the contact frame")
+    if beside is not None and beside.measured is not None:
+        from disctrack.diagnosis.disc.free_runs import force_of
+
+        force, sigma = np.full((2, n, 3), np.nan)
+        force[system.rows] = beside.measured.force - force_of(system, result.diagnosis.before)
+        sigma[system.rows] = beside.measured.force_sigma
+        what = "mass times measured acceleration, minus the force of the model before"
+        variables["missing_force"] = Variable(force, ("time", "contact_axis"), "N", what)
+        variables["missing_force_sigma"] = Variable(sigma, ("time", "contact_axis"), "N", f"standard deviation: {what}")
+    if result.moment is not None:
+        axes["probe_time"] = Variable(result.moment.time, ("probe_time",), "s", "middle of a probe of the moment")
+        dims = ("probe_time", "contact_axis")
+        what = "contact moment that the model before fails to supply"
+        variables["missing_moment"] = Variable(result.moment.moment, dims, "N m", what)
+        variables["missing_moment_sigma"] = Variable(result.moment.sigma, dims, "N m", f"standard deviation: {what}")
+    attributes = {
+        "verdict": result.diagnosis.verdict,
+        "sentence": result.sentence,
+        "diagnosis": json.dumps(document),
+    }
+    write_group(path, GROUP, variables, axes=axes, attributes=attributes)
+
+
+def lines(result: DiscDiagnosis, beside: Evidence | None = None) -> list[str]:
+    """Some lines for the terminal."""
+    before, after = result.before, result.after
+    found = [f"{'verdict':<13} {result.diagnosis.verdict}", f"{'':<13} {result.sentence}"]
+    found += [f"{'note':<13} {text}" for text in result.notes]
+    if before is None or after is None:
+        return found
+    found += [
+        f"{'significance':<13} {f.candidate.name}: chi-square rises by {f.gain:.4g} without it (noise alone: "
+        f"{f.threshold:.3g}); gain on held-out data {f.held_out_gain:.4g}"
+        for f in result.diagnosis.found
+    ]
+    found.append(
+        f"{'chi-square':<13} {before.reduced_chi_square:.4g} -> {after.reduced_chi_square:.4g} per degree of freedom; "
+        f"{before.rms_px:.4f} -> {after.rms_px:.4f} px rms"
+    )
+    found.append(f"{'free run':<13} {before.ratio_to_floor:.4g} -> {after.ratio_to_floor:.4g} times the noise floor")
+    for a, b in (*zip(before.ahead, after.ahead, strict=True), *(beside.ahead if beside else ())):
+        found.append(
+            f"{'':<13} {a.horizon:g} s ahead: theta {a.theta_deg:.3g} -> {b.theta_deg:.3g} deg, psi {a.psi_deg:.3g} -> "
+            f"{b.psi_deg:.3g} deg, position {a.position_mm:.3g} -> {b.position_mm:.3g} mm"
+        )
+    return found

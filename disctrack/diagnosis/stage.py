@@ -1,0 +1,148 @@
+"""The stage: trajectory file in; diagnosis.json, enlarged model and the group `diagnosis` out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from disctrack.diagnosis.disc.declared_dots import with_declared_dots
+from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
+from disctrack.diagnosis.disc.errors import energy_balance, errors
+from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment, learn, without_idle_terms
+from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
+from disctrack.diagnosis.disc.separation import separations
+from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import held_out, training_rows
+from disctrack.diagnosis.engine.search import Diagnosis, Settings
+from disctrack.diagnosis.engine.shape import refine_shapes
+from disctrack.diagnosis.engine.system import System
+from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
+from disctrack.diagnosis.pages.words import sentence
+from disctrack.errors import AnalysisError, OutputError
+from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
+from disctrack.files.whole import write_whole
+from disctrack.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class DiagnoseOutcome:
+    """What `run_diagnose` did."""
+
+    result: DiscDiagnosis
+    files: tuple[Path, ...]
+    summary: tuple[str, ...]
+
+
+def diagnose_trajectory(
+    trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None, *, separate: bool = True
+) -> DiscDiagnosis:
+    """What does the model lack? Fit, trace, refit, judge.
+
+    model    : "paper", "none", or a TOML file (`model_file.declared_model`)
+    separate : also look for recordings that would tell apart what this one does not
+    Raises AnalysisError, SceneError, ModelError.
+    """
+    declared = declared_model(trajectory, model)
+    answer = diagnose_motion(trajectory, declared.model, declared.faults, settings)
+    system, diagnosis = answer.system, answer.diagnosis
+    if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
+        text = sentence(diagnosis, diagnosis.after, None, None)
+        return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
+    diagnosis, remarks = refine_shapes(system, diagnosis)
+    moment, learned = _beyond_the_catalogue(system, diagnosis)
+    if learned is not None:
+        reason = (
+            f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
+        )
+        diagnosis = replace(diagnosis, verdict="unexplained", found=(), reason=reason)
+    if answer.slip is not None:
+        diagnosis = with_slip(diagnosis, answer.slip)
+    held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
+    assert held_before is not None
+    assert held_after is not None
+    fit_ = learned.fit if learned else diagnosis.after
+    before = errors(system, diagnosis.before, held_before)
+    after = errors(system, fit_, learned.held_out if learned else held_after)
+    text = sentence(diagnosis, fit_, after, learned.law if learned else None)
+    energy = energy_balance(system, fit_.values)
+    apart = {
+        f.candidate.name: separations(system, fit_, f.candidate, [r.candidate for r in f.cannot_be_told_from])
+        for f in diagnosis.found
+        if f.cannot_be_told_from and separate
+    }
+    return DiscDiagnosis(
+        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, (*answer.notes, *remarks)
+    )
+
+
+def _with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    return fit(system, (*base.quantities, *law.candidate.quantities), start)
+
+
+def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[MissingMoment | None, Learned | None]:
+    """The missing moment, and its law if that describes the data better, for its length, than the catalogue does."""
+    if diagnosis.verdict == "nothing missing" or (diagnosis.verdict == "found" and len(diagnosis.found) < 2):
+        return None, None
+    base = diagnosis.before
+    moment, law = learn(system, base, diagnosis.noise)
+    if law is None or diagnosis.held_out_before is None:
+        return moment, None
+    judged = diagnosis.judged or system
+    fitted = _with_law(judged, base, law)
+    shorter = without_idle_terms(law, fitted)
+    if fitted.converged and shorter is not law:
+        law, fitted = shorter, _with_law(judged, base, shorter)
+    price = float(np.log(np.sum(system.weights)))
+    lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
+    saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])
+    rows = training_rows(system, diagnosis.settings.train_fraction)
+    held = held_out(judged, fitted.quantities, fitted.values, rows)
+    held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise
+    if not (fitted.converged and saved > 0 and held_gain > 0):
+        return moment, None
+    gain = (base.cost - fitted.cost) / diagnosis.noise
+    work = energy_balance(system, fitted.values)[f"by {law.candidate.name}"]
+    power = -work / float(system.time[-1] - system.time[0])
+    return moment, Learned(law, fitted, held, gain, float(held_gain), power)
+
+
+def run_diagnose(
+    path: Path, output: Path | None = None, *, model: str = PAPER, overwrite: bool = False
+) -> DiagnoseOutcome:
+    """Diagnose a trajectory file; write diagnosis.json, diagnosis.html with figures, model.toml, and the file's group.
+
+    output : folder; without it `<name>_diagnosis` beside the file
+    Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
+    """
+    from disctrack.diagnosis.disc.free_runs import evidence
+    from disctrack.diagnosis.pages.report import write_report  # matplotlib is wanted here only
+
+    path = Path(path)
+    folder = Path(output) if output is not None else path.with_name(f"{path.stem}_diagnosis")
+    report = folder / "diagnosis.json"
+    if report.exists() and not overwrite:
+        raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
+    provenance = read_provenance(path)
+    trajectory = with_declared_dots(read_trajectory(path), read_findings(path))
+    try:
+        result = diagnose_trajectory(trajectory, model)
+    except AnalysisError as error:
+        raise AnalysisError(f"{path}: {error}") from error
+    beside = evidence(result) if result.before is not None else None
+    if beside is not None and result.moment is None:
+        result = replace(result, moment=beside.moment)
+    document = {"recording": provenance.recording, **as_json(result, beside)}
+    write_diagnosis(path, result, beside, document)
+    write_whole(report, (json.dumps(document, indent=1) + "\n").encode())
+    toml = folder / "model.toml"
+    text = model_toml(result.system, result.after_fit.values, provenance.recording)
+    write_whole(toml, text.encode())
+    pages = write_report(folder, result, beside, provenance.recording)
+    said = lines(result, beside)
+    return DiagnoseOutcome(result, (report, toml, *pages), tuple(said))

@@ -1,0 +1,1 @@
+"""How often the diagnosis is right, and how small an effect may be: recordings with something hidden in them."""

@@ -1,0 +1,505 @@
+"""The trajectory file: HDF5 that explains itself, written whole, and read back equal.
+
+Layout (axes in brackets): at the root time, frame, x y z psi theta phi with their sigmas, quaternion, pose_covariance,
+reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_group`).
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import platform
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import disctrack
+from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
+from disctrack.disc import Disc
+from disctrack.errors import OutputError, TrajectoryFileError
+from disctrack.files.labelled_arrays import Variable, flags, read_variables, write_variables
+from disctrack.files.whole import write_whole
+from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+SCHEMA = "disctrack trajectory"
+SCHEMA_VERSION = 1
+_DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "h5py", "numba")
+_CONVENTIONS = {
+    "frame_convention": "world: k up, table z = 0; origin and heading from the calibration's table view; "
+    "body: origin at the disc's centre, e3 out of the upper face",
+    "euler_convention": "R_world_body = Rz(psi) Rx(theta) Rz(phi); psi precession, theta nutation, phi spin; rad",
+    "quaternion_convention": "(w, x, y, z), body to world",
+    "pixel_convention": "(0, 0) is the centre of the top-left pixel, x right, y down",
+    "sigma_convention": "*_sigma and pose_covariance are the noise of that frame alone; *_sigma_calibration is common "
+    "to all frames and comes from the rig's covariance",
+}
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a result was made from; equal fingerprints mean that making it again would give it again."""
+
+    recording: str  # name
+    inputs: Mapping[str, str]  # what -> SHA-256 (hex) of its content
+    settings: Mapping[str, Any]  # everything that was chosen, of JSON's types
+    version: str = disctrack.__version__
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 (hex) of inputs, settings and version."""
+        content = {"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def write_trajectory(
+    path: Path,
+    trajectory: Trajectory,
+    provenance: Provenance,
+    overwrite: bool = False,
+    findings: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be.
+
+    findings : what the run found out on the way (blur, noise, warnings, ...), of JSON's types; see `read_findings`
+    """
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists. Choose another name with -o, or replace it with --overwrite.")
+    buffer = io.BytesIO()  # a disk that fills up fails in one plain write, not inside the HDF5 library
+    with h5py.File(buffer, "w", track_order=True) as file:
+        write_variables(file, _root_variables(trajectory), _axes(trajectory))
+        for name, variables in (("markers", _markers(trajectory)), ("disc", _disc(trajectory.disc))):
+            write_variables(file.create_group(name, track_order=True), variables)
+        file["disc"].attrs.update(_disc_attributes(trajectory.disc))
+        _write_rig(file.create_group("calibration", track_order=True), trajectory)
+        file.attrs.update(_root_attributes(trajectory, provenance))
+        file.attrs["findings"] = json.dumps(dict(findings or {}))
+        file.attrs["complete"] = 1
+    write_whole(path, buffer.getbuffer())
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's."""
+    with _Reading(path) as file:
+        return _trajectory(file)
+
+
+def read_provenance(path: Path) -> Provenance:
+    """What the file was made from. Raises TrajectoryFileError."""
+    with _Reading(path) as file:
+        return Provenance(
+            recording=str(file.attrs["recording"]),
+            inputs=json.loads(file.attrs["inputs_sha256"]),
+            settings=json.loads(file.attrs["settings"]),
+            version=str(file.attrs["software_version"]),
+        )
+
+
+def read_findings(path: Path) -> dict[str, Any]:
+    """What the run that wrote the file found out on the way. Raises TrajectoryFileError."""
+    with _Reading(path) as file:
+        return dict(json.loads(file.attrs["findings"]))
+
+
+def is_result_of(path: Path, provenance: Provenance) -> bool:
+    """True if `path` is the complete result of the same inputs, settings and version, so that it can be reused."""
+    try:
+        return read_provenance(path).fingerprint == provenance.fingerprint
+    except TrajectoryFileError:
+        return False
+
+
+def write_group(
+    path: Path,
+    group: str,
+    variables: Mapping[str, Variable],
+    axes: Mapping[str, Variable] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Add a stage's group to a trajectory file, or replace it; all else stays. The file is whole at every instant.
+
+    axes : those that the file's root does not have yet
+    Raises TrajectoryFileError, OutputError.
+    """
+    with _Reading(path):  # a complete trajectory file, or an error
+        pass
+    buffer = io.BytesIO(path.read_bytes())
+    with h5py.File(buffer, "r+", track_order=True) as file:
+        if group in file:
+            del file[group]
+        created = file.create_group(group, track_order=True)
+        write_variables(created, variables, axes)
+        created.attrs.update(dict(attributes or {}))
+    write_whole(path, buffer.getbuffer())
+
+
+def read_group(
+    path: Path, group: str, names: Collection[str] | None = None
+) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Arrays and attributes of one group. Raises TrajectoryFileError that names the groups there are.
+
+    names : the arrays that are wanted, where not all are
+    """
+    with _Reading(path) as file:
+        if group not in file or not isinstance(file[group], h5py.Group):
+            there = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
+            raise TrajectoryFileError(f"{path}: no group '{group}'; it holds {there}. Run the stage that writes it.")
+        return read_variables(file[group], names=names), dict(file[group].attrs)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What was filmed, by which cameras and when, without the measurement itself."""
+
+    time: NDArray[np.float64]  # (n,) [s]
+    disc: Disc
+    rig: StereoRig
+    gravity: float  # [m/s^2]
+    fingerprint: str  # of the trajectory: equal for equal inputs, settings and version
+
+
+def read_setup(path: Path) -> Setup:
+    """Time, disc and rig of a trajectory file. Raises TrajectoryFileError."""
+    with _Reading(path) as file:
+        return Setup(
+            time=read_variables(file, names=("time",))["time"],
+            disc=_read_disc(file["disc"]),
+            rig=_rig(
+                read_variables(file["calibration"], names=_RIG_VARIABLES),
+                bool(file["calibration"].attrs["world_is_table"]),
+            ),
+            gravity=float(file.attrs["gravity_m_s2"]),
+            fingerprint=str(file.attrs["fingerprint"]),
+        )
+
+
+def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> None:
+    """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown."""
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists. Choose another name with -o, or replace it with --overwrite.")
+    scale = np.array([1e3, 1e3, 1e3, *np.degrees([1.0, 1.0, 1.0])])
+    units = ["mm"] * 3 + ["deg"] * 3
+    names = [f"{name}_{unit}" for name, unit in zip(COORDINATES, units, strict=True)]
+    header = ["frame", "time_s", *names, *(n.replace("_", "_sigma_") for n in names)]
+    header += [*(f"reprojection_rms_{camera}_px" for camera in CAMERAS), "status"]
+    table = np.column_stack([trajectory.q * scale, trajectory.coordinate_sigma * scale, trajectory.reprojection_rms_px])
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(header)
+    for frame, time, values, status in zip(
+        trajectory.frame, trajectory.time, table, trajectory.frame_status, strict=True
+    ):
+        cells = ["" if np.isnan(value) else f"{value:.7g}" for value in values]
+        writer.writerow([frame, f"{time:.9g}", *cells, FrameStatus(status).name.lower()])
+    write_whole(path, text.getvalue().encode())
+
+
+def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "software": "disctrack",
+        "software_version": provenance.version,
+        "dependencies": json.dumps({"python": platform.python_version()} | {n: _version(n) for n in _DEPENDENCIES}),
+        "recording": provenance.recording,
+        "inputs_sha256": json.dumps(dict(provenance.inputs), sort_keys=True),
+        "settings": json.dumps(dict(provenance.settings), sort_keys=True),
+        "fingerprint": provenance.fingerprint,
+        "frame_rate_hz": trajectory.frame_rate,
+        "gravity_m_s2": trajectory.gravity,
+        **_CONVENTIONS,
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def _axes(trajectory: Trajectory) -> dict[str, Variable]:
+    def names(axis: str, values: tuple[str, ...], what: str) -> Variable:
+        return Variable(np.array(values), (axis,), "1", what)
+
+    markers = np.arange(trajectory.disc.n_markers)
+    return {
+        "time": Variable(trajectory.time, ("time",), "s", "mid exposure, from the recording's first frame"),
+        "camera": names("camera", CAMERAS, "camera"),
+        "marker": Variable(markers, ("marker",), "1", "dot on the upper face, in the order of recording.toml"),
+        "axis": names("axis", ("x", "y"), "pixel axis: x right, y down"),
+        "axis_2": names("axis_2", ("x", "y"), "pixel axis"),
+        "space_axis": names("space_axis", ("x", "y", "z"), "axis of space"),
+        "space_axis_2": names("space_axis_2", ("x", "y", "z"), "axis of space"),
+        "quaternion_component": names("quaternion_component", ("w", "x", "y", "z"), "quaternion component"),
+        "pose_component": names("pose_component", POSE_COMPONENTS, "position, and rotation vector in world axes"),
+        "pose_component_2": names("pose_component_2", POSE_COMPONENTS, "position, and rotation vector in world axes"),
+        "rig_parameter": names("rig_parameter", RIG_PARAMETERS, "parameter of the stereo rig"),
+        "rig_parameter_2": names("rig_parameter_2", RIG_PARAMETERS, "parameter of the stereo rig"),
+        "distortion_coefficient": names("distortion_coefficient", _DISTORTION, "Brown's coefficients as OpenCV's"),
+    }
+
+
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+_LONG_NAMES = {
+    "x": "position of the disc's centre along i",
+    "y": "position of the disc's centre along j",
+    "z": "height of the disc's centre above the table",
+    "psi": "precession angle, unwrapped",
+    "theta": "nutation angle",
+    "phi": "spin angle, unwrapped",
+}
+
+
+def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
+    units = ("m",) * 3 + ("rad",) * 3
+    variables = {"frame": Variable(trajectory.frame, ("time",), "1", "number of the frame in its sequence")}
+    parts = (
+        ("", "", trajectory.q),
+        ("_sigma", "standard deviation, noise of this frame: ", trajectory.coordinate_sigma),
+        ("_sigma_calibration", "standard deviation, calibration: ", trajectory.calibration_sigma),
+    )
+    for ending, what, values in parts:
+        for i, name in enumerate(COORDINATES):
+            variables[name + ending] = Variable(values[:, i], ("time",), units[i], what + _LONG_NAMES[name])
+    mixed = "m and rad: m2, m rad, rad2"
+    return variables | {
+        "quaternion": Variable(
+            trajectory.quaternion, ("time", "quaternion_component"), "1", "orientation, body to world, continuous"
+        ),
+        "pose_covariance": Variable(
+            trajectory.pose_covariance,
+            ("time", "pose_component", "pose_component_2"),
+            mixed,
+            "covariance of the pose, noise of this frame; calibration not included",
+        ),
+        "reprojection_rms_px": Variable(
+            trajectory.reprojection_rms_px, ("time", "camera"), "px", "root mean square of observed - projected dots"
+        ),
+        "reduced_chi_square": Variable(
+            trajectory.reduced_chi_square, ("time",), "1", "squared residuals over their predicted variance"
+        ),
+        "status": Variable(trajectory.frame_status, ("time",), "1", "why there is a pose, or none", flags(FrameStatus)),
+    }
+
+
+def _markers(trajectory: Trajectory) -> dict[str, Variable]:
+    dims = ("time", "camera", "marker", "axis")
+    return {
+        "centre_px": Variable(trajectory.markers_px, dims, "px", "image of the dot's centre (not the ellipse's)"),
+        "centre_covariance_px2": Variable(
+            trajectory.markers_covariance_px2, (*dims, "axis_2"), "px2", "covariance of centre_px"
+        ),
+        "residual_px": Variable(trajectory.markers_residual_px, dims, "px", "observed - projected"),
+        "status": Variable(
+            trajectory.marker_status, dims[:3], "1", "why a dot has a centre, or none", flags(MarkerStatus)
+        ),
+    }
+
+
+def _disc(disc: Disc) -> dict[str, Variable]:
+    return {
+        "marker_centres_body": Variable(
+            disc.marker_centres_body, ("marker", "space_axis"), "m", "dots on the disc, body frame, as used"
+        )
+    }
+
+
+def _disc_attributes(disc: Disc) -> dict[str, float]:
+    return {
+        "radius_m": disc.radius,
+        "half_thickness_m": disc.half_thickness,
+        "mass_kg": disc.mass,
+        "marker_diameter_m": disc.marker_diameter,
+    }
+
+
+def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
+    rig = trajectory.rig
+    matrix, vector = ("space_axis", "space_axis_2"), ("space_axis",)
+    write_variables(
+        group,
+        {
+            "camera_matrix": Variable(
+                [camera.camera_matrix for camera in rig.cameras], ("camera", *matrix), "px", "pinhole matrix K"
+            ),
+            "distortion": Variable(
+                [camera.distortion for camera in rig.cameras],
+                ("camera", "distortion_coefficient"),
+                "1",
+                "Brown distortion on normalised coordinates",
+            ),
+            "image_size_px": Variable(
+                [camera.image_size for camera in rig.cameras], ("camera", "axis"), "px", "width, height"
+            ),
+            "R_right_left": Variable(rig.R_right_left, matrix, "1", "rotation, left camera axes to right camera axes"),
+            "t_right_left": Variable(rig.t_right_left, vector, "m", "points_right = R_right_left @ points_left + t"),
+            "R_left_world": Variable(rig.R_left_world, matrix, "1", "rotation, world axes to left camera axes"),
+            "t_left_world": Variable(rig.t_left_world, vector, "m", "points_left = R_left_world @ points_world + t"),
+            "covariance": Variable(
+                rig.covariance,
+                ("rig_parameter", "rig_parameter_2"),
+                "px, m, rad and products",
+                "covariance of the rig's parameters; common to all frames",
+            ),
+            "sensitivity": Variable(
+                trajectory.calibration_sensitivity,
+                ("time", "pose_component", "rig_parameter"),
+                "m or rad per unit of the parameter",
+                "d pose / d rig parameter at fixed pixels",
+            ),
+        },
+    )
+    group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
+    group.attrs["baseline_m"] = rig.baseline
+
+
+class _Reading:
+    """A complete trajectory file, open for reading; whatever the HDF5 library says becomes a TrajectoryFileError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.file: h5py.File | None = None
+
+    def __enter__(self) -> h5py.File:
+        if not self.path.is_file():
+            raise TrajectoryFileError(f"{self.path}: no such file. Give a trajectory file written by disctrack track.")
+        try:
+            self.file = h5py.File(self.path, "r")
+            schema = self.file.attrs.get("schema", None)
+            version = int(self.file.attrs.get("schema_version", -1))
+            complete = int(self.file.attrs.get("complete", 0))
+        except Exception as error:
+            self._close()
+            raise self._damaged(error) from error
+        if schema != SCHEMA:
+            self._close()
+            raise TrajectoryFileError(
+                f"{self.path}: an HDF5 file, but not a trajectory (schema {schema!r}; expected {SCHEMA!r}). "
+                "Give a file written by disctrack track."
+            )
+        if version != SCHEMA_VERSION or complete != 1:
+            self._close()
+            what = f"has version {version} of the layout" if version != SCHEMA_VERSION else "is not complete"
+            raise TrajectoryFileError(f"{self.path}: {what}; expected version {SCHEMA_VERSION}. Run disctrack track.")
+        return self.file
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+        self._close()
+        if isinstance(error, Exception) and not isinstance(error, TrajectoryFileError):
+            raise self._damaged(error) from error
+
+    def _close(self) -> None:
+        if self.file is not None:
+            self.file.close()
+
+    def _damaged(self, error: Exception) -> TrajectoryFileError:
+        reason = " ".join(str(error).split())[:200]
+        return TrajectoryFileError(
+            f"{self.path}: not a readable trajectory file ({reason}). Run disctrack track again."
+        )
+
+
+def _trajectory(file: h5py.File) -> Trajectory:
+    root, markers = read_variables(file, text=False), read_variables(file["markers"])
+    calibration = read_variables(file["calibration"])
+    trajectory = Trajectory(
+        time=root["time"],
+        frame=root["frame"],
+        q=np.column_stack([root[name] for name in COORDINATES]),
+        pose_covariance=root["pose_covariance"],
+        calibration_sensitivity=calibration["sensitivity"],
+        quaternion=root["quaternion"],
+        frame_status=root["status"],
+        reprojection_rms_px=root["reprojection_rms_px"],
+        reduced_chi_square=root["reduced_chi_square"],
+        markers_px=markers["centre_px"],
+        markers_covariance_px2=markers["centre_covariance_px2"],
+        markers_residual_px=markers["residual_px"],
+        marker_status=markers["status"],
+        disc=_read_disc(file["disc"]),
+        rig=_rig(calibration, bool(file["calibration"].attrs["world_is_table"])),
+        frame_rate=float(file.attrs["frame_rate_hz"]),
+        gravity=float(file.attrs["gravity_m_s2"]),
+    )
+    _check_shapes(trajectory)
+    return trajectory
+
+
+def _read_disc(group: h5py.Group) -> Disc:
+    sizes = {key: float(value) for key, value in group.attrs.items()}
+    return Disc(
+        sizes["radius_m"],
+        sizes["half_thickness_m"],
+        sizes["mass_kg"],
+        read_variables(group)["marker_centres_body"],
+        sizes["marker_diameter_m"],
+    )
+
+
+_RIG_VARIABLES = (
+    "camera_matrix",
+    "distortion",
+    "image_size_px",
+    "R_right_left",
+    "t_right_left",
+    "R_left_world",
+    "t_left_world",
+    "covariance",
+)
+
+
+def _rig(values: Mapping[str, NDArray], world_is_table: bool) -> StereoRig:
+    cameras = [
+        Camera(
+            float(K[0, 0]),
+            float(K[1, 1]),
+            float(K[0, 2]),
+            float(K[1, 2]),
+            tuple(float(k) for k in distortion),  # type: ignore[arg-type]
+            (int(size[0]), int(size[1])),
+        )
+        for K, distortion, size in zip(
+            values["camera_matrix"], values["distortion"], values["image_size_px"], strict=True
+        )
+    ]
+    left, right = cameras
+    return StereoRig(
+        left,
+        right,
+        R_right_left=values["R_right_left"],
+        t_right_left=values["t_right_left"],
+        R_left_world=values["R_left_world"],
+        t_left_world=values["t_left_world"],
+        covariance=values["covariance"],
+        world_is_table=world_is_table,
+    )
+
+
+def _check_shapes(trajectory: Trajectory) -> None:
+    n, m = len(trajectory.time), trajectory.disc.n_markers
+    expected = {
+        "frame": (n,),
+        "q": (n, 6),
+        "pose_covariance": (n, 6, 6),
+        "calibration_sensitivity": (n, 6, len(RIG_PARAMETERS)),
+        "quaternion": (n, 4),
+        "frame_status": (n,),
+        "reprojection_rms_px": (n, 2),
+        "reduced_chi_square": (n,),
+        "markers_px": (n, 2, m, 2),
+        "markers_covariance_px2": (n, 2, m, 2, 2),
+        "markers_residual_px": (n, 2, m, 2),
+        "marker_status": (n, 2, m),
+    }
+    for name, shape in expected.items():
+        if getattr(trajectory, name).shape != shape:
+            raise TrajectoryFileError(f"{name} has shape {getattr(trajectory, name).shape}; expected {shape}")

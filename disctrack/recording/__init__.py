@@ -1,0 +1,1 @@
+"""What a recording declares: `recording.toml` read into frozen dataclasses in SI units."""

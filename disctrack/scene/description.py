@@ -1,0 +1,368 @@
+"""What a synthetic recording shows: every property of cameras, light, disc, board, motion and faults, with its default.
+
+A scene is a tree of frozen dataclasses and a TOML file of the same shape. Grey values are those of an 8-bit sensor
+(0 to 255) whatever the bit depth. Lengths in mm, angles in degrees, times in s, as the names say; all that a key does
+not say takes the default below, which resembles the experiment of Ma et al. 2014, section 3 (1000 pairs/s of 512 x 512,
+0.25 mm per pixel). Every random choice follows from `seed`.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from disctrack.disc import MA_2014, Disc, disc_from_mm
+from disctrack.errors import SceneError
+from disctrack.files.toml_tree import build, toml_lines
+
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Timing and format of the two cameras."""
+
+    frame_rate_hz: float = 1000.0
+    n_frames: int = 200  # for moving discs; static poses give one frame each
+    image_size: tuple[int, int] = (512, 512)  # width, height [px]
+    exposure_s: float = 0.0002  # frame i is exposed from i / frame_rate - exposure / 2 to + exposure / 2
+    bit_depth: int = 8  # 8, 10, 12 or 16; more than 8 is written as 16-bit files
+
+
+@dataclass(frozen=True)
+class RigSettings:
+    """Where the cameras stand and what lenses they have; `variation` scales the seeded differences between rigs."""
+
+    mm_per_px: float = 0.25  # at the point both cameras look at
+    distance_mm: Pair = (420.0, 420.0)
+    off_vertical_deg: Pair = (42.0, 42.0)
+    azimuth_deg: Pair = (-122.0, -53.0)  # of the camera seen from the target, from world axis i towards j
+    roll_deg: Pair = (0.0, 0.0)
+    target_mm: Triple = (32.0, 20.0, 4.0)  # world point on both optical axes, before variation
+    k1: Pair = (-0.11, -0.12)
+    k2: Pair = (0.25, 0.22)
+    p1: Pair = (4e-4, -3e-4)
+    p2: Pair = (-3e-4, 5e-4)
+    k3: Pair = (0.0, 0.0)
+    variation: float = 1.0  # 1: scatter of 2 deg, 10 mm, 4 px of the principal point, 0.5 % of focal length, ...
+
+
+@dataclass(frozen=True)
+class OpticsSettings:
+    """Blur and fall-off of the lenses."""
+
+    blur_px: Pair = (0.60, 0.65)  # standard deviation of the Gaussian point spread, left and right, without the pixel
+    vignetting: float = 0.04  # loss of light at the image's corner
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """From light to grey values. Defaults have the noise of a machine-vision camera: variance 0.64 + grey / 50 DN^2."""
+
+    gain_e_per_dn: float = 50.0  # photo-electrons per 8-bit grey level; 0: no shot noise
+    read_noise_dn: float = 0.8
+    black_level_dn: float = 0.0
+    hot_pixels: int = 0  # per camera
+    hot_pixel_dn: float = 60.0  # mean excess of a hot pixel, exponentially distributed
+
+
+@dataclass(frozen=True)
+class GlareSettings:
+    """A reflex of a lamp in a lens: a Gaussian spot fixed in the image, moving with neither disc nor table."""
+
+    camera: str = "left"
+    centre_px: Pair = (256.0, 256.0)
+    sigma_px: float = 40.0
+    grey: float = 20.0
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """The lamp: a gradient over the table, and how far brightness follows the face's inclination to it."""
+
+    gradient_per_m: Pair = (0.0, 0.0)  # relative change of brightness per metre along world i, j
+    directed: float = 0.10  # share of light that comes from `direction`; the rest comes from everywhere
+    direction: Triple = (0.2, 0.3, 1.0)
+    glare: tuple[GlareSettings, ...] = ()
+
+
+@dataclass(frozen=True)
+class AppearanceSettings:
+    """Grey values of the surfaces under full light, and the table's texture (fixed to the world)."""
+
+    paper: float = 190.0
+    dot: float = 25.0
+    rim: float = 118.0  # bare steel ring of the upper face
+    rim_width_mm: float = 1.5
+    side: float = 58.0
+    underside: float = 90.0
+    board_white: float = 200.0
+    board_black: float = 20.0
+    table: float = 85.0
+    table_streaks: float = 3.0  # standard deviation of the brushed texture
+    table_blotches: float = 2.0  # standard deviation of the soft spots
+    streak_direction_deg: float = 90.0  # from world axis i
+
+
+@dataclass(frozen=True)
+class DiscSettings:
+    """The disc as declared in recording.toml."""
+
+    radius_mm: float = 37.5
+    thickness_mm: float = 6.0
+    mass_g: float = 209.69
+
+
+def _default_centres() -> tuple[Pair, ...]:
+    return tuple((round(float(x), 4), round(float(y), 4)) for x, y in MA_2014.marker_centres_body[:, :2] * 1e3)
+
+
+@dataclass(frozen=True)
+class MarkerSettings:
+    """The dots as declared in recording.toml."""
+
+    diameter_mm: float = 7.0
+    centres_mm: tuple[Pair, ...] = field(default_factory=_default_centres)
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """The chessboard and its views; view 0 lies flat on the table."""
+
+    n_views: int = 20
+    inner_corners: tuple[int, int] = (9, 6)
+    square_mm: float = 8.0
+    margin_mm: float = 8.0  # white paper round the squares
+    thickness_mm: float = 3.0
+    max_tilt_deg: float = 38.0
+    max_turn_deg: float = 35.0
+    shift_mm: float = 22.0
+    height_mm: Pair = (5.0, 40.0)  # of the board's middle above the table in the tilted views
+
+
+@dataclass(frozen=True)
+class RollingMotion:
+    """Motion from the rolling model: regular precession with a nutation oscillation, losing energy to the effects."""
+
+    theta_deg: float = 20.0
+    psi_deg: float = 0.0
+    phi_deg: float = 0.0
+    centre_mm: Pair = (32.0, 20.0)  # of the disc at the first frame
+    omega3_rad_s: float = math.nan  # spin about the axis; nan: as much as keeps the centre at rest
+    nutation_deg: float = 0.05  # amplitude of the oscillation on top of regular precession
+    nutation_phase_deg: float = 0.0
+    state: dict[str, float] = field(default_factory=dict)  # components of rolling.State [SI] that replace the above
+    struck: dict[str, float] = field(default_factory=dict)  # in place of all that: upright and at rest, hit by a ball;
+    # lateral_mm, vertical_mm from the middle of the upper face, impulse_N_s, friction of the table during the impact
+    effects: dict[str, dict[str, float]] = field(default_factory=lambda: {"km": {}, "kn": {}, "kz": {}})
+    # by their names in rolling.CATALOGUE; parameters not given take their nominal value, for these three the paper's
+    formulas: dict[str, dict[str, str]] = field(default_factory=dict)  # laws of further effects: component -> formula
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """One source of motion: poses (one frame each), a table over time, or the rolling model.
+
+    Poses are rows of x, y, z [mm], psi, theta, phi [deg]; `table` names a CSV or NPY file beside the scene with rows
+    t [s], x, y, z [m], psi, theta, phi [rad] (cubic spline between them).
+    """
+
+    kind: str = "static"  # static, table or rolling
+    poses: tuple[tuple[float, ...], ...] = ((32.0, 20.0, 12.0, 30.0, 15.0, 40.0),)
+    table: str = ""
+    rolling: RollingMotion = field(default_factory=RollingMotion)
+
+
+@dataclass(frozen=True)
+class CameraFault:
+    """What became of one camera after its calibration."""
+
+    rotation_deg: Triple = (0.0, 0.0, 0.0)  # rotation vector in the camera's own axes
+    translation_mm: Triple = (0.0, 0.0, 0.0)  # of the camera, in its own axes
+    focal_scale: float = 1.0
+    k1_change: float = 0.0
+    principal_point_change_px: Pair = (0.0, 0.0)
+    missing_frames: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Occluder:
+    """A dark rod before one camera, straight in its image, from the first to the last frame named."""
+
+    camera: str = "left"
+    centre_px: Pair = (256.0, 256.0)
+    angle_deg: float = 0.0  # of its axis, from x towards y
+    width_px: float = 20.0
+    length_px: float = 1e4
+    grey: float = 40.0
+    first_frame: int = 0
+    last_frame: int = 10**9
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong and is not declared: it changes the images and truth.h5, never recording.toml."""
+
+    right_delay_s: float = 0.0  # the right camera exposes that much later than the left
+    frame_rate_hz: float = 0.0  # true frame rate; 0: the declared one
+    misprint_mm: tuple[Pair, ...] = ()  # true minus declared centre of each dot
+    misprint_sigma_mm: float = 0.0  # the same drawn at random
+    pattern_offset_mm: Pair = (0.0, 0.0)  # paper and dots glued off centre
+    pattern_turn_deg: float = 0.0  # and turned about the disc's axis
+    pattern_scale: float = 1.0  # true over declared distances of the dots from the pattern's middle
+    pattern_height_mm: float = 0.0  # of the dots above half the thickness: paper and glue
+    table_turn_deg: Pair = (0.0, 0.0)  # rotation vector, x and y, of the true table in the axes of the table view
+    table_height_mm: float = 0.0  # of the true table in those axes
+    exposure_s: float = 0.0  # true exposure; 0: that of the cameras
+    ellipse_centre_share: float = (
+        0.0  # not of the images: of whoever takes the centre of a dot's image for the image of
+    )
+    # its centre; 1: not corrected at all. Nothing to draw, but a model may know of it
+    hidden_markers: tuple[int, ...] = ()  # dots that have come off
+    left: CameraFault = field(default_factory=CameraFault)
+    right: CameraFault = field(default_factory=CameraFault)
+    occluders: tuple[Occluder, ...] = ()
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Fineness of the computation, not of the scene."""
+
+    subpixels: int = 5  # cells per pixel and axis where an edge passes
+    threads: int = 2
+    png_compression: int = 3  # 0 to 9
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that determines a synthetic recording."""
+
+    name: str = "scene"
+    seed: int = 1
+    gravity_m_s2: float = 9.81
+    cameras: CameraSettings = field(default_factory=CameraSettings)
+    rig: RigSettings = field(default_factory=RigSettings)
+    optics: OpticsSettings = field(default_factory=OpticsSettings)
+    sensor: SensorSettings = field(default_factory=SensorSettings)
+    light: LightSettings = field(default_factory=LightSettings)
+    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
+    disc: DiscSettings = field(default_factory=DiscSettings)
+    markers: MarkerSettings = field(default_factory=MarkerSettings)
+    board: BoardSettings = field(default_factory=BoardSettings)
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    faults: Faults = field(default_factory=Faults)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    folder: Path = Path()  # where files named in the scene are looked for; set by load_scene
+
+    @property
+    def declared_disc(self) -> Disc:
+        """The disc that recording.toml describes."""
+        d = self.disc
+        return disc_from_mm(
+            d.radius_mm, d.thickness_mm, d.mass_g, [list(c) for c in self.markers.centres_mm], self.markers.diameter_mm
+        )
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Scene of a TOML file; what it does not say takes its default.
+
+    Raises SceneError for a file that cannot be read, an unknown key (naming the nearest known one) and a value of the
+    wrong kind.
+    """
+    path = Path(path)
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(
+            f"{path}: the scene cannot be read ({error.strerror}); give the path of a TOML file"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: not a TOML file ({error}); correct it there") from error
+    return scene_from_tree(tree, where=str(path), folder=path.parent)
+
+
+def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = Path()) -> Scene:
+    """Scene of nested dictionaries as tomllib returns them; errors as in `load_scene`."""
+    scene = replace(build(Scene, tree, where), folder=folder)
+    _check(scene, where)
+    return scene
+
+
+def scene_toml(scene: Scene) -> str:
+    """All of `scene` as a TOML file that `load_scene` reads back to the same scene (but for its folder)."""
+    return "\n".join(toml_lines(scene)).lstrip() + "\n"
+
+
+def _check(scene: Scene, where: str) -> None:
+    """Raise SceneError for values that no recording can have."""
+    cameras, disc, board = scene.cameras, scene.disc, scene.board
+    reach_mm = max((math.hypot(x, y) for x, y in scene.markers.centres_mm), default=0.0) + scene.markers.diameter_mm / 2
+    positive = {
+        "cameras.frame_rate_hz": cameras.frame_rate_hz,
+        "rig.mm_per_px": scene.rig.mm_per_px,
+        "rig.distance_mm": min(scene.rig.distance_mm),
+        "disc.radius_mm": disc.radius_mm,
+        "disc.thickness_mm": disc.thickness_mm,
+        "disc.mass_g": disc.mass_g,
+        "markers.diameter_mm": scene.markers.diameter_mm,
+        "board.square_mm": board.square_mm,
+        "gravity_m_s2": scene.gravity_m_s2,
+        "faults.pattern_scale": scene.faults.pattern_scale,
+    }
+    for key, value in positive.items():
+        if not (math.isfinite(value) and value > 0):
+            raise SceneError(f"{where}: {key} = {value}; expected a positive number")
+    complaints = [
+        (len(scene.markers.centres_mm) < 3, "markers.centres_mm", f"{len(scene.markers.centres_mm)} rows", "3 or more"),
+        (reach_mm > disc.radius_mm, "markers.centres_mm", "a dot over the disc's rim", "dots on the face"),
+        (
+            board.n_views < 1 or min(board.inner_corners) < 2,
+            "board",
+            "no view or no corner",
+            "n_views >= 1, corners >= 2",
+        ),
+        (scene.cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", scene.cameras.bit_depth, "8, 10, 12, 16"),
+        (scene.cameras.n_frames < 1, "cameras.n_frames", scene.cameras.n_frames, "at least 1"),
+        (scene.cameras.exposure_s < 0, "cameras.exposure_s", scene.cameras.exposure_s, "0 or more"),
+        (scene.faults.exposure_s < 0, "faults.exposure_s", scene.faults.exposure_s, "0 or more"),
+        (min(scene.cameras.image_size) < 16, "cameras.image_size", scene.cameras.image_size, "at least 16 x 16"),
+        (min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"),
+        (scene.render.subpixels < 2, "render.subpixels", scene.render.subpixels, "2 or more"),
+        (
+            scene.motion.kind not in ("static", "table", "rolling"),
+            "motion.kind",
+            scene.motion.kind,
+            "static, table, rolling",
+        ),
+        (
+            any(len(p) != 6 for p in scene.motion.poses),
+            "motion.poses",
+            "rows",
+            "6 numbers each: x y z mm, psi theta phi deg",
+        ),
+        (
+            not {g.camera for g in scene.light.glare} | {r.camera for r in scene.faults.occluders} <= {"left", "right"},
+            "camera of a glare or occluder",
+            "another word",
+            "left or right",
+        ),
+        (
+            len(scene.faults.misprint_mm) not in (0, len(scene.markers.centres_mm)),
+            "faults.misprint_mm",
+            f"{len(scene.faults.misprint_mm)} rows",
+            f"one per dot ({len(scene.markers.centres_mm)})",
+        ),
+        (
+            any(not 0 <= k < len(scene.markers.centres_mm) for k in scene.faults.hidden_markers),
+            "faults.hidden_markers",
+            scene.faults.hidden_markers,
+            f"numbers from 0 to {len(scene.markers.centres_mm) - 1}",
+        ),
+    ]
+    for bad, key, found, expected in complaints:
+        if bad:
+            raise SceneError(f"{where}: {key} = {found}; expected {expected}")

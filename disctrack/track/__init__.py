@@ -1,0 +1,1 @@
+"""The tracking stage: image pairs become the trajectory, each pose with its covariance."""

@@ -1,0 +1,293 @@
+"""Find and number the dots without any prior: blobs in both images, then the one rigid motion that explains them.
+
+Stereo first: blobs that meet in space give points, and triples of points with the mutual distances of three dots give
+candidate motions. If one camera sees too little, three blobs of the other give candidate poses (perspective three-point
+problem), and of mirror twins the one that touches the table is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations, permutations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import StereoRig, normalise, triangulate
+from calibration.grey_levels import level_step
+from disctrack.disc import Disc
+from disctrack.frames import euler_from_rotation, rotation_from_vector
+from disctrack.track.pose import fit_poses, marker_pixels
+
+Array = NDArray[np.float64]
+
+MAX_BLOBS = 24
+EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by little
+SIDE_TOLERANCE = 0.06  # of the distance between two dots: centroids err by 0.3 px, that is 0.1 mm of 13-52 mm
+INLIER_DIAMETERS = 0.35  # a blob belongs to a dot if it lies within this part of a dot's diameter
+MIN_EXPLAINED = 4
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """Pose found without a prior, good to a fraction of a pixel, or the reason why none was found."""
+
+    R_world_body: Array | None  # (3, 3)
+    t_world_body: Array | None  # (3,) [m]
+    n_explained: int  # dot images explained by blobs, both cameras together
+    reason: str  # empty when found
+
+
+def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
+    """Centroids (k, 2) of round-ish blobs, dark on light and light on dark, most elliptical first.
+
+    A blob's pixels differ from the mean of their surroundings (so uneven light does not matter), and its area must be
+    that of the ellipse with the same second moments.
+    """
+    grey = np.asarray(image, np.float32) / np.float32(level_step(image))  # images of any depth alike, to the last bit
+    block = 2 * int(1.25 * expected_diameter_px) + 1
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    mean = cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE)
+    spread = float(np.percentile(np.abs(smooth - mean), 50))
+    # against the surroundings, so that a glare gradient does not matter; dim images keep a floor of three spreads
+    threshold = np.maximum(0.12 * mean, 3.0 * spread)
+    found = []
+    for mask in (smooth < mean - threshold, smooth > mean + threshold):
+        found += _elliptical_components(mask.astype(np.uint8), expected_diameter_px)
+    found.sort()
+    return np.array([[x, y] for _, x, y in found[:MAX_BLOBS]], float).reshape(-1, 2)
+
+
+def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float]]:
+    contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    result = []
+    for contour in contours:
+        if len(contour) < 8:
+            continue
+        moments = cv2.moments(contour)
+        area = moments["m00"]
+        if not 0.02 * diameter**2 < area < 4.0 * diameter**2:
+            continue
+        a, b, c = moments["mu20"] / area, moments["mu11"] / area, moments["mu02"] / area
+        root = np.hypot(0.5 * (a - c), b)
+        major, minor = 0.5 * (a + c) + root, 0.5 * (a + c) - root
+        if minor <= 0.2:
+            continue
+        misfit = abs(area / (4 * np.pi * np.sqrt(major * minor)) - 1.0)
+        if misfit < 0.08 and 2 * np.sqrt(major) < 1.3 * diameter:
+            result.append((misfit, moments["m10"] / area, moments["m01"] / area))
+    return result
+
+
+def expected_diameter_px(rig: StereoRig, disc: Disc) -> tuple[float, float]:
+    """Diameter of a dot's image in each camera where its axis meets the table, or 0.5 m away without a table."""
+    result = []
+    for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
+        centre = -R.T @ t
+        distance = -centre[2] / R[2, 2] if rig.world_is_table and R[2, 2] < -0.05 else 0.5
+        result.append(camera.fx * disc.marker_diameter / distance)
+    return result[0], result[1]
+
+
+def symmetry_order(disc: Disc, tolerance: float = 0.1) -> int:
+    """Number of turns about e3 that map the layout of the dots onto itself (1: none but the full turn).
+
+    With an order n > 1 the spin angle phi is known only modulo 2 pi / n. tolerance: part of a dot's diameter.
+    """
+    centres = disc.marker_centres_body[:, :2]
+    reach = tolerance * disc.marker_diameter
+    order = 1
+    for n in range(2, 2 * disc.n_markers + 1):
+        angle = 2 * np.pi / n
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        distance = np.linalg.norm((centres @ turn.T)[:, None] - centres[None], axis=-1)
+        if np.all(distance.min(axis=1) < reach):
+            order = n
+    return order
+
+
+def acquire(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRig, disc: Disc) -> Acquisition:
+    """Find the disc in one pair of images, wherever it is and however it is turned."""
+    diameters = expected_diameter_px(rig, disc)
+    blobs = [dot_blobs(image, diameter) for image, diameter in zip((left, right), diameters, strict=True)]
+    return acquire_from_blobs(blobs, rig, disc)
+
+
+def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquisition:
+    """Find the disc from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
+    candidates = _candidates_from_stereo(blobs, rig, disc)
+    best = _best_explanation(candidates, blobs, rig, disc)
+    if best is None or best[3] < 2 * disc.n_markers - 3:
+        for camera in (0, 1):
+            single = _best_explanation(_candidates_from_one_camera(blobs[camera], camera, rig, disc), blobs, rig, disc)
+            if single is not None and (best is None or single[0] < best[0]):
+                best = single
+    if best is None:
+        counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, ("left", "right"), strict=True))
+        return Acquisition(
+            None,
+            None,
+            0,
+            f"no arrangement of the blobs found ({counts} image) matches the {disc.n_markers} dots of [markers]: "
+            "is the upper face visible, are diameter and centres right, does the rig belong to these images?",
+        )
+    return Acquisition(best[1], best[2], best[3], "")
+
+
+def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> list[tuple[Array, Array]]:
+    if min(len(b) for b in blobs) < 3:
+        return []
+    i, j = (k.ravel() for k in np.meshgrid(range(len(blobs[0])), range(len(blobs[1])), indexing="ij"))
+    pixels = np.stack([blobs[0][i], blobs[1][j]])
+    with np.errstate(all="ignore"):
+        points = triangulate(pixels, rig)
+        error = np.linalg.norm(rig.project(points) - pixels, axis=-1).max(axis=0)
+    keep = error < EPIPOLAR_PX
+    if rig.world_is_table:  # a dot is neither below the table nor above a disc that stands on its edge
+        keep &= (points[:, 2] > -3e-3) & (points[:, 2] < 2.1 * disc.radius + 2 * disc.half_thickness)
+    points = points[keep][np.argsort(error[keep])][:MAX_BLOBS]
+    if len(points) < 3:
+        return []
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    order = np.array(list(permutations(range(len(points)), 3)))
+    sides = np.stack([distance[order[:, a], order[:, b]] for a, b in ((0, 1), (1, 2), (2, 0))], axis=-1)
+    found_points, found_dots = [], []
+    centres = disc.marker_centres_body
+    for triple in combinations(range(len(centres)), 3):
+        wanted = np.array(
+            [np.linalg.norm(centres[triple[a]] - centres[triple[b]]) for a, b in ((0, 1), (1, 2), (2, 0))]
+        )
+        match = np.flatnonzero(np.all(np.abs(sides / wanted - 1.0) < SIDE_TOLERANCE, axis=1))
+        found_points.append(points[order[match]])
+        found_dots.append(np.broadcast_to(centres[list(triple)], (len(match), 3, 3)))
+    P, B = np.concatenate(found_points), np.concatenate(found_dots)
+    if len(P) == 0:
+        return []
+    R, t = _rigid_motions(B, P)
+    # score by the points that fall on dots; keep the distinct best
+    predicted = centres @ np.swapaxes(R, 1, 2) + t[:, None]
+    gap = np.linalg.norm(predicted[:, :, None] - points[None, None], axis=-1).min(axis=2)
+    reach = INLIER_DIAMETERS * disc.marker_diameter
+    score = np.sum(np.clip(1 - (gap / reach) ** 2, 0, None), axis=1)
+    return [(R[k], t[k]) for k in np.argsort(-score)[:40]]
+
+
+def _rigid_motions(body: Array, world: Array) -> tuple[Array, Array]:
+    """Rotations and translations that map triples (k, 3, 3) of body points onto world points (Kabsch)."""
+    b0, w0 = body.mean(axis=1, keepdims=True), world.mean(axis=1, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(body - b0, 1, 2) @ (world - w0))
+    sign = np.sign(np.linalg.det(U @ Vt))
+    Vt[:, 2] *= sign[:, None]
+    R = np.swapaxes(U @ Vt, 1, 2)
+    return R, (w0 - b0 @ np.swapaxes(R, 1, 2))[:, 0]
+
+
+def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc: Disc) -> list[tuple[Array, Array]]:
+    if len(blobs) < MIN_EXPLAINED:
+        return []
+    blobs = blobs[:9]
+    rays = normalise(blobs, rig.cameras[camera])
+    R_cw, t_cw = rig.camera_poses()[camera]
+    centres = disc.marker_centres_body
+    # three dots far apart carry the most; the widest triples are tried first
+    triples = sorted(
+        combinations(range(len(centres)), 3),
+        key=lambda k: -np.linalg.norm(np.cross(centres[k[1]] - centres[k[0]], centres[k[2]] - centres[k[0]])),
+    )[:6]
+    turns: list[NDArray] = []
+    shifts: list[NDArray] = []
+    for order in permutations(range(len(blobs)), 3):
+        image = np.ascontiguousarray(rays[list(order)].reshape(3, 1, 2))
+        for triple in triples:
+            model = np.ascontiguousarray(centres[list(triple)].reshape(3, 1, 3))
+            n, rvecs, tvecs = cv2.solveP3P(model, image, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
+            turns += rvecs[:n]
+            shifts += tvecs[:n]
+    if not turns:
+        return []
+    R, t = rotation_from_vector(np.array(turns).reshape(-1, 3)), np.array(shifts).reshape(-1, 3)
+    score = _blob_score(R, t, rays, disc)
+    best = np.argsort(-score, kind="stable")[:40]
+    best = best[score[best] > MIN_EXPLAINED - 0.5]
+    return [(R_cw.T @ R[k], R_cw.T @ (t[k] - t_cw)) for k in best]
+
+
+def _blob_score(R: Array, t: Array, rays: Array, disc: Disc) -> Array:
+    """(n,) how well blobs (k, 2) [normalised] agree with poses R_camera_body (n, 3, 3), t_camera_body (n, 3).
+
+    A dot counts 1 where a blob lies on its centre, 0 from INLIER_DIAMETERS on; -1 for a face that looks away.
+    """
+    points = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]
+    middle = points.mean(axis=1)
+    possible = np.isfinite(points).all((1, 2)) & (points[..., 2] > 0).all(axis=1)
+    possible &= np.einsum("ni,ni->n", R[:, :, 2], middle) <= 0
+    score = np.full(len(R), -1.0)
+    points, middle = points[possible], middle[possible]
+    gap = np.linalg.norm((points[..., :2] / points[..., 2:])[:, :, None] - rays, axis=-1).min(axis=2)
+    reach = INLIER_DIAMETERS * disc.marker_diameter / middle[:, 2:]
+    score[possible] = np.sum(np.clip(1 - (gap / reach) ** 2, 0, None), axis=1)
+    return score
+
+
+def _best_explanation(
+    candidates: list[tuple[Array, Array]], blobs: list[Array], rig: StereoRig, disc: Disc
+) -> tuple[float, Array, Array, int] | None:
+    """Refine the candidates on the blobs they explain; (cost, R, t, explained dot images) of the best, or None."""
+    if not candidates:
+        return None
+    R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
+    n, m = len(R), disc.n_markers
+    centres = disc.marker_centres_body
+    best = None
+    for _ in range(2):  # once with the triple's pose, once with the refined one
+        pixels, _ = marker_pixels(R, t, rig, centres)
+        matched = np.full((n, 2, m, 2), np.nan)
+        facing = _facing(R, t, rig, disc)
+        for camera, points in enumerate(blobs):
+            if len(points) == 0:
+                continue
+            gap = np.linalg.norm(pixels[:, camera, :, None] - points[None, None], axis=-1)
+            gap = np.where(np.isfinite(gap), gap, np.inf)
+            nearest = gap.argmin(axis=2)
+            reach = INLIER_DIAMETERS * expected_diameter_px(rig, disc)[camera]
+            ok = (gap.min(axis=2) < reach) & facing[:, camera, None]
+            matched[:, camera] = np.where(ok[..., None], points[nearest], np.nan)
+        fits = fit_poses(
+            matched,
+            np.broadcast_to(0.25 * np.eye(2), (n, 2, m, 2, 2)),
+            rig,
+            centres,
+            R,
+            t,
+            reject_outliers=False,
+            with_sensitivity=False,
+        )
+        R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
+        t = np.where(fits.converged[:, None], fits.t_world_body, t)
+    explained = np.isfinite(matched).all(-1).sum((1, 2))
+    rms = np.sqrt(fits.chi_square * 0.25 / np.maximum(explained, 1))
+    # a dot that should be seen and is not costs as much as a badly placed one
+    cost = np.where(fits.converged, rms, np.inf) - 2.0 * explained
+    cost += 0.5 * _table_gap(R, t, rig, disc) / disc.half_thickness
+    cost = np.where((explained >= MIN_EXPLAINED) & (rms < 2.5) & fits.converged, cost, np.inf)
+    k = int(np.argmin(cost))
+    if np.isfinite(cost[k]):
+        best = (float(cost[k]), R[k], t[k], int(explained[k]))
+    return best
+
+
+def _facing(R: Array, t: Array, rig: StereoRig, disc: Disc) -> NDArray[np.bool_]:
+    """(n, 2) True where the camera is on the side of the upper face."""
+    result = []
+    for R_cw, t_cw in rig.camera_poses():
+        eye = -R_cw.T @ t_cw
+        result.append(np.einsum("ni,ni->n", R[:, :, 2], eye - t) > disc.half_thickness)
+    return np.stack(result, axis=1)
+
+
+def _table_gap(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
+    """(n,) distance between the disc's lowest point and the table [m], at most 5 mm; 0 without a table."""
+    if not rig.world_is_table:
+        return np.zeros(len(R))
+    return np.minimum(np.abs(t[:, 2] - disc.resting_height(euler_from_rotation(R)[:, 1])), 5e-3)

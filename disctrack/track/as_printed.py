@@ -1,0 +1,239 @@
+"""What all frames of a recording share, refined over the whole sequence: the dots' places, the rig within its sigma.
+
+Printed dots are off by tens of micrometres, the rig by its calibration's sigma; both leave the same residual in every
+frame, and a few hundred frames of a moving disc determine them far better than the calibration did. Shared parameters
+s and one pose per frame are fitted together; the poses are eliminated frame by frame (Schur complement):
+
+    (sum_i C_i^T C_i - C_i^T P_i (P_i^T P_i)^-1 P_i^T C_i + prior^-1) ds = sum_i C_i^T (1 - P_i (...)^-1 P_i^T) r_i
+
+P, C: whitened Jacobians by the pose and by s. Priors: the rig's own covariance; DOT_SIGMA for every dot in the plane
+of the face. Gauge: moving or turning the whole pattern on the disc cannot be told from moving the disc. The pattern is
+moved and turned to where the sum of the dots' displacements is smallest: if one dot is misprinted, the others stay
+where they were declared, and the centre of mass with them; the cameras do not see it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import N_RIG, StereoRig
+from disctrack.disc import Disc
+from disctrack.track.pose import fit_poses, marker_pixels, whitening
+
+Array = NDArray[np.float64]
+
+DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
+# The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
+# not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
+SYSTEMATIC_PX = 0.002
+# Dots that are found this near their declared places (rms) are left there: SYSTEMATIC_PX alone makes 0.5 um.
+MIN_MARKER_SHIFT = 2e-6  # [m]
+ITERATIONS = 4
+MIN_FRAMES = 10
+
+
+@dataclass(frozen=True)
+class AsBuilt:
+    """Rig and disc after the refinement, and what it changed."""
+
+    rig: StereoRig  # with the covariance that remains
+    disc: Disc
+    marker_shift: Array  # (m, 3) [m] refined minus declared, body axes; third component 0
+    marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
+    rig_shift_sigmas: Array  # (30,) change of the rig's parameters in units of their prior sigma; 0 where fixed
+    reduced_chi_square_before: float
+    reduced_chi_square_after: float
+    n_frames: int  # that entered
+
+
+def refine_as_built(
+    markers_px: Array,
+    markers_covariance_px2: Array,
+    rig: StereoRig,
+    disc: Disc,
+    R: Array,
+    t: Array,
+    *,
+    refine_markers: bool = True,
+    refine_rig: bool = False,
+    max_frames: int = 2000,
+) -> AsBuilt:
+    """Refine dots and rig from the marker centres of n frames; shapes as in `pose.fit_poses`.
+
+    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared, and so do
+    dots that turn out to lie within MIN_MARKER_SHIFT (rms) of their declared places.
+    """
+    good = np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4))
+    rows = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).astype(int))] if len(good) else good
+    m = disc.n_markers
+    unchanged = AsBuilt(
+        rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA), np.zeros(N_RIG), np.nan, np.nan, len(rows)
+    )
+    if len(rows) < MIN_FRAMES or not (refine_markers or refine_rig):
+        return unchanged
+
+    prior_sigma = np.concatenate([np.sqrt(np.diag(rig.covariance)), np.full(2 * m, DOT_SIGMA)])
+    free = np.concatenate([(prior_sigma[:N_RIG] > 0) & refine_rig, np.full(2 * m, refine_markers)])
+    information = _prior_information(rig.covariance, free, m)
+    observed, covariance = markers_px[rows], markers_covariance_px2[rows]
+    R, t = R[rows], t[rows]
+    shift = np.zeros(N_RIG + 2 * m)
+    current_rig, current_disc = rig, disc
+    before = after = np.nan
+    for iteration in range(ITERATIONS):
+        fits = fit_poses(
+            observed, covariance, current_rig, current_disc.marker_centres_body, R, t,
+            reject_outliers=iteration > 0, with_sensitivity=False,
+        )  # fmt: skip
+        ok = fits.converged
+        R, t = np.where(ok[:, None, None], fits.R_world_body, R), np.where(ok[:, None], fits.t_world_body, t)
+        after = float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1))
+        if iteration == 0:
+            before = after
+        used = fits.used & ok[:, None, None]
+        normal, gradient = shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
+        # common errors: the data's information is bounded by what SYSTEMATIC_PX allows
+        # dots that scatter more than the image noise alone makes them tell accordingly less
+        scale = _information_scale(covariance, used) / max(1.0, after)
+        matrix = scale * normal + information
+        rhs = scale * gradient - information @ shift[free]
+        step = np.zeros_like(shift)
+        step[free] = np.linalg.solve(matrix, rhs)
+        shift += step
+        current_rig = rig.perturbed(shift[:N_RIG])
+        current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + _body_shift(shift, m))
+        if np.all(np.abs(step[free]) < 0.02 * prior_sigma[free]) and iteration > 0:
+            break
+    remaining = np.zeros((len(shift), len(shift)))
+    remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
+    sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
+    rig_covariance = remaining[:N_RIG, :N_RIG] if refine_rig else rig.covariance
+    if refine_markers and not refine_rig and np.sqrt(np.mean(shift[N_RIG:] ** 2)) < MIN_MARKER_SHIFT:
+        return replace(
+            unchanged,
+            marker_shift_sigma=sigma,
+            reduced_chi_square_before=before,
+            reduced_chi_square_after=before,
+        )
+    kept = declared_places_kept(disc, shift[N_RIG:].reshape(m, 2))
+    current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
+    return AsBuilt(
+        rig=replace(current_rig, covariance=rig_covariance),
+        disc=current_disc,
+        marker_shift=kept,
+        marker_shift_sigma=sigma,
+        rig_shift_sigmas=in_sigmas,
+        reduced_chi_square_before=before,
+        reduced_chi_square_after=after,
+        n_frames=len(rows),
+    )
+
+
+def _prior_information(rig_covariance: Array, free: NDArray[np.bool_], m: int) -> Array:
+    information = np.zeros((len(free), len(free)))
+    rig_free = np.flatnonzero(free[:N_RIG])
+    if rig_free.size:
+        block = rig_covariance[np.ix_(rig_free, rig_free)]
+        scale = np.sqrt(np.diag(block))
+        correlation = block / np.outer(scale, scale)
+        information[np.ix_(rig_free, rig_free)] = np.linalg.pinv(correlation, hermitian=True, rcond=1e-13) / np.outer(
+            scale, scale
+        )
+    dots = np.arange(N_RIG, N_RIG + 2 * m)
+    information[dots, dots] = DOT_SIGMA**-2
+    return information[np.ix_(free, free)]
+
+
+def _body_shift(shift: Array, m: int) -> Array:
+    return np.column_stack([shift[N_RIG:].reshape(m, 2), np.zeros(m)])
+
+
+def declared_places_kept(disc: Disc, shift: Array) -> Array:
+    """Displacements (m, 3) that differ from `shift` (m, 2) by a displacement and a turn of the whole pattern only.
+
+    Of all these the one with the smallest sum of lengths: as many dots as possible stay where they were declared.
+    """
+    motions = _pattern_motions(disc)
+    rest = shift
+    for _ in range(100):  # iteratively reweighted least squares; 1 nm keeps the weights finite
+        weight = 1.0 / np.maximum(np.linalg.norm(rest, axis=1), 1e-9)
+        weighted = motions * weight[:, None, None]
+        normal = np.einsum("kai,kaj->ij", weighted, motions)
+        new = shift - motions @ np.linalg.solve(normal, np.einsum("kai,ka->i", weighted, shift))
+        done = np.abs(new - rest).max() < 1e-10
+        rest = new
+        if done:
+            break
+    return np.column_stack([rest, np.zeros(len(rest))])
+
+
+def places_sigma(disc: Disc, covariance: Array) -> Array:
+    """Standard deviations (m, 2) of displacements of covariance (2m, 2m), the motion of the whole pattern left out."""
+    motions = _pattern_motions(disc).reshape(len(covariance), 3)
+    keep = np.eye(len(covariance)) - motions @ np.linalg.pinv(motions)
+    return np.sqrt(np.diag(keep @ covariance @ keep)).reshape(-1, 2)
+
+
+def _pattern_motions(disc: Disc) -> Array:
+    """Displacement (m, 2, 3) of the dots by a unit displacement and turn of the whole pattern."""
+    x, y = disc.marker_centres_body[:, :2].T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)
+    motions[..., 2] /= np.sqrt(np.mean(x * x + y * y))
+    return motions
+
+
+def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:
+    """Factor on the data's information: n frames of sigma count at most as (sigma / SYSTEMATIC_PX)^2 frames."""
+    variance = float(np.median(0.5 * np.trace(covariance, axis1=-2, axis2=-1)[used]))
+    independent = variance / SYSTEMATIC_PX**2
+    n = len(used)
+    return 1.0 / (1.0 + n / max(independent, 1e-9))
+
+
+def shared_normal_equations(
+    observed: Array,
+    covariance: Array,
+    used: NDArray[np.bool_],
+    rig: StereoRig,
+    disc: Disc,
+    R: Array,
+    t: Array,
+    free: NDArray[np.bool_],
+    further: Array | None = None,
+) -> tuple[Array, Array]:
+    """Normal matrix (k, k) and gradient (k,) of what the frames share, every frame's pose eliminated.
+
+    free : (30 + 2m,) which of RIG_PARAMETERS and of the dots' places are asked for; after them `further`,
+    (n, 2, m, 2, j) derivatives of the pixels by anything else, so that k = free.sum() + j
+    """
+    extra = np.zeros((*observed.shape, 0)) if further is None else further
+    size = int(free.sum()) + extra.shape[-1]
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    m = disc.n_markers
+    for block in np.array_split(np.arange(len(R)), max(1, len(R) // 256)):
+        pixels, P = marker_pixels(R[block], t[block], rig, disc.marker_centres_body)
+        # d pixel / d point of the body = d pixel / d translation turned into body axes
+        d_body = P[..., :3] @ R[block][:, None, None]
+        C = np.zeros((len(block), 2, m, 2, N_RIG + 2 * m))
+        if free[:N_RIG].any():
+            points = disc.marker_centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None]
+            C[..., :N_RIG] = rig.project_with_jacobians(points)[2]
+        for k in range(m):
+            C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
+        seen = used[block]
+        W = np.where(seen[..., None, None], whitening(np.where(seen[..., None, None], covariance[block], np.eye(2))), 0)
+        r = (W @ np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None])[..., 0].reshape(len(block), -1)
+        J = (W @ P).reshape(len(block), -1, 6)
+        S = (W @ np.concatenate([C[..., free], extra[block]], axis=-1)).reshape(len(block), -1, size)
+        JtJ = np.swapaxes(J, 1, 2) @ J + 1e-12 * np.eye(6)
+        projected = S - J @ np.linalg.solve(JtJ, np.swapaxes(J, 1, 2) @ S)
+        flat = projected.reshape(-1, size)
+        normal += flat.T @ S.reshape(-1, size)
+        gradient += flat.T @ r.reshape(-1)
+    return 0.5 * (normal + normal.T), gradient

@@ -1,0 +1,283 @@
+"""The circle template: where the centre of a round dot lies in an image, to a hundredth of a pixel and without bias.
+
+Model of the grey values round one dot, fitted by weighted least squares in a band about its edge:
+
+    I(u) = (L + g . (u - u0)) (1 - c S(d(u) / sigma + kappa sigma / 2))
+
+L, g light and its gradient, c contrast (negative for a light dot on dark), S(z) = erfc(z / sqrt 2) / 2 the edge of a
+step blurred by optics, pixel and motion (sigma), d the signed distance in pixels from the edge, kappa the edge's
+curvature (a blurred curved edge seems shifted inwards by kappa sigma^2 / 2). d comes from the exact map of every pixel
+onto the plane of the dots (distortion and perspective), where the dot is a circle of radius R about its centre: so the
+result is the image of the dot's own centre. The centre of the ellipse differs from it by 0.02-0.13 px here.
+Free per dot: centre (2), R, sigma, L, g (2), c. R and sigma do not couple with the centre (even against odd), so a dot
+printed too large, or motion blur, costs no accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import Camera, normalise, project
+from calibration.grey_levels import full_scale, level_step
+from disctrack.disc import Disc
+from disctrack.track import _kernels as kernels
+from disctrack.trajectory import MarkerStatus
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of a pixel of mean grey value I: read + gain * I (photon transfer); grey values as in the file."""
+
+    read: float
+    gain: float
+    step: float = 1.0  # between neighbouring grey values: 16 where 12 bits fill the upper end of 16
+
+    def variance(self, grey: Array) -> Array:
+        """Variance [grey^2] at mean grey values of any shape; never below that of rounding, step^2 / 12."""
+        return np.maximum(self.read + self.gain * np.asarray(grey, float), self.step**2 / 12.0)
+
+    @property
+    def parameters(self) -> Array:
+        """(read, gain, step^2)."""
+        return np.array([self.read, self.gain, self.step**2])
+
+
+def typical_noise(image: Image) -> NoiseModel:
+    """Noise of an ordinary camera (50 electrons per grey value of 8 bits), where nothing was measured."""
+    grey = full_scale(image) / 255.0
+    return NoiseModel(grey**2, 0.02 * grey, float(level_step(image)))
+
+
+@dataclass(frozen=True)
+class TemplateLimits:
+    """When a converged fit is refused."""
+
+    misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
+    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
+    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
+    radius: float = 0.20  # relative departure of the fitted radius
+    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
+
+    def array(self) -> Array:
+        """(5,) for the compiled kernels."""
+        return np.array([self.misfit, self.share, self.clipped, self.radius, self.blur])
+
+
+@dataclass(frozen=True)
+class DotCentres:
+    """Centres of m dots in one image."""
+
+    pixels: Array  # (m, 2); NaN unless MEASURED
+    covariance_px2: Array  # (m, 2, 2) from the image's noise, enlarged where the model misfits
+    status: NDArray[np.uint8]  # (m,) MarkerStatus
+    misfit: Array  # (m,) reduced chi-square of the grey values
+    blur_px: Array  # (m,) sigma of the edge
+    radius: Array  # (m,) fitted radius, plane units
+    level: Array  # (m,) grey value beside the dot
+    contrast: Array  # (m,) 1 - dark / light
+
+
+def normalised_maps(camera: Camera) -> tuple[Array, Array]:
+    """Undistorted normalised coordinates x, y of every pixel, each (height, width); made once per camera."""
+    width, height = camera.image_size
+    grid = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
+    ab = normalise(grid, camera)
+    # pixels beyond the fold of a distortion polynomial have no ray; the kernels skip windows that touch them
+    return np.ascontiguousarray(ab[..., 0]), np.ascontiguousarray(ab[..., 1])
+
+
+def face_edge(disc: Disc) -> float:
+    """Radius [m] within which the face is taken to be one even background for its dots.
+
+    Paper ends, and edges are bevelled, a few per cent inside the disc's radius; a dot printed farther out than that
+    moves the limit with it.
+    """
+    outermost = float(np.hypot(*disc.marker_centres_body[:, :2].T).max()) + 0.5 * disc.marker_diameter
+    return max(0.95 * disc.radius, min(outermost + 0.15 * disc.marker_diameter, disc.radius))
+
+
+def locate_on_disc(
+    image: Image,
+    camera: Camera,
+    R_camera_body: Array,
+    t_camera_body: Array,
+    disc: Disc,
+    *,
+    maps: tuple[Array, Array] | None = None,
+    noise: NoiseModel | None = None,
+    blur_px: float = TYPICAL_BLUR_PX,
+    limits: TemplateLimits | None = None,
+) -> DotCentres:
+    """Locate the disc's dots in one image, the pose being known to a few pixels.
+
+    image (height, width) uint8 or uint16; R_camera_body (3, 3), t_camera_body (3,) [m].
+    """
+    map_x, map_y = maps if maps is not None else normalised_maps(camera)
+    results = np.full((disc.n_markers, kernels.N_RESULT), np.nan)
+    status = np.zeros(disc.n_markers, np.uint8)
+    noise = noise or typical_noise(image)
+    kernels.locate_dots(
+        np.ascontiguousarray(image),
+        map_x,
+        map_y,
+        camera.parameters,
+        np.ascontiguousarray(R_camera_body),
+        np.ascontiguousarray(t_camera_body),
+        np.ascontiguousarray(disc.marker_centres_body),
+        0.5 * disc.marker_diameter,
+        face_edge(disc),
+        blur_px,
+        noise.parameters,
+        np.empty((kernels.SCRATCH_ROWS, 40000)),
+        results,
+        status,
+    )
+    limits = limits or TemplateLimits()
+    for i in np.flatnonzero(status == MarkerStatus.MEASURED):
+        status[i] = kernels.judge_dot(results[i], 0.5 * disc.marker_diameter, blur_px, noise.parameters, limits.array())
+    return dot_centres(results, status)
+
+
+def locate_on_plane(
+    image: Image,
+    image_from_plane: Array,
+    centres: Array,
+    radius: float,
+    *,
+    noise: NoiseModel | None = None,
+    blur_px: float = TYPICAL_BLUR_PX,
+    limits: TemplateLimits | None = None,
+) -> DotCentres:
+    """Locate round dots of a flat target whose homography is roughly known, without a calibrated camera.
+
+    image (height, width); image_from_plane (3, 3) or one per dot (m, 3, 3): homography plane -> pixel, right near each
+    dot; centres (m, 2) and radius in plane units. Lens distortion within one dot is neglected.
+    """
+    centres = np.atleast_2d(np.asarray(centres, float))
+    H = np.broadcast_to(np.asarray(image_from_plane, float), (len(centres), 3, 3))
+    height, width = image.shape
+    map_x, map_y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    noise = noise or typical_noise(image)
+    limits = limits or TemplateLimits()
+    results = np.full((len(centres), kernels.N_RESULT), np.nan)
+    status = np.zeros(len(centres), np.uint8)
+    scratch = np.empty((kernels.SCRATCH_ROWS, 40000))
+    contiguous = np.ascontiguousarray(image)
+    for i, (x, y) in enumerate(centres):  # the body is one compiled call
+        p = np.empty(8)
+        u = H[i] @ (x, y, 1.0)
+        start = np.array([x, y, radius, u[0] / u[2], u[1] / u[2]])
+        others = np.delete(centres, i, axis=0)
+        near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
+        status[i] = kernels.fit_dot(
+            contiguous, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, scratch, p,
+            results[i],
+        )  # fmt: skip
+        if status[i] == MarkerStatus.MEASURED:
+            status[i] = kernels.judge_dot(results[i], radius, blur_px, noise.parameters, limits.array())
+            u = H[i] @ (x + p[0], y + p[1], 1.0)
+            results[i, kernels.U], results[i, kernels.V] = u[:2] / u[2]
+    return dot_centres(results, status)
+
+
+def dot_centres(results: Array, status: NDArray[np.uint8]) -> DotCentres:
+    """Arrays with names from the kernels' table of results (..., m, 12) and status (..., m)."""
+    good = status == MarkerStatus.MEASURED
+    r = np.where(good[..., None], results, np.nan)
+    covariance = np.empty((*good.shape, 2, 2))
+    covariance[..., 0, 0], covariance[..., 1, 1] = r[..., kernels.VAR_U], r[..., kernels.VAR_V]
+    covariance[..., 0, 1] = covariance[..., 1, 0] = r[..., kernels.COV_UV]
+    misfit = r[..., kernels.CHI_SQUARE]
+    # grey values that scatter more than the noise model says (print, speckle, compression) scatter the centre too
+    covariance *= np.maximum(misfit, 1.0)[..., None, None]
+    return DotCentres(
+        pixels=r[..., : kernels.V + 1],
+        covariance_px2=covariance,
+        status=status,
+        misfit=misfit,
+        blur_px=r[..., kernels.FIT_SIGMA],
+        radius=r[..., kernels.FIT_RADIUS],
+        level=r[..., kernels.FIT_LEVEL],
+        contrast=r[..., kernels.FIT_CONTRAST],
+    )
+
+
+def measure_noise(
+    images: list[Image],
+    camera: Camera,
+    poses_camera_body: list[tuple[Array, Array]],
+    disc: Disc,
+    maps: tuple[Array, Array],
+    blur_px: float = TYPICAL_BLUR_PX,
+) -> NoiseModel:
+    """Photon transfer from the dots themselves: variance against mean in the flat parts inside and beside each dot.
+
+    In each flat part a plane is fitted and the mean square about it taken, so light gradients do not count as noise;
+    the law read + gain * I is fitted to (mean, variance) of all parts, weighted by their degrees of freedom. Parts
+    struck by a hot pixel or a print fault are dropped (beyond 4 median absolute deviations of their class).
+    """
+    means, variances, weights = [], [], []
+    radius = 0.5 * disc.marker_diameter
+    flat = max(4.0 * blur_px, 2.5)  # [px] from the edge: beyond, the blur's tail is below 1e-4 of the contrast
+    for image, (R, t) in zip(images, poses_camera_body, strict=True):
+        for centre, (x0, x1, y0, y1) in _dot_windows(camera, R, t, disc, image.shape, flat + 5.0):
+            M = np.column_stack([R[:, 0], R[:, 1], R[:, 2] * centre[2] + t])
+            xn, yn = maps[0][y0:y1, x0:x1], maps[1][y0:y1, x0:x1]
+            plane = np.einsum("ij,jvu->ivu", np.linalg.inv(M), np.stack([xn, yn, np.ones_like(xn)]))
+            rho = np.hypot(plane[0] / plane[2] - centre[0], plane[1] / plane[2] - centre[1])
+            step = np.hypot(*np.gradient(rho))  # plane units per pixel
+            distance = (rho - radius) / step
+            for part in (distance < -flat, (distance > flat) & (distance < flat + 4.5)):
+                v, u = np.nonzero(part)
+                if len(v) < 20:
+                    continue
+                A = np.column_stack([np.ones(len(v)), u - u.mean(), v - v.mean()])
+                grey = image[y0:y1, x0:x1][part].astype(float)
+                residual = grey - A @ np.linalg.lstsq(A, grey, rcond=None)[0]
+                means.append(grey.mean())
+                variances.append(residual @ residual / (len(v) - 3))
+                weights.append(len(v) - 3)
+    if len(means) < 4:
+        return typical_noise(images[0])
+    step = float(level_step(images[0]))
+    mean, variance, weight = np.array(means), np.array(variances), np.array(weights)
+    bright = mean > 0.5 * (mean.min() + mean.max())
+    keep = np.ones(len(mean), bool)
+    for group in (bright, ~bright):
+        if group.any():
+            middle = np.median(variance[group])
+            spread = 1.4826 * np.median(np.abs(variance[group] - middle)) + 1e-9 * step**2
+            keep[group] = np.abs(variance[group] - middle) < 4 * spread
+    A = np.column_stack([np.ones(keep.sum()), mean[keep]])
+    # a variance with f degrees of freedom scatters by sqrt(2 / f) of itself
+    w = np.sqrt(weight[keep] / 2) / np.maximum(variance[keep], 1e-3 * step**2)
+    read, gain = np.linalg.lstsq(A * w[:, None], variance[keep] * w, rcond=None)[0]
+    if gain < 0:  # noise that does not grow with light: a constant says all
+        return NoiseModel(float(np.average(variance[keep], weights=weight[keep])), 0.0, step)
+    # a negative intercept is a clipped black level: keep the law above it, `variance` holds the floor
+    return NoiseModel(float(read), float(gain), step)
+
+
+def _dot_windows(
+    camera: Camera, R: Array, t: Array, disc: Disc, shape: tuple[int, ...], margin: float
+) -> list[tuple[Array, tuple[int, int, int, int]]]:
+    result = []
+    angle = np.radians(np.arange(0, 360, 15))
+    ring = 0.5 * disc.marker_diameter * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    for centre in disc.marker_centres_body:
+        outline = project((centre + ring) @ R.T + t, camera)
+        if not np.isfinite(outline).all():
+            continue
+        (x0, y0), (x1, y1) = np.floor(outline.min(0) - margin), np.ceil(outline.max(0) + margin) + 1
+        if x0 < 0 or y0 < 0 or x1 > shape[1] or y1 > shape[0]:
+            continue
+        result.append((centre, (int(x0), int(x1), int(y0), int(y1))))
+    return result

@@ -1,0 +1,171 @@
+"""Pictures of a measurement: coordinates with their sigmas, reprojection error, residual per dot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+
+from disctrack.files.whole import whole_file
+from disctrack.frames import CAMERAS, COORDINATES
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+Array = NDArray[np.float64]
+
+COLOURS = {"left": "#1f6f8b", "right": "#c8553d"}
+INK = "#222222"
+BAND = 3.0  # sigmas shown as a band: one is thinner than the line in most recordings
+_LABELS = {
+    "x": ("x", "mm", 1e3),
+    "y": ("y", "mm", 1e3),
+    "z": ("z", "mm", 1e3),
+    "psi": ("precession ψ", "deg", 180 / np.pi),
+    "theta": ("nutation θ", "deg", 180 / np.pi),
+    "phi": ("spin φ", "deg", 180 / np.pi),
+}
+
+
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure whole; the format follows from the name. Raises OutputError."""
+    FigureCanvasAgg(figure)
+    with whole_file(path) as part:
+        figure.savefig(part, format=path.suffix[1:], dpi=130)
+    return path
+
+
+def coordinates_figure(trajectory: Trajectory) -> Figure:
+    """x, y, z, psi, theta, phi over time above their sigmas; frames without a pose are marked below."""
+    figure = Figure(figsize=(13, 8.5), layout="constrained")
+    grid = figure.add_gridspec(4, 3, height_ratios=(3, 1.3, 3, 1.3))
+    sigma, shared = trajectory.coordinate_sigma, trajectory.calibration_sigma
+    for i in range(len(COORDINATES)):
+        row, column = 2 * (i // 3), i % 3
+        axes = figure.add_subplot(grid[row, column])
+        below = figure.add_subplot(grid[row + 1, column], sharex=axes)
+        _coordinate(axes, trajectory, i, sigma[:, i])
+        _sigmas(below, trajectory, i, sigma[:, i], shared[:, i])
+        axes.tick_params(labelbottom=False)
+        if row == 2:
+            below.set_xlabel("time (s)")
+    lost = int(np.sum(~trajectory.measured))
+    figure.suptitle(
+        f"Pose of the disc in {len(trajectory)} frames, {lost} without an answer; band ± {BAND:.0f} σ", color=INK
+    )
+    return figure
+
+
+def _coordinate(axes: Axes, trajectory: Trajectory, i: int, sigma: Array) -> None:
+    label, unit, scale = _LABELS[COORDINATES[i]]
+    time, values = trajectory.time, trajectory.q[:, i] * scale
+    band = BAND * sigma * scale
+    axes.fill_between(time, values - band, values + band, color=COLOURS["left"], alpha=0.35, linewidth=0)
+    axes.plot(time, values, color=INK, linewidth=0.9)
+    _mark_lost(axes, trajectory)
+    axes.set_ylabel(f"{label} ({unit})")
+    axes.margins(x=0.01)
+    axes.grid(alpha=0.25)
+
+
+def _sigmas(axes: Axes, trajectory: Trajectory, i: int, sigma: Array, shared: Array) -> None:
+    scale, unit = (1e6, "µm") if i < 3 else (180e3 / np.pi, "mdeg")
+    axes.plot(trajectory.time, sigma * scale, color=COLOURS["left"], linewidth=0.9, label="this frame's noise")
+    if np.nanmax(shared, initial=0.0) > 0:
+        axes.plot(
+            trajectory.time, shared * scale, color=COLOURS["right"], linewidth=0.9, label="calibration, shared by all"
+        )
+    finite = np.concatenate([sigma, shared])
+    finite = finite[np.isfinite(finite) & (finite > 0)] * scale
+    if finite.size and finite.max() > 30 * finite.min():
+        axes.set_yscale("log")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes.set_ylim(bottom=0)
+    axes.set_ylabel(f"σ ({unit})")
+    axes.grid(alpha=0.25)
+    if i == 0:
+        axes.legend(fontsize=7, frameon=False)
+
+
+def _mark_lost(axes: Axes, trajectory: Trajectory) -> None:
+    lost = trajectory.time[~trajectory.measured]
+    if lost.size:
+        axes.plot(lost, np.zeros_like(lost), "|", color=COLOURS["right"], transform=axes.get_xaxis_transform(),
+                  clip_on=False, markersize=6)  # fmt: skip
+
+
+def reprojection_figure(trajectory: Trajectory) -> Figure:
+    """Root mean square of observed - projected dots per camera, reduced chi-square, and the dots used, over time."""
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    error, chi, used = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.5))
+    for camera, name in enumerate(CAMERAS):
+        rms = trajectory.reprojection_rms_px[:, camera]
+        typical = f"{np.nanmedian(rms):.4f}" if np.isfinite(rms).any() else "no"
+        error.plot(trajectory.time, rms, color=COLOURS[name], linewidth=0.8, label=f"{name}, median {typical} px")
+        count = np.sum(trajectory.marker_status[:, camera] == MarkerStatus.MEASURED, axis=1)
+        used.step(trajectory.time, count, color=COLOURS[name], linewidth=0.9, where="mid", label=name)
+    error.set_ylabel("reprojection error, rms (px)")
+    error.set_ylim(bottom=0)
+    error.legend(frameon=False, fontsize=8)
+    chi.plot(trajectory.time, trajectory.reduced_chi_square, color=INK, linewidth=0.8)
+    chi.axhline(1.0, color="#888888", linewidth=0.8, linestyle="--")
+    chi.set_ylabel("reduced χ²")
+    chi.set_ylim(bottom=0)
+    used.set_ylabel("dots used")
+    used.set_ylim(-0.3, trajectory.disc.n_markers + 0.3)
+    used.set_xlabel("time (s)")
+    for axes in (error, chi, used):
+        _mark_lost(axes, trajectory)
+        axes.grid(alpha=0.25)
+        axes.margins(x=0.01)
+    unreadable = int(np.sum(trajectory.frame_status == FrameStatus.UNREADABLE))
+    figure.suptitle("Reprojection error over time" + (f"; {unreadable} frames unreadable" if unreadable else ""))
+    return figure
+
+
+def dots_figure(trajectory: Trajectory) -> Figure:
+    """Residual (observed - projected) of every dot in each camera: cloud, mean and its standard error, in px."""
+    residuals, m = trajectory.markers_residual_px, trajectory.disc.n_markers
+    figure = Figure(figsize=(2.0 * m + 0.8, 4.8), layout="constrained")
+    grid = figure.subplots(2, m, sharex=True, sharey=True, squeeze=False)
+    finite = np.abs(residuals[np.isfinite(residuals)])
+    reach = float(np.percentile(finite, 99.5)) * 1.3 if finite.size else 1.0
+    for camera, name in enumerate(CAMERAS):
+        for marker in range(m):
+            _dot(grid[camera, marker], residuals[:, camera, marker], COLOURS[name], reach)
+            grid[0, marker].set_title(f"dot {marker}", fontsize=9)
+        grid[camera, 0].set_ylabel(f"{name}: y (px)")
+    for axes in grid[1]:
+        axes.set_xlabel("x (px)")
+    figure.suptitle("Observed minus projected, per dot and camera (cross: mean ± 3 standard errors)", fontsize=10)
+    return figure
+
+
+def _dot(axes: Axes, residuals: Array, colour: str, reach: float) -> None:
+    good = residuals[np.isfinite(residuals).all(axis=1)]
+    axes.axhline(0, color="#bbbbbb", linewidth=0.6)
+    axes.axvline(0, color="#bbbbbb", linewidth=0.6)
+    axes.plot(good[:, 0], good[:, 1], ".", color=colour, markersize=2, alpha=0.35)
+    if len(good) > 1:
+        mean, error = good.mean(axis=0), 3 * good.std(axis=0) / np.sqrt(len(good))
+        axes.errorbar(mean[0], mean[1], error[1], error[0], color=INK, linewidth=1.2)
+        rms = np.sqrt(np.mean(good**2))
+        axes.text(0.03, 0.97, f"n {len(good)}\nrms {rms:.4f}", transform=axes.transAxes, fontsize=7, va="top")
+    else:
+        axes.text(0.5, 0.5, "not seen", transform=axes.transAxes, fontsize=8, ha="center")
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7)
+
+
+FIGURES: dict[str, Callable[[Trajectory], Figure]] = {
+    "coordinates": coordinates_figure,
+    "reprojection": reprojection_figure,
+    "dots": dots_figure,
+}

@@ -1,0 +1,203 @@
+"""A video that shows the eye what was measured: fitted disc and dots drawn over the frames of both cameras."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.grey_levels import full_scale
+from disctrack.errors import OutputError
+from disctrack.files.whole import whole_file
+from disctrack.frames import CAMERAS, rotation_from_quaternion
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+Array = NDArray[np.float64]
+ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
+
+PLAYBACK_HZ = 25.0
+MOST_FRAMES = 1500  # a minute of video; of longer recordings every second, third, ... pair is shown
+OUTLINE_POINTS = 120
+CAPTION_LINE = 18  # height of a line [px]
+CAPTION_WIDTH = 950  # of the whole caption on one line [px]
+_SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
+
+_TEXT = (230, 230, 230)
+# Blue, green, red as OpenCV orders them.
+_RIM, _LOWER, _DOT, _CENTRE, _REFUSED, _CONTACT = (
+    (80, 220, 80), (90, 140, 60), (255, 190, 60), (60, 60, 255), (60, 160, 255), (240, 80, 240),
+)  # fmt: skip
+
+
+def write_overlay(
+    path: Path,
+    pairs: Iterable[tuple[int, NDArray]],
+    trajectory: Trajectory,
+    progress: Callable[[int], None] = lambda n: None,
+) -> Path:
+    """Video (mp4) of the pairs with the fitted disc and dots drawn on them.
+
+    pairs : (row of the trajectory, images (2, height, width)) in order
+    Raises OutputError.
+    """
+    stream = iter(pairs)
+    first = next(stream, None)
+    if first is None:
+        raise OutputError(f"{path}: no frame to draw")
+    with whole_file(path, suffix=".mp4") as part, _encoder(part, _drawn(*first, trajectory).shape[:2]) as write:
+        write(_drawn(*first, trajectory))
+        progress(1)
+        for row, images in stream:
+            write(_drawn(row, images, trajectory))
+            progress(1)
+    return path
+
+
+def shown_rows(start: int, stop: int) -> range:
+    """Rows that an overlay of start..stop-1 shows: all, or evenly spaced ones of a long recording."""
+    return range(start, stop, max(1, -(-(stop - start) // MOST_FRAMES)))
+
+
+def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
+    """Both images side by side, (height, 2 width, 3) BGR, with what row `row` of the trajectory says.
+
+    images : (2, height, width) uint8 or uint16
+    """
+    return _drawn(row, images, trajectory)
+
+
+def _drawn(row: int, images: NDArray, trajectory: Trajectory) -> ColourImage:
+    pictures = [cv2.cvtColor(_to_8_bit(image), cv2.COLOR_GRAY2BGR) for image in images]
+    if trajectory.measured[row]:
+        _draw_disc(pictures, trajectory, row)
+    for camera, picture in enumerate(pictures):
+        _draw_centres(picture, trajectory.markers_px[row, camera], trajectory.marker_status[row, camera])
+        cv2.putText(picture, CAMERAS[camera], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
+    picture = np.vstack([np.hstack(pictures), _caption_strip(trajectory, row, 2 * images.shape[2])])
+    return picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]  # video codecs want even sizes
+
+
+def _caption_strip(trajectory: Trajectory, row: int, width: int) -> ColourImage:
+    """Caption below the images, (height, width, 3), on as many lines as the width asks for."""
+    parts = _caption(trajectory, row)
+    n_lines = min(-(-CAPTION_WIDTH // width), 4)
+    strip = np.zeros((CAPTION_LINE * n_lines + 6, width, 3), np.uint8)
+    colour = _TEXT if trajectory.measured[row] else _REFUSED
+    per_line = -(-len(parts) // n_lines)
+    for line in range(n_lines):
+        text = "   ".join(parts[line * per_line : (line + 1) * per_line])
+        place = (8, CAPTION_LINE * (line + 1) - 3)
+        cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return strip
+
+
+def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
+    """For the eye only: deep images are scaled from the full scale of their camera, so that brightness is steady."""
+    if image.dtype == np.uint8:
+        return image
+    return np.asarray(image * (255.0 / full_scale(image)), np.uint8)
+
+
+def _caption(trajectory: Trajectory, row: int) -> list[str]:
+    head = f"frame {trajectory.frame[row]}  t = {trajectory.time[row]:.4f} s"
+    if not trajectory.measured[row]:
+        return [head, FrameStatus(trajectory.frame_status[row]).sentence]
+    q = trajectory.q[row]
+    x, y, z = q[:3] * 1e3
+    psi, theta, phi = np.degrees(q[3:])
+    errors = " ".join("-" if np.isnan(rms) else f"{rms:.3f}" for rms in trajectory.reprojection_rms_px[row])
+    return [
+        head,
+        f"x {x:.3f}  y {y:.3f}  z {z:.3f} mm",
+        f"psi {psi:.2f}  theta {theta:.3f}  phi {phi:.2f} deg",
+        f"error {errors} px",
+    ]
+
+
+def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) -> None:
+    disc, rig = trajectory.disc, trajectory.rig
+    R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
+    h = disc.half_thickness
+    lower = _circle(np.zeros(3), disc.radius, -h) @ R.T + t
+    for picture, pixels, (R_cw, t_cw) in zip(pictures, rig.project(lower), rig.camera_poses(), strict=True):
+        # the wall is seen where its outward normal faces the camera; the other half lies behind the disc
+        facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
+        start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
+        visible = np.roll(facing, -start)
+        _polyline(picture, np.roll(pixels, -start, axis=0)[visible], _LOWER, closed=bool(facing.all()))
+    lines = [(_circle(np.zeros(3), disc.radius, h), _RIM)]
+    lines += [(_circle(centre, disc.marker_diameter / 2, centre[2]), _DOT) for centre in disc.marker_centres_body]
+    for points_body, colour in lines:
+        for picture, pixels in zip(pictures, rig.project(points_body @ R.T + t), strict=True):
+            _polyline(picture, pixels, colour)
+    psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
+    e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
+    contact = t - disc.radius * e2 - h * R[:, 2]
+    for picture, pixels in zip(pictures, rig.project(contact[None]), strict=True):
+        if np.isfinite(pixels).all():
+            _cross(picture, pixels[0], _CONTACT, cv2.MARKER_DIAMOND, 9)
+
+
+def _circle(centre: Array, radius: float, height: float) -> Array:
+    angle = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
+    return np.column_stack(
+        [centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), np.full(angle.size, height)]
+    )
+
+
+def _polyline(picture: ColourImage, pixels: Array, colour: tuple[int, int, int], closed: bool = True) -> None:
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(pixels) > 1:
+        fixed = np.clip(np.rint(pixels * (1 << _SUBPIXEL_BITS)), -(2**24), 2**24).astype(np.int32)
+        cv2.polylines(picture, [fixed[:, None]], closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _draw_centres(picture: ColourImage, pixels: Array, status: NDArray[np.uint8]) -> None:
+    for point, state in zip(pixels, status, strict=True):
+        if np.isfinite(point).all():
+            _cross(picture, point, _CENTRE if state == MarkerStatus.MEASURED else _REFUSED, cv2.MARKER_CROSS, 7)
+
+
+def _cross(picture: ColourImage, point: Array, colour: tuple[int, int, int], kind: int, size: int) -> None:
+    x, y = np.clip(np.rint(point), -10000, 10000).astype(int)
+    cv2.drawMarker(picture, (int(x), int(y)), colour, kind, size, 1, cv2.LINE_AA)
+
+
+@contextlib.contextmanager
+def _encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImage], None]]:
+    """Function that appends one picture to an mp4 file: H.264 where PyAV is installed, MPEG-4 part 2 otherwise."""
+    try:
+        import av
+    except ImportError:
+        with _opencv_encoder(path, size) as write:
+            yield write
+        return
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=round(PLAYBACK_HZ), options={"preset": "veryfast", "crf": "20"})
+        stream.height, stream.width, stream.pix_fmt = size[0], size[1], "yuv420p"
+
+        def write(picture: ColourImage) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")))
+
+        yield write
+        container.mux(stream.encode())
+
+
+@contextlib.contextmanager
+def _opencv_encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImage], None]]:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), PLAYBACK_HZ, (size[1], size[0]))
+    if not writer.isOpened():
+        raise OutputError(f"{path}: this OpenCV cannot write mp4. Install PyAV: pip install disctrack[video]")
+
+    def write(picture: ColourImage) -> None:
+        writer.write(np.ascontiguousarray(picture))
+
+    try:
+        yield write
+    finally:
+        writer.release()

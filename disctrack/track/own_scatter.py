@@ -1,0 +1,129 @@
+"""How much the dots scatter once everything that the frames share may be wrong: cameras, printed dots, clock.
+
+A camera that was moved or that lags leaves residuals many times the noise. Taken for noise they would hide every
+effect that is smaller, the fault itself included, and dots would be moved to make up for it. So the noise of the dots
+is what remains after a free refinement of the two cameras, the dots' places and the delay of the right camera, with
+one pose per frame: nothing slow or systematic can pass it, and it needs no model of the motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, StereoRig
+from disctrack.disc import Disc
+from disctrack.track.as_printed import DOT_SIGMA, declared_places_kept, places_sigma, shared_normal_equations
+from disctrack.track.pose import PoseFits, fit_poses
+
+Array = NDArray[np.float64]
+
+MIN_FRAMES = 20
+ITERATIONS = 3
+# How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
+_WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
+_WIDE_ROTATION, _WIDE_TRANSLATION = 0.02, 0.01  # [rad], [m]
+_WIDE_DELAY = 1.0  # in frame periods
+_N_RELATIVE = 24  # of RIG_PARAMETERS; the others place the world, which moves all poses alike
+
+
+@dataclass(frozen=True)
+class SharedFaults:
+    """Dots and their scatter when cameras, dots and clock are free."""
+
+    reduced_chi_square: float  # of the dots about the poses, without the twentieth of the frames that fits worst
+    marker_shift: Array  # (m, 3) [m] from the declared places, body axes
+    marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
+    delay: float  # [frame periods] of the right camera against the left
+    n_frames: int
+
+
+def without_shared_faults(
+    markers_px: Array,
+    markers_covariance_px2: Array,
+    rig: StereoRig,
+    disc: Disc,
+    R: Array,
+    t: Array,
+    *,
+    max_frames: int = 400,
+) -> SharedFaults | None:
+    """Refine cameras, dots and delay together, with a free pose for each of n successive frames.
+
+    Shapes as in `pose.fit_poses`. None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
+    """
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(markers_px).all(-1))
+    steady = np.zeros(len(R), bool)
+    complete = np.asarray(seen.all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
+    steady[1:-1] = complete[:-2] & complete[1:-1] & complete[2:]
+    rows = np.flatnonzero(steady)
+    if len(rows) < MIN_FRAMES:
+        return None
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(max_frames, len(rows))).astype(int))]
+    by_delay = 0.5 * (markers_px[rows + 1] - markers_px[rows - 1])  # per frame period
+    by_delay[:, 0] = 0.0
+
+    m = disc.n_markers
+    wide = np.concatenate([_wide_rig(), np.full(2 * m, DOT_SIGMA), [_WIDE_DELAY]])
+    estimated = np.concatenate([np.diag(rig.covariance)[:_N_RELATIVE] > 0, np.zeros(N_RIG - _N_RELATIVE, bool)])
+    free = np.concatenate([estimated, np.ones(2 * m + 1, bool)])
+    shift = np.zeros(len(wide))
+    covariance, Rs, ts = markers_covariance_px2[rows], R[rows], t[rows]
+    for iteration in range(ITERATIONS + 1):
+        now_rig = rig.perturbed(shift[:N_RIG])
+        now_disc = _with_shifted_dots(disc, shift[N_RIG:-1])
+        observed = markers_px[rows] - shift[-1] * by_delay
+        fits = fit_poses(
+            observed, covariance, now_rig, now_disc.marker_centres_body, Rs, ts,
+            reject_outliers=iteration > 0, with_sensitivity=False,
+        )  # fmt: skip
+        ok = fits.converged
+        Rs = np.where(ok[:, None, None], fits.R_world_body, Rs)
+        ts = np.where(ok[:, None], fits.t_world_body, ts)
+        if iteration == ITERATIONS:
+            break
+        used = fits.used & ok[:, None, None]
+        normal, gradient = shared_normal_equations(
+            observed, covariance, used, now_rig, now_disc, Rs, ts, free[:-1], by_delay[..., None]
+        )
+        noise = max(1.0, trimmed_reduced_chi_square(fits))
+        # in units of the wide sigmas, for the sake of the conditioning
+        unit = wide[free]
+        matrix = normal * np.outer(unit, unit) / noise + np.eye(len(unit))
+        rhs = gradient * unit / noise - shift[free] / unit
+        shift[free] += unit * np.linalg.solve(matrix, rhs)
+    dots = slice(-2 * m - 1, -1)
+    places = np.asarray(np.linalg.inv(matrix)[dots, dots] * np.outer(unit[dots], unit[dots]), float)
+    reduced = trimmed_reduced_chi_square(fits)
+    spent = int(fits.degrees_of_freedom[fits.converged].sum())
+    return SharedFaults(
+        reduced_chi_square=reduced * spent / max(spent - int(free.sum()), 1),
+        marker_shift=declared_places_kept(disc, shift[N_RIG:-1].reshape(m, 2)),
+        marker_shift_sigma=places_sigma(disc, places),
+        delay=float(shift[-1]),
+        n_frames=len(rows),
+    )
+
+
+def trimmed_reduced_chi_square(fits: PoseFits) -> float:
+    """Mean reduced chi-square of the frames, without the twentieth that fits worst (smears, objects in view)."""
+    reduced = np.sort(fits.reduced_chi_square[fits.degrees_of_freedom >= 6])
+    if len(reduced) < MIN_FRAMES:
+        return 1.0
+    kept = reduced[: int(0.95 * len(reduced))]
+    # the 5 % that are cut hold more than 5 % of the sum: 18 degrees of freedom lose 4 % of their mean
+    return float(kept.mean() / 0.96)
+
+
+def _wide_rig() -> Array:
+    camera = [_WIDE[name] for name in INTRINSIC_PARAMETERS]
+    pose = [_WIDE_ROTATION] * 3 + [_WIDE_TRANSLATION] * 3
+    return np.array([*camera, *camera, *pose, *pose])
+
+
+def _with_shifted_dots(disc: Disc, shift: Array) -> Disc:
+    moved = disc.marker_centres_body.copy()
+    moved[:, :2] += shift.reshape(-1, 2)
+    return replace(disc, marker_centres_body=moved)

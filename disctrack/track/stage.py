@@ -1,0 +1,246 @@
+"""The measurement from end to end: a recording's files -> rig -> trajectory, with what is needed to reuse results."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import StereoRig
+from disctrack.errors import RecordingError
+from disctrack.files.trajectory_file import Provenance
+from disctrack.frames import CAMERAS
+from disctrack.readers import FrameReader, open_frames
+from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
+from disctrack.readers.camera_header import check_headers, header_of
+from disctrack.readers.time_stamps import check_time_stamps, usable_times
+from disctrack.recording.declaration import Recording
+from disctrack.track.motion_span import MotionSpan, find_motion
+from disctrack.track.tracking import TrackingSettings, prepare, stretch_edges, track
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+Array = NDArray[np.float64]
+Progress = Callable[[int], None]
+
+WHOLE_BELOW = 2.0  # [s] a recording as short as this was cut to what is wanted, and rest in it is wanted too
+
+
+@dataclass(frozen=True)
+class ImagePairs:
+    """The frames of a recording that are to be measured: both cameras, checked to belong together."""
+
+    left: FrameReader
+    right: FrameReader
+    start: int
+    stop: int
+    warnings: tuple[str, ...] = ()  # where the cameras' headers leave doubt that the frames are simultaneous
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know about how the frames are read."""
+        return (*self.left.notes, *self.right.notes)
+
+    def camera_headers(self) -> dict[str, Any]:
+        """Under "camera_headers" what the cameras wrote about themselves (exposure, trigger, ...), if anything."""
+        found = {name: header_of(reader) for name, reader in zip(CAMERAS, (self.left, self.right), strict=True)}
+        told = {name: header.as_dict() for name, header in found.items() if header is not None}
+        return {"camera_headers": told} if told else {}
+
+    def inputs(self) -> dict[str, str]:
+        """SHA-256 of each camera's frames; what was read already is not read again."""
+        with ThreadPoolExecutor(2) as pool:  # hashing a gigabyte takes a second
+            digests = pool.map(lambda reader: reader.content_sha256(self.start, self.stop), (self.left, self.right))
+            return {f"{name} frames": digest for name, digest in zip(CAMERAS, digests, strict=True)}
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A tracked recording and what the run found out on the way."""
+
+    trajectory: Trajectory
+    unreadable: tuple[Unreadable, ...]
+    findings: dict[str, Any]  # blur, noise, warnings, ...: of JSON's types, stored with the result
+    seconds: float  # spent on reading and tracking
+
+
+def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:
+    """Open both cameras. frames: first and one past the last frame to measure, None for the recording's ends.
+
+    Raises RecordingError if images are missing, do not belong together, or the range holds no frame; or if a camera's
+    own header contradicts the other's, or the declared frame rate.
+    """
+    left, right = (
+        open_frames(pattern, recording.folder, camera)
+        for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
+    )
+    warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
+    check_pair(left, right)
+    warnings += check_time_stamps(left, right, recording.frame_rate)
+    start, stop, _ = slice(*frames).indices(len(left))
+    if stop <= start:
+        raise RecordingError(
+            f"{recording.folder}: --frames {frames[0]}:{frames[1]} holds no frame; the recording has {len(left)}."
+        )
+    return ImagePairs(left, right, start, stop, warnings)
+
+
+def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
+    """Raise RecordingError unless the rig was calibrated at the recording's image size."""
+    for camera, reader, name in zip(rig.cameras, (pairs.left, pairs.right), CAMERAS, strict=True):
+        if camera.image_size != reader.image_size:
+            (w, h), (wr, hr) = reader.image_size, camera.image_size
+            raise RecordingError(
+                f"{reader.describe(pairs.start)}: {name} images are {w} x {h} px, but {rig_name} was calibrated with "
+                f"{wr} x {hr} px. Calibrate with views of the recording's own size, or name its own rig."
+            )
+
+
+def measure(
+    recording: Recording,
+    rig: StereoRig,
+    pairs: ImagePairs,
+    settings: TrackingSettings | None = None,
+    threads: int | None = None,
+    progress: Progress = lambda n: None,
+) -> Measurement:
+    """Track the disc through the pairs; the trajectory has the length of the recording.
+
+    Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
+    Raises TrackingError if the disc is found in no frame.
+    """
+    settings = settings or TrackingSettings()
+    unreadable: list[Unreadable] = []
+    rate = recording.frame_rate
+
+    stamps = usable_times(pairs.left, rate)
+    prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
+    began = time.perf_counter()
+    span = _span(pairs, rate, settings, threads)
+    progress(len(pairs) - (span.stop - span.start))
+    tracked = range(span.start, span.stop)
+    edges = stretch_edges(tracked, recording.disc)
+    workers = _workers(pairs, len(edges) - 1, threads)
+    readers = max(1, (threads or default_threads()) // workers)  # each worker has its own three blocks
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers, breaks=edges):
+            unreadable.extend(block.unreadable)
+            yield block
+
+    tracking = track(
+        read_blocks,
+        tracked,
+        rig,
+        recording.disc,
+        rate,
+        gravity=recording.gravity,
+        settings=settings,
+        timestamps=None if stamps is None else stamps[span.start : span.stop],
+        workers=workers,
+        progress=progress,
+    )
+    unreadable.sort(key=lambda image: (image.frame, image.camera))
+    seconds = time.perf_counter() - began
+    findings = {
+        "notes": list(pairs.notes),
+        "warnings": [*pairs.warnings, *tracking.warnings],
+        "unreadable": [image.reason for image in unreadable],
+        "blur_px": list(tracking.blur_px),
+        "noise": [_json_fields(noise) for noise in tracking.noise],
+        "variance_factor": tracking.variance_factor,
+        "noise_factor": tracking.noise_factor,
+        "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
+        "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
+        "acquisitions": tracking.acquisitions,
+        "first_pass": dataclasses.asdict(span),
+        **pairs.camera_headers(),
+    }
+    trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
+    for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
+        trajectory.frame_status[still] = FrameStatus.STILL
+    return Measurement(trajectory, tuple(unreadable), findings, seconds)
+
+
+def _workers(pairs: ImagePairs, stretches: int, threads: int | None) -> int:
+    """Stretches of the recording that are followed side by side: one per core, where frames can be read anywhere."""
+    if not (pairs.left.random_access and pairs.right.random_access):
+        return 1
+    return max(1, min(threads or default_threads(), stretches))
+
+
+def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:
+    """What is to be tracked of the pairs."""
+    if not settings.first_pass:
+        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame, as asked for")
+    if len(pairs) < WHOLE_BELOW * frame_rate:
+        return MotionSpan(pairs.start, pairs.stop, 0, True, f"every frame of a recording below {WHOLE_BELOW:g} s")
+    if not (pairs.left.random_access and pairs.right.random_access):
+        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame: these files can only be read in order")
+    return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate, threads)
+
+
+_FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}
+
+
+def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | None = None) -> Trajectory:
+    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED.
+
+    timestamps (n,) [s] where the camera wrote them; otherwise frames are evenly spaced.
+    """
+    length = len(part)
+    if length == n:
+        return part
+    whole: dict[str, Any] = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, np.ndarray):
+            fill = _FILL.get(field.name, np.nan if value.dtype.kind == "f" else 0)
+            whole[field.name] = np.full((n, *value.shape[1:]), fill, value.dtype)
+            whole[field.name][start : start + length] = value
+    whole["frame"] = np.arange(n)
+    whole["time"] = np.arange(n) / part.frame_rate if timestamps is None else np.array(timestamps, float)
+    whole["time"][start : start + length] = part.time
+    return dataclasses.replace(part, **whole)
+
+
+def trajectory_provenance(
+    recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
+) -> Provenance:
+    """What the trajectory is made from; reads the images' content where it was not read yet."""
+    return Provenance(
+        recording=recording.name,
+        inputs={**pairs.inputs(), "rig": rig_sha256(rig)},
+        settings={
+            "recording": dict(recording.declared),
+            "frames": [pairs.start, pairs.stop],
+            "tracking": dataclasses.asdict(settings or TrackingSettings()),
+            **pairs.camera_headers(),
+        },
+    )
+
+
+def rig_sha256(rig: StereoRig) -> str:
+    """SHA-256 (hex) of a rig's numbers, to the last bit."""
+    digest = hashlib.sha256()
+    for camera in rig.cameras:
+        digest.update(camera.parameters.tobytes() + np.array(camera.image_size, np.int64).tobytes())
+    for part in (rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance):
+        digest.update(np.ascontiguousarray(part, float).tobytes())
+    digest.update(bytes([rig.world_is_table]))
+    return digest.hexdigest()
+
+
+def _json_fields(item: Any) -> dict[str, Any]:
+    """A dataclass as JSON's types, arrays as lists."""
+    fields = dataclasses.asdict(item)
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}
