@@ -196,11 +196,12 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
             sums_new = normal_equations(image, window, trial, curvature, noise, H_new, g_new)
             accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
         if accepted:
+            blur_step = trial[4] - p[4]  # as clamped: edges sharper than the pixel hold it at its lower bound
             p[:], sums = trial, sums_new
             H, H_new = H_new, H
             g, g_new = g_new, g
             damping = max(damping * 0.1, 1e-9)
-            if abs(step[0]) < tolerance and abs(step[1]) < tolerance and abs(step[4]) < 10 * tolerance:
+            if abs(step[0]) < tolerance and abs(step[1]) < tolerance and abs(blur_step) < 10 * tolerance:
                 converged = True
                 break
         else:

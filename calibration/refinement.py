@@ -15,6 +15,9 @@ from calibration.errors import CalibrationError
 from calibration.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.stereo_model import Observations, StereoModel, Terms, board_basis, predict, restricted
 
+FREE_ROUNDS = 6  # of rejection, in which a point may come back; then it may not, so that the rounds come to an end
+MAX_ROUNDS = 12
+
 
 @dataclass(frozen=True)
 class Refinement:
@@ -76,7 +79,7 @@ def refine_stereo(
         model, extra = _robust_start(observations, model, stereo_basis, shape_basis, n_views)
     else:
         kept, extra = begin.kept, begin.unexplained_sigma**2
-    for _ in range(8):
+    for turn in range(MAX_ROUNDS):
         used = observations[kept]
         problem = Problem(used, inverse_covariance(used.covariance, extra), stereo_basis, shape_basis, n_views)
         if _degrees_of_freedom(problem, len(used)) <= 0:
@@ -91,10 +94,14 @@ def refine_stereo(
         new_extra = _extra_variance(residuals[kept], used.covariance, dof)
         distance = _mahalanobis2(residuals, observations.covariance, new_extra)
         new_kept = distance < reject_beyond**2
-        settled = abs(new_extra - extra) <= 1e-3 * extra + 1e-10 and (new_kept == kept).all()
-        kept, extra = new_kept, new_extra
-        if settled:
+        if turn >= FREE_ROUNDS:
+            new_kept &= kept
+        same = bool((new_kept == kept).all())
+        settled = same and abs(new_extra - extra) <= 1e-3 * extra + 1e-10
+        extra = new_extra
+        if settled or turn == MAX_ROUNDS - 1:  # what is returned belongs to the points that were fitted
             break
+        kept = new_kept
     own = _mahalanobis2(residuals[kept], observations.covariance[kept], 0.0)
     return Refinement(
         model=model,

@@ -31,7 +31,7 @@ def start_camera(
             f"{name} camera: the target is found in {len(views)} views, at least {MIN_VIEWS} are needed "
             "(10 to 20, tilted in several directions, are good)"
         )
-    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
     guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])
     try:

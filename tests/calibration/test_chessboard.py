@@ -90,6 +90,18 @@ def test_opencv_corners_at_the_usual_window_are_worse(board_drawer):
     assert error[0] < 0.5 * error[1]
 
 
+@pytest.mark.parametrize("optical_blur", [0.02, 0.1, 0.2])
+def test_edges_sharper_than_the_pixel_are_located_as_well(board_drawer, optical_blur):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board, (-35, 10, 33))
+    view = find_corners(
+        board_drawer(CAMERA, R, t, board, sub=8, sigma=optical_blur, rng=np.random.default_rng(1)), (9, 6)
+    )
+    assert isinstance(view, CornerView), view
+    assert view.accepted.all()
+    assert np.sqrt(np.mean((view.points - truth(board, R, t)) ** 2)) < 0.005  # the light's limit is 0.002 px
+
+
 @pytest.mark.parametrize("turn", [0, 37, 90, 145, 180, 222, 270, 301])
 def test_order_follows_the_dark_side_however_the_board_lies(board_drawer, turn):
     board = Board((9, 6), 6e-3)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 from calibration import CalibrationError, Terms, refine_stereo
-from calibration.assessment import consistency_factor
+from calibration.assessment import consistency_factor, half_set_differences
 from calibration.camera import N_RIG
 from calibration.model_choice import choose_terms
 from calibration.start import start_stereo
@@ -212,6 +212,30 @@ def test_gross_outliers_are_rejected_and_do_no_harm(scene_maker, rng):
     sigma = np.sqrt(np.diag(rig_with_covariance(clean, None, 0, 1.0).covariance))[:9]
     change = dirty.model.cameras[0].parameters - clean.model.cameras[0].parameters
     assert np.abs(change[sigma > 0] / sigma[sigma > 0]).max() < 1.0
+
+
+def test_rejection_that_does_not_settle_leaves_a_fit_of_the_points_that_it_names(scene_maker, rng):
+    scene = scene_maker(n_views=8)
+    o = scene.observations(0.05, rng)
+    # beyond one sigma lie a third of all good points: each round strikes others
+    found = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL, reject_beyond=1.0)
+    assert len(found.problem.observations) == found.kept.sum()
+    assert np.array_equal(found.problem.observations.pixels, found.observations.pixels[found.kept])
+    assert half_set_differences(found, 1.0) is not None
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.33])
+def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, rng, aspect):
+    scene = scene_maker(n_views=10)
+    cameras = tuple(
+        replace(c, fy=c.fy * aspect, cy=c.cy * aspect, image_size=(512, int(512 * aspect))) for c in scene.model.cameras
+    )
+    scene = replace(scene, model=replace(scene.model, cameras=cameras))
+    o = scene.observations(0.02, rng)
+    start, usable = start_stereo(o, scene.board.points, (cameras[0].image_size, cameras[1].image_size), 10)
+    assert usable.all()
+    found = refine_stereo(o, start, scene.board.points, FULL)
+    assert_allclose(found.model.cameras[0].fy / found.model.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3)
 
 
 def test_a_bent_board_is_chosen_and_recovered_by_held_out_error(scene_maker, rng):
