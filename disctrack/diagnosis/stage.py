@@ -20,7 +20,7 @@ from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
 from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.shape import refine_shapes
-from disctrack.diagnosis.engine.system import System
+from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import sentence
 from disctrack.errors import AnalysisError, OutputError
@@ -56,6 +56,7 @@ def diagnose_trajectory(
     diagnosis, remarks = refine_shapes(system, diagnosis)
     moment, learned = _beyond_the_catalogue(system, diagnosis)
     if learned is not None:
+        system = system.knowing(learned.law.effect)
         reason = (
             f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
         )
@@ -80,6 +81,11 @@ def diagnose_trajectory(
     )
 
 
+def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:
+    """The system with its noise as the diagnosis found it."""
+    return diagnosis.judged.over(system) if isinstance(diagnosis.judged, Wrapped) else system
+
+
 def _with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
     start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
     return fit(system, (*base.quantities, *law.candidate.quantities), start)
@@ -93,11 +99,14 @@ def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Mis
     moment, law = learn(system, base, diagnosis.noise)
     if law is None or diagnosis.held_out_before is None:
         return moment, None
-    judged = diagnosis.judged or system
+    system = system.knowing(law.effect)
+    judged = _judged(diagnosis, system)
     fitted = _with_law(judged, base, law)
     shorter = without_idle_terms(law, fitted)
     if fitted.converged and shorter is not law:
-        law, fitted = shorter, _with_law(judged, base, shorter)
+        law, system = shorter, system.knowing(shorter.effect)
+        judged = _judged(diagnosis, system)
+        fitted = _with_law(judged, base, law)
     price = float(np.log(np.sum(system.weights)))
     lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
     saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])

@@ -9,7 +9,7 @@ are part of each signature: a changed layout recompiles what depends on it. A ca
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def compile_system(function: Callable[..., None], scalar: type) -> Any:
     return _compile(function, types.void(v, v, v, types.CPointer(types.int64), *records))
 
 
-@cache
+@lru_cache(maxsize=256)  # the catalogue several times over; whoever calls a law holds it himself
 def compile_law(function: Callable[..., None], parameters: tuple[str, ...], helpers: tuple, scalar: type) -> Any:
     """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call."""
     for helper in helpers:

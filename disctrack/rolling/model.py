@@ -23,9 +23,11 @@ class Model:
     disc: Disc
     gravity: float = 9.81  # [m/s^2] along -k, unless an effect says otherwise
     effects: tuple[Effect, ...] = ()
+    laws: tuple[type[Effect], ...] = ()  # by formula, that parameters may name beside those of the catalogue
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "effects", tuple(self.effects))
+        object.__setattr__(self, "laws", tuple(self.laws))
         names = [effect.name for effect in self.effects]
         for name in names:
             if names.count(name) > 1:
@@ -60,18 +62,36 @@ class Model:
         """Copy with new values by "effect.parameter"; an effect that is not in the model is added, absent otherwise."""
         new = {e.name: dict(e.values) for e in self.effects}
         for full_name, value in values.items():
-            effect, parameter = split_name(full_name)
-            new.setdefault(effect, effect_class(effect).absent().values)[parameter] = value
-        return replace(self, effects=tuple(effect_class(name)(**v) for name, v in new.items()))
+            effect, parameter = self.split_name(full_name)
+            new.setdefault(effect.name, effect.absent().values)[parameter] = value
+        return replace(self, effects=tuple(self.effect_class(name)(**v) for name, v in new.items()))
 
+    def knowing(self, *laws: type[Effect]) -> Model:
+        """Copy whose parameters may also be those of these laws; they replace laws of the same name."""
+        new = {law.name: law for law in self.laws} | {law.name: law for law in laws}
+        return replace(self, laws=tuple(new.values()))
 
-def split_name(full_name: str) -> tuple[str, str]:
-    """("effect", "parameter") of "effect.parameter"; raises ModelError where the catalogue has no such parameter."""
-    effect, _, parameter = full_name.partition(".")
-    known = [p.name for p in effect_class(effect).parameters]
-    if parameter not in known:
-        raise ModelError(f"'{full_name}' is no parameter; effect '{effect}' has {', '.join(known)}")
-    return effect, parameter
+    def effect_class(self, name: str) -> type[Effect]:
+        """Class of the effect of this name: in the model, among its laws, or in the catalogue; raises ModelError."""
+        own = (*(type(effect) for effect in self.effects), *self.laws)
+        return next((e for e in own if e.name == name), None) or effect_class(name)
+
+    def split_name(self, full_name: str) -> tuple[type[Effect], str]:
+        """(effect, "parameter") of "effect.parameter"; raises ModelError where no effect has such a parameter."""
+        name, _, parameter = full_name.partition(".")
+        effect = self.effect_class(name)
+        known = [p.name for p in effect.parameters]
+        if parameter not in known:
+            raise ModelError(f"'{full_name}' is no parameter; effect '{name}' has {', '.join(known)}")
+        return effect, parameter
+
+    def has_name(self, full_name: str) -> bool:
+        """Is this the name of a parameter that the model has or may take?"""
+        try:
+            self.split_name(full_name)
+        except ModelError:
+            return False
+        return True
 
 
 def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -104,9 +124,11 @@ def effects_from_tables(
 
     formulas : {effect: {component: formula}} of effects that are not in the catalogue (effects.learned)
     """
-    for name, law in (formulas or {}).items():
-        effect_from_formulas(name, law)
-    return tuple(effect_class(name)(**values) for name, values in tables.items())
+    laws = {name: effect_from_formulas(name, law) for name, law in (formulas or {}).items()}
+    for name in laws:
+        if name not in tables:
+            raise ModelError(f"the law by formula '{name}' has no numbers: give effects.{name}, or take it out")
+    return tuple((laws.get(name) or effect_class(name))(**values) for name, values in tables.items())
 
 
 def effects_toml(effects: Sequence[Effect], section: str = "motion.rolling.effects") -> str:

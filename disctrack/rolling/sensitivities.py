@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from disctrack.rolling._assembly import Assembly
-from disctrack.rolling.effects import effect_class
-from disctrack.rolling.model import DEFAULT_THETA_END, Model, split_name
+from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, coordinates
 from disctrack.rolling.records import STATE_COMPONENTS
 from disctrack.rolling.simulate import MAX_SWITCHES, RTOL, _grid, _start, check_in_model, follow
@@ -84,7 +83,7 @@ def _missing(model: Model, parameters: Sequence[str]) -> dict[str, float]:
     present = {e.name for e in model.effects}
     missing = {}
     for full_name in parameters:
-        effect, name = split_name(full_name)
-        if effect not in present:
-            missing[full_name] = effect_class(effect).absent().values[name]
+        effect, name = model.split_name(full_name)
+        if effect.name not in present:
+            missing[full_name] = effect.absent().values[name]
     return missing

@@ -14,10 +14,9 @@ from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import measured
 
 
-def hide(name: str, component: str, formula: str) -> str:
-    """Register an effect that no candidate list proposes."""
-    effect_from_formulas(name, {component: formula})
-    return f"{name}.k"
+def hiding(name: str, component: str, formula: str, size: float, **options):
+    """Measured with an effect that no candidate list proposes."""
+    return measured({f"{name}.k": size}, laws=[effect_from_formulas(name, {component: formula})], **options)
 
 
 @pytest.mark.parametrize(
@@ -29,7 +28,7 @@ def hide(name: str, component: str, formula: str) -> str:
     ],
 )
 def test_an_effect_in_no_catalogue_is_described_by_a_learned_law(name, component, formula, size, locked):
-    trajectory = measured({hide(name, component, formula): size}, seed=5, n=450, omega3=2.0)
+    trajectory = hiding(name, component, formula, size, seed=5, n=450, omega3=2.0)
     result = diagnose_trajectory(trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
@@ -45,11 +44,12 @@ def test_an_effect_in_no_catalogue_is_described_by_a_learned_law(name, component
 
 def test_missing_moment_is_the_hidden_one():
     """The true course of the moment lies within the band: pulls of order one, and the band is narrow."""
-    trajectory = measured({hide("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z"): 1e-6}, seed=7, n=400)
+    trajectory = hiding("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z", 1e-6, seed=7, n=400)
     system = DiscSystem(trajectory, declared_model(trajectory).model)
     base = fit(system, system.base, system.start())
     moment = missing_moment(probe(system, base))
     _, law = learn(system, base, 1.0)
+    system = system.knowing(law.effect)
     truth = learned_moment(
         system,
         fit(

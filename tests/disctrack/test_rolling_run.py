@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.cli import main
 from disctrack.errors import OutputError, SceneError
-from disctrack.rolling import CATALOGUE, effects_from_tables, effects_toml
+from disctrack.rolling import CATALOGUE, ModelError, effects_from_tables, effects_toml
 from disctrack.scene.simulation import run_simulate
 
 SCENE = """
@@ -96,16 +96,18 @@ def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
 def test_an_effect_by_formula_is_simulated_and_saved(scene, tmp_path):
     law = '[motion.rolling.formulas.brake]\nload_z = "-c * omega_z"\n[motion.rolling.effects.brake]\nc = 1e-4\n'
     scene.write_text(SCENE + law)
-    try:
-        run = run_simulate(scene, tmp_path / "motion.h5")
-        plain = scene.with_name("plain.toml")
-        plain.write_text(SCENE)
-        without = run_simulate(plain, tmp_path / "plain.h5")
-        assert np.abs(run.motion.q - without.motion.q).max() > 1e-6
-        saved = tomllib.loads(effects_toml(run.motion.model.effects))["motion"]["rolling"]
-        assert effects_from_tables(saved["effects"], saved["formulas"]) == run.motion.model.effects
-    finally:
-        CATALOGUE.pop("brake", None)
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    plain = scene.with_name("plain.toml")
+    plain.write_text(SCENE)
+    without = run_simulate(plain, tmp_path / "plain.h5")
+    assert np.abs(run.motion.q - without.motion.q).max() > 1e-6
+    saved = tomllib.loads(effects_toml(run.motion.model.effects))["motion"]["rolling"]
+    assert effects_from_tables(saved["effects"], saved["formulas"]) == run.motion.model.effects
+    scene.write_text(SCENE + law.replace("omega_z", "thetadot"))  # another law of that name, in the same process
+    assert np.abs(run_simulate(scene, tmp_path / "other.h5").motion.q - run.motion.q).max() > 1e-6
+    scene.write_text(SCENE + law.partition("[motion.rolling.effects")[0])
+    with pytest.raises(ModelError, match="brake"):
+        run_simulate(scene, tmp_path / "no_numbers.h5")
 
 
 def test_effects_survive_their_toml():

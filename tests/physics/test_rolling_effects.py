@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Effect, Model, ModelError, Parameter, State, steady_precession
-from disctrack.rolling.effects import FORMULAS, catalogue_table, effect_class, effect_from_formulas
+from disctrack.rolling.effects import catalogue_table, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None]
@@ -183,15 +183,6 @@ def test_load_dependent_moments_are_solved_with_the_acceleration_not_lagged():
     assert_allclose(F_z[3:-3], MA_2014.mass * (9.81 + second[3:-3]), rtol=0.02)
 
 
-@pytest.fixture
-def formula_effects():
-    before = set(FORMULAS)
-    yield
-    for name in set(FORMULAS) - before:
-        del FORMULAS[name]
-
-
-@pytest.mark.usefixtures("formula_effects")
 def test_an_effect_written_as_a_formula_is_the_effect_written_as_a_class():
     written = effect_from_formulas("formula_km", {"load_m": "-k * psidot * magnitude(psidot)"})
     state = steady_precession(np.radians(9), MA_2014)
@@ -201,12 +192,31 @@ def test_an_effect_written_as_a_formula_is_the_effect_written_as_a_class():
     assert_allclose(a.q, b.q, rtol=1e-13)
     two = effect_from_formulas("formula_two", {"M_z": "-c*omega_z", "X_n": "-(c + d)*v_n*exp(-theta**2)"})
     assert [p.name for p in two.parameters] == ["c", "d"]
-    assert effect_from_formulas("formula_two", two.formulas) is two
-    assert effect_class("formula_two") is two
+    assert effect_from_formulas("formula_two", two.formulas)(c=2, d=3) == two(c=2, d=3)
     assert "formula_two" not in CATALOGUE  # nor, therefore, among the candidates for the next recording
 
 
-@pytest.mark.usefixtures("formula_effects")
+def test_laws_of_one_name_live_side_by_side_in_one_process():
+    """Two recordings taught laws of the default name; each model carries its own."""
+    one = effect_from_formulas("learned", {"M_z": "-c_0 * omega_z"})
+    other = effect_from_formulas("learned", {"M_z": "-c_0 * omega_z", "M_m": "c_1 * time"})
+    first, second = Model(MA_2014, laws=(one,)), Model(MA_2014, laws=(other,))
+    with_first = first.with_values({"learned.c_0": 1e-7})
+    with_second = second.with_values({"learned.c_0": 2e-7, "learned.c_1": 1e-6})
+    assert with_first.with_values({"learned.c_0": 3e-7}).values == {"learned.c_0": 3e-7}
+    assert with_second.with_values({"learned.c_1": 4e-6}).values == {"learned.c_0": 2e-7, "learned.c_1": 4e-6}
+    assert one(c_0=1e-7) != other(c_0=1e-7)
+    with pytest.raises(ModelError, match="no effect 'learned'"):
+        Model(MA_2014).with_values({"learned.c_0": 1.0})
+    with pytest.raises(ModelError, match="no parameter; effect 'learned' has c_0"):
+        first.with_values({"learned.c_1": 1.0})
+    state, times = steady_precession(np.radians(9), MA_2014), np.linspace(0, 0.2, 21)
+    found = rolling.sensitivities(second, state, times, ["learned.c_1"])
+    step = 1e-7
+    moved = rolling.simulate(with_second.with_values({"learned.c_0": 0.0, "learned.c_1": step}), state, times=times)
+    assert_allclose(found.dq[:, :, -1] * step, moved.q - found.q, rtol=1e-2, atol=1e-10)  # integrated to 1e-11
+
+
 @pytest.mark.parametrize(
     ("formulas", "message"),
     [

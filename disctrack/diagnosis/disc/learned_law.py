@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, prior_rows, triangle
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
-from disctrack.rolling.effects import FORMULAS, effect_from_formulas
+from disctrack.rolling import Model
+from disctrack.rolling.effects import Effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
 
 Array = NDArray[np.float64]
@@ -78,11 +79,16 @@ class LearnedLaw:
     """Terms that describe the missing moment."""
 
     candidate: Candidate  # of the effect by formula
-    formulas: dict[str, str]  # component of the wrench -> formula
+    effect: type[Effect]
     terms: tuple[tuple[str, str], ...]  # (axis, function)
     share: tuple[float, ...]  # of the resamples that chose each term
     locked: bool  # to an angle of the body or of the table
     laws: dict[str, str]  # function of each term -> formula
+
+    @property
+    def formulas(self) -> dict[str, str]:
+        """Component of the wrench -> formula."""
+        return dict(self.effect.formulas or {})
 
 
 @dataclass(frozen=True)
@@ -206,9 +212,10 @@ def courses(system: DiscSystem, fit: Fit, time: Array, laws: Mapping[str, str]) 
     return found
 
 
-def learn(system: DiscSystem, fit: Fit, noise: float, name: str = "learned") -> tuple[MissingMoment, LearnedLaw | None]:
+def learn(system: DiscSystem, fit: Fit, noise: float) -> tuple[MissingMoment, LearnedLaw | None]:
     """The missing moment, and the law of few terms that describes it; None if no term survives.
 
+    The law is called "learned", or "learned_2" and so on where the model has learned laws already.
     noise : variance of the residual's noise over that stated
     """
     blocks = probe(system, fit)
@@ -230,7 +237,12 @@ def learn(system: DiscSystem, fit: Fit, noise: float, name: str = "learned") -> 
     if not kept:
         return moment, None
     scale = _values(np.vstack(reduced), blocks.n_fitted, [t for t, _ in kept])
-    return moment, _law([terms[t] for t, _ in kept], [s for _, s in kept], scale, name, laws)
+    return moment, _law([terms[t] for t, _ in kept], [s for _, s in kept], scale, _free_name(system.model), laws)
+
+
+def _free_name(model: Model) -> str:
+    names = ("learned", *(f"learned_{i}" for i in range(2, len(model.effects) + 2)))
+    return next(name for name in names if model.effect(name) is None)
 
 
 def _with_terms(T: Array, n_fitted: int, mixing: Array) -> Array:
@@ -288,21 +300,14 @@ def _law(
     for i, (axis, term) in enumerate(terms):
         piece = f"c_{i} * ({laws[term]})"
         formulas[f"M_{axis}"] = f"{formulas[f'M_{axis}']} + {piece}" if f"M_{axis}" in formulas else piece
-    number = 0
-    unique = name
-    while unique in FORMULAS and FORMULAS[unique].formulas != formulas:
-        number += 1
-        unique = f"{name}_{number}"
-    effect = effect_from_formulas(unique, formulas, source="regression on the residual of this recording")
+    effect = effect_from_formulas(name, formulas, source="regression on the residual of this recording")
     quantities = tuple(
-        Quantity(f"{unique}.c_{i}", "SI", 0.01 * abs(float(v)) or 1e-9, meaning=f"M_{axis} by {term}")
+        Quantity(f"{name}.c_{i}", "SI", 0.01 * abs(float(v)) or 1e-9, meaning=f"M_{axis} by {term}")
         for i, ((axis, term), v) in enumerate(zip(terms, scale, strict=True))
     )
-    candidate = Candidate(
-        unique, unique, "motion", effect.title, effect.source, quantities, tuple(float(v) for v in scale)
-    )
+    candidate = Candidate(name, name, "motion", effect.title, effect.source, quantities, tuple(float(v) for v in scale))
     locked = any(mark in laws[term] for _, term in terms for mark in _LOCKED)
-    return LearnedLaw(candidate, formulas, tuple(terms), tuple(share), locked, {term: laws[term] for _, term in terms})
+    return LearnedLaw(candidate, effect, tuple(terms), tuple(share), locked, {term: laws[term] for _, term in terms})
 
 
 def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
@@ -312,9 +317,7 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     if not kept or len(kept) == len(names):
         return law
     scale = np.array([fitted.values[names[i]] for i in kept])
-    name = law.candidate.name
-    del FORMULAS[name]  # the shorter law takes its place
-    return _law([law.terms[i] for i in kept], [law.share[i] for i in kept], scale, name, law.laws)
+    return _law([law.terms[i] for i in kept], [law.share[i] for i in kept], scale, law.candidate.name, law.laws)
 
 
 def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:

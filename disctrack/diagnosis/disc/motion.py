@@ -8,7 +8,6 @@ import numpy as np
 
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.rolling import CATALOGUE, Effect, Model, Parameter, State
-from disctrack.rolling.effects import FORMULAS
 
 # Parameters of one effect that act so differently that each part is a question of its own.
 _PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
@@ -72,7 +71,7 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
     """
     present = {effect.name for effect in model.effects}
     found = []
-    for effect in (*CATALOGUE.values(), *(FORMULAS[n] for n in names or () if n in FORMULAS)):
+    for effect in CATALOGUE.values():
         wanted = names is None or effect.name in names
         if not (wanted and effect.candidate) or effect.name in present:
             continue

@@ -24,7 +24,7 @@ from disctrack.diagnosis.engine.fit import triangle
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
-from disctrack.rolling.effects import find_effect
+from disctrack.rolling.effects import Effect
 from disctrack.track.pose import whitening
 from disctrack.trajectory import MarkerStatus, Trajectory
 
@@ -145,9 +145,15 @@ class DiscSystem:
             setattr(part, name, getattr(self, name)[:n])
         return part
 
+    def knowing(self, law: type[Effect]) -> DiscSystem:
+        """The same system, in whose values parameters of this law may be named."""
+        known = copy(self)
+        known.model = self.model.knowing(law)
+        return known
+
     def model_with(self, values: Values) -> Model:
         """The model with every effect that has an amount in `values`."""
-        effects = {name: v for name, v in values.items() if _is_effect(name)}
+        effects = {name: v for name, v in values.items() if self.model.has_name(name)}
         if values.get(SLIP, 0.0) > 0:
             effects["slip.mu"] = 1.0 / values[SLIP]
         return self.model.with_values(effects)
@@ -241,7 +247,7 @@ class DiscSystem:
         model = self.model_with({k: v for k, v in values.items() if np.isfinite(v)})
         components = [n.partition(".")[2] for n in names if n.startswith("state.")]
         present = set(model.values)
-        parameters = [n for n in names if n in present or _is_effect(n)]
+        parameters = [n for n in names if n in present or model.has_name(n)]
         parameters = [n for n in parameters if np.isfinite(values.get(n, 0.0))]
         slips = SLIP in names and values.get(SLIP, 0.0) > 0
         if slips:
@@ -329,12 +335,6 @@ def _nowhere(n: int) -> _Path:
     """No motion at all."""
     nothing = np.full((2, n, 6), np.nan)
     return _Path(nothing, nothing, (), np.zeros((n, 6, 0)))
-
-
-def _is_effect(name: str) -> bool:
-    effect, _, parameter = name.partition(".")
-    known = find_effect(effect)
-    return known is not None and any(p.name == parameter for p in known.parameters)
 
 
 def _scaled(covariance: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ business of an adapter (`diagnosis.disc`, `examples`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -87,6 +88,12 @@ class Wrapped:
 
     def __init__(self, system: System) -> None:
         self._system = system
+
+    def over(self, system: System) -> Wrapped:
+        """The same view of another system."""
+        view = copy(self)
+        view._system = system
+        return view
 
     @property
     def time(self) -> Array:

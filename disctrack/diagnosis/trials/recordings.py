@@ -8,7 +8,7 @@ error drawn from its covariance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from disctrack.frames import (
 )
 from disctrack.render import rig_of
 from disctrack.render.cameras import board_poses, rig_after_faults
-from disctrack.rolling import Model, simulate, steady_precession
+from disctrack.rolling import Effect, Model, simulate, steady_precession
 from disctrack.scene.description import Faults, Scene
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
@@ -90,12 +90,14 @@ def measured(
     sigma_px: float = SIGMA_PX,
     motion: Motion | None = None,
     base: Mapping[str, float] | None = None,
+    laws: Sequence[type[Effect]] = (),
 ) -> Trajectory:
     """Trajectory of a disc that rolls down with these effects ("effect.parameter") besides the paper's k_m.
 
     faults, unseen : delay, frame rate, dots, pattern, cameras, table; the trajectory does not tell of them
     motion         : in place of the rolling model's
     base           : laws that every diagnosis knows of, in place of k_m = 0.381e-7
+    laws           : by formula, that `effects` may name
     """
     rng = np.random.default_rng([20261121, seed])
     scene = Scene(seed=seed, faults=faults or Faults())
@@ -109,8 +111,8 @@ def measured(
     true_rig = _on_the_true_table(rig_after_faults(believed_rig.perturbed(error), scene), u)
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
     if motion is None:
-        laws = dict({"km.k_m": K_M} if base is None else base) | dict(effects or {})
-        motion = _rolling(Model(disc).with_values(laws), theta_deg, nutation_deg, omega3, rng)
+        amounts = dict({"km.k_m": K_M} if base is None else base) | dict(effects or {})
+        motion = _rolling(Model(disc, laws=tuple(laws)).with_values(amounts), theta_deg, nutation_deg, omega3, rng)
     true_times = np.arange(n) / ((f.frame_rate_hz or declared_rate) * (1.0 + u.clock)) + STATION
     centres = _true_centres(disc, f, u)
     views = [

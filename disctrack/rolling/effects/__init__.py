@@ -5,14 +5,12 @@ from pkgutil import iter_modules
 
 from disctrack.rolling.effects.base import (
     CATALOGUE,
-    FORMULAS,
     Effect,
     ModelError,
     Parameter,
     catalogue,
     catalogue_table,
     effect_class,
-    find_effect,
 )
 
 for _module in iter_modules(__path__):
@@ -22,7 +20,6 @@ from disctrack.rolling.effects.learned import effect_from_formulas  # noqa: E402
 
 __all__ = [
     "CATALOGUE",
-    "FORMULAS",
     "Effect",
     "ModelError",
     "Parameter",
@@ -30,5 +27,4 @@ __all__ = [
     "catalogue_table",
     "effect_class",
     "effect_from_formulas",
-    "find_effect",
 ]

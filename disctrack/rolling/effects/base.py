@@ -7,7 +7,8 @@ To add one, write a class in a module of this package: a name, its parameters, w
                          and complex numbers alike: no `if`, no `abs`; use `magnitude`, `sign`, `np.sqrt`, `np.exp`.
     adjust(body, p)      changes the body's constants (records.BODY) before the motion starts
 
-or both. Defining the class registers it: simulation, fitting and diagnosis take it from CATALOGUE. A compiled law is
+or both. Defining the class enters it into CATALOGUE, from where simulation, fitting and diagnosis take it (a law by
+formula is no part of it: a model that may use one carries it, Model.laws). A compiled law is
 kept as long as its own file does not change; who changes `magnitude` or `sign` touches the laws' files too.
 
 Signs: M is the moment of the table on the disc at the contact, in (n0, m0, k). Its power is
@@ -25,8 +26,6 @@ import numpy as np
 from disctrack.errors import DiscTrackError
 
 CATALOGUE: dict[str, type[Effect]] = {}
-# Apart from the catalogue: what one recording taught, or a user tried, is no candidate for the next one.
-FORMULAS: dict[str, type[Effect]] = {}
 
 
 class ModelError(DiscTrackError):
@@ -76,11 +75,13 @@ class Effect:
     adjust: ClassVar[Any] = None  # static method adjust(body, p), or None
 
     def __init_subclass__(cls) -> None:
-        if cls.formulas is None and cls.name in CATALOGUE and CATALOGUE[cls.name].__qualname__ != cls.__qualname__:
+        if cls.formulas is not None:  # what one recording taught is no candidate for the next one
+            return
+        if cls.name in CATALOGUE and CATALOGUE[cls.name].__qualname__ != cls.__qualname__:
             raise ModelError(
                 f"two effects are called '{cls.name}': {CATALOGUE[cls.name].__qualname__}, {cls.__qualname__}"
             )
-        (CATALOGUE if cls.formulas is None else FORMULAS)[cls.name] = cls
+        CATALOGUE[cls.name] = cls
 
     def __init__(self, **values: float) -> None:
         """Values by parameter name, in the parameter's unit; those not given take their nominal value."""
@@ -112,7 +113,9 @@ class Effect:
         return cls(**{p.name: p.nominal if p.is_shape else p.null for p in cls.parameters})
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self._values == getattr(other, "_values", None)
+        if not isinstance(other, Effect):
+            return NotImplemented
+        return (self.name, self.formulas, self._values) == (other.name, other.formulas, other._values)
 
     def __hash__(self) -> int:
         return hash((self.name, tuple(self._values.items())))
@@ -121,17 +124,11 @@ class Effect:
         return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self._values.items())})"
 
 
-def find_effect(name: str) -> type[Effect] | None:
-    """Class of the effect of this name, in the catalogue or by formulas; None if there is none."""
-    return CATALOGUE.get(name) or FORMULAS.get(name)
-
-
 def effect_class(name: str) -> type[Effect]:
-    """Class of the effect of this name; raises ModelError naming what there is."""
-    found = find_effect(name)
-    if found is None:
+    """Class of the catalogue's effect of this name; raises ModelError naming what there is."""
+    if name not in CATALOGUE:
         raise ModelError(f"there is no effect '{name}'; the catalogue has {', '.join(sorted(CATALOGUE))}")
-    return found
+    return CATALOGUE[name]
 
 
 def catalogue() -> Iterator[type[Effect]]:

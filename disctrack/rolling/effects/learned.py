@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import CATALOGUE, FORMULAS, Effect, ModelError, Parameter, magnitude, sign
+from disctrack.rolling.effects.base import CATALOGUE, Effect, ModelError, Parameter, magnitude, sign
 from disctrack.rolling.records import KINEMATICS, WRENCH
 
 _COMPONENTS = WRENCH[:9]
@@ -37,16 +38,25 @@ def effect_from_formulas(
     source: str = "learned from a residual",
     passive: bool = False,
 ) -> type[Effect]:
-    """Effect class whose law adds these formulas to the wrench; known by `name`, but no part of the catalogue.
+    """Effect class whose law adds these formulas to the wrench; no part of the catalogue: models carry it.
 
     formulas : component of the wrench -> formula.   parameters : those not given have unit "SI", nominal 1, no bounds.
-    Asking again for the same formulas returns the same class. Raises ModelError for a formula that cannot be read and
-    for a name that is taken.
+    Raises ModelError for a formula that cannot be read and for a name of the catalogue.
     """
-    formulas = dict(formulas)
-    if name in FORMULAS and FORMULAS[name].formulas == formulas:
-        return FORMULAS[name]
-    if name in CATALOGUE or name in FORMULAS:
+    return _effect(name, tuple(formulas.items()), parameters, title, source, passive)
+
+
+@lru_cache(maxsize=64)  # of a pure function: a law that is asked for again is not compiled again
+def _effect(
+    name: str,
+    pairs: tuple[tuple[str, str], ...],
+    parameters: tuple[Parameter, ...],
+    title: str,
+    source: str,
+    passive: bool,
+) -> type[Effect]:
+    formulas = dict(pairs)
+    if name in CATALOGUE:
         raise ModelError(f"there is an effect '{name}' already, with another law: choose another name")
     lines, free = [], []
     for component, formula in formulas.items():
