@@ -1,0 +1,386 @@
+"""Recordings as an ordinary laboratory makes them, by ray casting that has no part in the product's renderer.
+
+Every imperfection has its own switch: a lens with a smooth residual field beyond any radial polynomial, a chessboard
+that is bowed and stretched along one side, pixel gains, column offsets, a curved response, light that falls off, a
+broad gleam. The motion is that of `newton_euler`. Images are cast backwards through each camera on a grid of SUB x SUB
+rays per pixel, blurred there, and gathered to pixels.
+
+    python -m tests.oracles.imperfect_laboratory FOLDER --seed 3 [--effect kz] [--only bow] [--without lens_field]
+"""
+
+import argparse
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from tests.oracles import newton_euler
+
+SUB = 4  # rays per pixel and axis
+RADIUS, HALF_THICKNESS, MASS, G = 37.5e-3, 3e-3, 0.20969, 9.81
+DOT_RADIUS = 3.5e-3
+ANGLES = np.radians([0, 60, 120, 180, 240, 300])
+DOTS = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)]) * np.array([26, 26, 26, 26, 26, 13.0])[:, None] * 1e-3
+K_M = 0.381e-7
+SAMPLES = 8  # of the motion per frame
+GAUSS = ((-0.7745966692414834, 5 / 18), (0.0, 8 / 18), (0.7745966692414834, 5 / 18))
+
+# What hides in the motion: changes of the body that newton_euler follows.
+EFFECTS = {
+    "none": {},
+    "tilt": {"gravity": (G * np.sin(np.radians(0.1)), 0.0, -G * np.cos(np.radians(0.1)))},
+    "kz": {"laws": (newton_euler.pivoting_friction(30e-6),)},
+    "com": {"com_body": (50e-6, 0.0, 0.0)},
+    "rolling": {"laws": (newton_euler.classical_rolling_friction(30e-6),)},
+    "drag": {"laws": (lambda disc, now: (-2.5e-6 * now.omega, newton_euler.ZERO, newton_euler.ZERO),)},
+}
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """How much of each; 0 switches it off."""
+
+    lens_field: float = 0.02  # [px] rms per axis
+    bow: float = 60e-6  # [m] of the board, middle against short sides
+    stretch: float = 2e-4  # squares longer along the long side
+    thickness: float = 0.0  # [m] true minus declared thickness of the board
+    gains: float = 0.01  # rms of the pixels' gains
+    columns: float = 0.3  # [grey] rms of the columns' offsets
+    curve: float = 0.03  # largest departure of the response from a straight line, of full scale
+    fall_off: float = 0.15  # of the light, from the brightest place to the farthest corner
+    gleam: float = 12.0  # [grey]
+    misprint: float = 0.0  # [m] rms of the dots' places, per axis
+    exposure: float = 2e-4  # [s]
+
+
+IDEAL = Imperfections(**{f.name: 0.0 for f in fields(Imperfections)})
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A recording."""
+
+    seed: int = 1
+    n_frames: int = 300
+    size: int = 512
+    mm_per_px: float = 0.25
+    n_views: int = 20
+    square: float = 8e-3
+    theta_deg: float = 12.0
+    omega3: float = 1.5
+    frame_rate: float = 1000.0
+    effect: str = "none"
+    imperfections: Imperfections = Imperfections()
+    paper: float = 190.0
+    ink: float = 25.0
+    blur: float = 0.62  # [px]
+
+
+class Camera:
+    """Pinhole, two radial terms and the residual field; rays of every sub-pixel, and a fixed pattern of the sensor."""
+
+    def __init__(self, rng, plan, azimuth, target):
+        faults, size = plan.imperfections, plan.size
+        self.size = size
+        off, azimuth = np.radians(42 + rng.normal(0, 2)), np.radians(azimuth + rng.normal(0, 2))
+        distance = 0.42 + rng.normal(0, 0.01)
+        self.focal = distance / (plan.mm_per_px * 1e-3) * (1 + rng.normal(0, 0.005))
+        self.middle = (size - 1) / 2 + rng.normal(0, 4, 2)
+        self.k1, self.k2 = -0.11 + rng.normal(0, 0.01), 0.22
+        back = np.array([np.sin(off) * np.cos(azimuth), np.sin(off) * np.sin(azimuth), np.cos(off)])
+        z = -back
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        roll = np.radians(rng.normal(0, 2))
+        y = np.cross(z, x)
+        self.R = np.array([np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x, z])
+        self.place = target + distance * back
+        self.waves = rng.normal(size=(6, 2)) * 2 * np.pi / (0.9 * size)  # wavelengths of about the image's side
+        self.phases = rng.uniform(0, 2 * np.pi, (6, 2))
+        grid = np.stack(np.meshgrid(np.arange(0, size, 8.0), np.arange(0, size, 8.0)), -1)
+        raw = self._raw_field(grid)
+        self.field_mean, self.field_scale = raw.mean((0, 1)), faults.lens_field / raw.std((0, 1))
+        fine = (np.arange(size * SUB) + 0.5) / SUB - 0.5
+        pixels = np.stack(np.meshgrid(fine, fine), -1)
+        self.rays = self._rays(pixels)  # (size SUB, size SUB, 2)
+        self.coarse = self._rays(np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).astype(float))
+        self.gain = 1 + faults.gains * rng.normal(size=(size, size))
+        self.offset = faults.columns * rng.normal(size=size)
+        u = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1) / size - 0.5
+        far = np.sum((u - rng.uniform(-0.25, 0.25, 2)) ** 2, -1)
+        self.light = 1 - faults.fall_off * far / far.max()
+        glow = np.sum((u - rng.uniform(-0.25, 0.25, 2)) ** 2, -1)
+        self.gleam = faults.gleam * np.exp(-0.5 * glow / 0.18**2)
+        texture = cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), 6.0)
+        self.table = 85 + 2 * texture / texture.std()
+        self.curve = faults.curve
+
+    def _raw_field(self, pixels):
+        turns = np.einsum("...j,kj->...k", pixels, self.waves)
+        return np.stack([np.sin(turns + self.phases[:, axis]).sum(-1) for axis in (0, 1)], -1)
+
+    def field(self, pixels):
+        """Displacement [px] of an image point at these pixels (..., 2) from where the polynomial has it."""
+        return (self._raw_field(pixels) - self.field_mean) * self.field_scale
+
+    def _rays(self, pixels):
+        smooth = pixels - self.field(pixels)
+        distorted = (smooth - self.middle) / self.focal
+        ray = distorted.copy()
+        for _ in range(12):
+            r2 = np.sum(ray * ray, -1, keepdims=True)
+            ray = distorted / (1 + r2 * (self.k1 + r2 * self.k2))
+        return ray
+
+    def project(self, points):
+        """Pixels (..., 2) of world points (..., 3)."""
+        inside = (points - self.place) @ self.R.T
+        ray = inside[..., :2] / inside[..., 2:]
+        r2 = np.sum(ray * ray, -1, keepdims=True)
+        smooth = self.middle + self.focal * ray * (1 + r2 * (self.k1 + r2 * self.k2))
+        found = smooth
+        for _ in range(4):
+            found = smooth + self.field(found)
+        return found
+
+    def plane(self, rays, R, t, height):
+        """Where rays (..., 2) meet the plane z = height of a body at R, t: two arrays of body coordinates."""
+        o = R.T @ (self.place - t)
+        M = R.T @ self.R.T
+        d = [rays[..., 0] * M[i, 0] + rays[..., 1] * M[i, 1] + M[i, 2] for i in range(3)]
+        s = (height - o[2]) / d[2]
+        return o[0] + s * d[0], o[1] + s * d[1]
+
+    def expose(self, radiance, rng):
+        """Grey values (uint8) from ideal ones: light, gleam, response, pattern, noise."""
+        grey = radiance * self.light + self.gleam
+        part = grey / 255
+        grey = 255 * (part + 4 * self.curve * part * (1 - part))
+        grey = grey * self.gain + self.offset
+        grey = grey + rng.normal(size=grey.shape) * np.sqrt(0.64 + np.maximum(grey, 0) / 50)
+        return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def gathered(fine, blur):
+    """Sub-pixel values blurred by the lens and averaged over pixels."""
+    soft = cv2.GaussianBlur(fine, (0, 0), blur * SUB, borderType=cv2.BORDER_REPLICATE)
+    h, w = soft.shape
+    return soft.reshape(h // SUB, SUB, w // SUB, SUB).mean((1, 3))
+
+
+def board_image(camera, plan, R, t, rng):
+    """One view of the board; R, t of the board's frame: origin at corner 0 of the printed face's undeformed plane."""
+    faults, a = plan.imperfections, plan.square
+    long, short = 8 * a, 5 * a
+    x, y = camera.plane(camera.rays, R, t, 0.0)
+    for _ in range(3):
+        height = board_height(x / (1 + faults.stretch), plan)
+        x, y = _deeper(camera, R, t, height)
+    x = x / (1 + faults.stretch)
+    w = plan.mm_per_px * 1e-3 / SUB  # of a sub-pixel on the board, near enough for the antialiasing
+
+    def side(v):
+        cell = v / a
+        near = np.rint(cell)
+        return np.clip(2 * (cell - near) * a / w, -1, 1) * np.where(near % 2 == 0, 1, -1)
+
+    black = 0.5 + 0.5 * side(x) * side(y)
+    beyond = np.maximum(np.maximum(-a - x, x - long - a), np.maximum(-a - y, y - short - a))
+    black = black * np.clip(0.5 - beyond / w, 0, 1)
+    on_board = np.clip(0.5 - (beyond - a) / w, 0, 1)
+    table = cv2.resize(camera.table, None, fx=SUB, fy=SUB, interpolation=cv2.INTER_LINEAR)
+    radiance = table + on_board * (200 - 180 * black - table)
+    return camera.expose(gathered(radiance, plan.blur), rng)
+
+
+def board_height(x, plan):
+    """Height [m] of the printed face above its lowest part, at x [m] along the long side."""
+    bow = plan.imperfections.bow
+    along = (x - 4 * plan.square) / (5 * plan.square)
+    return bow * (1 - along**2) if plan.seed % 2 else bow * along**2
+
+
+def _deeper(camera, R, t, height):
+    o = R.T @ (camera.place - t)
+    M = R.T @ camera.R.T
+    rays = camera.rays
+    d = [rays[..., 0] * M[i, 0] + rays[..., 1] * M[i, 1] + M[i, 2] for i in range(3)]
+    s = (height - o[2]) / d[2]
+    return o[0] + s * d[0], o[1] + s * d[1]
+
+
+def disc_image(camera, plan, poses, dots, rng):
+    """One image; poses: (R, t, weight) over the exposure, the middle one second."""
+    size, soft = plan.size, camera.table.copy()
+    R, t, _ = poses[1]
+    rim = np.column_stack([np.cos(np.linspace(0, 6.3, 40)), np.sin(np.linspace(0, 6.3, 40))]) * RADIUS
+    faces = np.concatenate([np.column_stack([rim, np.full(40, h)]) for h in (HALF_THICKNESS, -HALF_THICKNESS)])
+    outline = camera.project(faces @ R.T + t)
+    x0, y0 = np.clip(np.floor(outline.min(0)).astype(int) - 4, 0, size - 1)
+    x1, y1 = np.clip(np.ceil(outline.max(0)).astype(int) + 5, 1, size)
+    box = np.s_[y0:y1, x0:x1]
+    px = plan.mm_per_px * 1e-3
+    for height in np.linspace(-HALF_THICKNESS, HALF_THICKNESS, 5):
+        x, y = camera.plane(camera.coarse[box], R, t, height)
+        rho = np.hypot(x, y)
+        inside = np.clip(0.5 - (rho - RADIUS) / px, 0, 1)
+        soft[box] += inside * (58 - soft[box])
+    soft[box] += inside * (118 - soft[box])
+    soft[box] += np.clip(0.5 - (rho - RADIUS + 1.5e-3) / px, 0, 1) * (plan.paper - soft[box])
+    soft = cv2.GaussianBlur(soft, (0, 0), np.hypot(plan.blur, 0.29))
+    circle = np.column_stack([np.cos(np.linspace(0, 6.3, 24)), np.sin(np.linspace(0, 6.3, 24))]) * DOT_RADIUS
+    margin = int(np.ceil(4 * plan.blur + 2))
+    for dot in dots:
+        ring = np.column_stack([dot + circle, np.full(24, HALF_THICKNESS)])
+        edge = np.concatenate([camera.project(ring @ Rk.T + tk) for Rk, tk, _ in poses])
+        x0, y0 = np.floor(edge.min(0)).astype(int) - margin
+        x1, y1 = np.ceil(edge.max(0)).astype(int) + margin + 1
+        if min(x0, y0) < 0 or max(x1, y1) > size:
+            continue
+        rays = camera.rays[y0 * SUB : y1 * SUB, x0 * SUB : x1 * SUB]
+        cover = 0.0
+        for Rk, tk, weight in poses:
+            x, y = camera.plane(rays, Rk, tk, HALF_THICKNESS)
+            x, y = x - dot[0], y - dot[1]
+            h, w = x.shape
+            i, j = h // 2, w // 2  # one linear map from sub-pixels to the face will do for the width of the edge
+            G = np.array(
+                [[x[i, j + 1] - x[i, j], x[i + 1, j] - x[i, j]], [y[i, j + 1] - y[i, j], y[i + 1, j] - y[i, j]]]
+            )
+            rho = np.hypot(x, y) + 1e-12
+            step = np.hypot(G[0, 0] * x + G[1, 0] * y, G[0, 1] * x + G[1, 1] * y) / rho
+            cover = cover + weight * np.clip(0.5 - (rho - DOT_RADIUS) / step, 0, 1)
+        soft[y0:y1, x0:x1] += gathered(cover, plan.blur) * (plan.ink - soft[y0:y1, x0:x1])
+    return camera.expose(soft, rng)
+
+
+def motion(plan):
+    """Spline of (x, y, z, psi, theta, phi) over time."""
+    changes = dict(EFFECTS[plan.effect])
+    laws = (newton_euler.precession_friction(K_M), *changes.pop("laws", ()))
+    body = newton_euler.Disc(RADIUS, HALF_THICKNESS, MASS, laws=laws, **changes)
+    theta = np.radians(plan.theta_deg)
+    omega2 = np.sqrt(4 * G * np.sin(theta) / RADIUS)
+    psi0 = 0.7 + 1.9 * plan.seed
+    state = newton_euler.state_from_angles(body, 0.032, 0.02, psi0, theta, -0.4, 0.0, omega2, plan.omega3)
+    lead = 0.005
+    times = np.arange(0.0, plan.n_frames / plan.frame_rate + 2 * lead, 1.0 / (SAMPLES * plan.frame_rate))
+    answer = newton_euler.follow(body, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
+    q = newton_euler.coordinates(body, answer.y)
+    speed = np.empty_like(q)
+    for i, s in enumerate(answer.y.T):
+        now = newton_euler.Instant(body, s)
+        speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
+    return CubicHermiteSpline(times - lead, q, speed)
+
+
+def pose_at(spline, time):
+    """(R, t) of the disc."""
+    q = spline(time)
+    return newton_euler.matrix_of(newton_euler.quaternion_from_angles(*q[3:])), q[:3]
+
+
+def write(folder, plan):
+    """A recording's folder, with truth.npz beside recording.toml. Returns the folder."""
+    folder, faults = Path(folder), plan.imperfections
+    rng = np.random.default_rng([plan.seed, 7])
+    target = np.array([0.032, 0.02, 0.004]) + rng.normal(0, 5e-4, 3)
+    cameras = [Camera(rng, plan, azimuth, target) for azimuth in (-122.0, -53.0)]
+    dots = DOTS + faults.misprint * rng.normal(size=DOTS.shape)
+    thickness = 3e-3
+    for name in ("left", "right", "calibration/left", "calibration/right"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+
+    def save(name, image):
+        cv2.imwrite(str(folder / name), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+    for view in range(plan.n_views):
+        R, t = np.eye(3), np.array([0, 0, thickness + faults.thickness])
+        if view:
+            tilt, turn = rng.uniform(0, np.radians(38)), rng.uniform(-1, 1) * np.radians(35)
+            axis = rng.uniform(0, 2 * np.pi)
+            tilted = cv2.Rodrigues(tilt * np.array([np.cos(axis), np.sin(axis), 0]))[0]
+            R = tilted @ cv2.Rodrigues(np.array([0, 0, turn]))[0]
+            middle = np.array([4, 2.5, 0]) * plan.square
+            place = target + np.array([*rng.uniform(-0.022, 0.022, 2), rng.uniform(5e-3, 40e-3)])
+            t = place - R @ middle
+        for name, camera in zip(("left", "right"), cameras, strict=True):
+            save(f"calibration/{name}/{view:04d}.png", board_image(camera, plan, R, t, rng))
+    spline = motion(plan)
+    times = np.arange(plan.n_frames) / plan.frame_rate
+    for i, time in enumerate(times):
+        poses = [(*pose_at(spline, time + 0.5 * faults.exposure * x), weight) for x, weight in GAUSS]
+        if not faults.exposure:
+            poses = [(*poses[1][:2], w) for w in (0.0, 1.0, 0.0)]
+        for name, camera in zip(("left", "right"), cameras, strict=True):
+            save(f"{name}/{i:06d}.png", disc_image(camera, plan, poses, dots, rng))
+    centres = ", ".join(f"[{x * 1e3:.4f}, {y * 1e3:.4f}]" for x, y in DOTS)
+    (folder / "recording.toml").write_text(
+        f"""name = "{folder.name}"
+
+[cameras]
+frame_rate_hz = {plan.frame_rate}
+left = "left/*.png"
+right = "right/*.png"
+
+[disc]
+radius_mm = {RADIUS * 1e3}
+thickness_mm = {HALF_THICKNESS * 2e3}
+mass_g = {MASS * 1e3}
+
+[markers]
+diameter_mm = {DOT_RADIUS * 2e3}
+centres_mm = [{centres}]
+
+[calibration]
+left = "calibration/left/*.png"
+right = "calibration/right/*.png"
+inner_corners = [9, 6]
+square_mm = {plan.square * 1e3}
+
+[table]
+view = 0
+board_thickness_mm = {thickness * 1e3}
+
+[gravity]
+g_m_s2 = {G}
+""",
+        encoding="utf-8",
+    )
+    truth = {"time": times, "q": spline(times), "dots": dots}
+    for name, camera in zip(("left", "right"), cameras, strict=True):
+        truth |= {f"{name}_R": camera.R, f"{name}_place": camera.place}
+        truth[f"{name}_intrinsics"] = np.array([camera.focal, *camera.middle, camera.k1, camera.k2])
+        grid = np.stack(np.meshgrid(np.arange(0, plan.size, 16.0), np.arange(0, plan.size, 16.0)), -1)
+        truth[f"{name}_field"] = camera.field(grid)
+    np.savez(folder / "truth.npz", effect=plan.effect, **truth)
+    return folder
+
+
+def main():
+    """Command line."""
+    names = [f.name for f in fields(Imperfections)]
+    parser = argparse.ArgumentParser(description="Render a recording of an imperfect laboratory.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--theta", type=float, default=12.0, help="nutation at the start [deg]")
+    parser.add_argument("--omega3", type=float, default=1.5)
+    parser.add_argument("--effect", choices=sorted(EFFECTS), default="none")
+    parser.add_argument("--ideal", action="store_true", help="no imperfection at all (but exposure)")
+    parser.add_argument("--only", nargs="*", choices=names, help="these imperfections alone")
+    parser.add_argument("--without", nargs="*", choices=names, default=(), help="all but these")
+    asked = parser.parse_args()
+    faults, full = Imperfections(), Imperfections()
+    if asked.ideal or asked.only is not None:
+        kept = {"exposure", *(asked.only or ())}
+        faults = replace(IDEAL, **{name: getattr(full, name) for name in kept})
+    faults = replace(faults, **dict.fromkeys(asked.without, 0.0))
+    plan = Plan(asked.seed, asked.frames, theta_deg=asked.theta, omega3=asked.omega3, effect=asked.effect)
+    write(asked.folder, replace(plan, imperfections=faults))
+
+
+if __name__ == "__main__":
+    main()
