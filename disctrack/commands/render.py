@@ -35,6 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from disctrack.render import run_render
+    from disctrack.scene.description import load_scene
+    from disctrack.scene.motion import effects_in_words
 
     folder = arguments.output or arguments.scene.with_suffix("")
     with tqdm(unit="image", file=sys.stderr, disable=arguments.quiet or None) as bar:
@@ -49,6 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
         f"{folder}: {len(truth.time)} frames at {truth.frame_rate:g} Hz ({', '.join(written)} images), "
         f"{len(truth.R_world_board)} views of the chessboard"
     )
+    scene = load_scene(arguments.scene)
+    if scene.motion.kind == "rolling":
+        print(f"effects: {effects_in_words(scene)}")
     print(f"truth, for comparison only: {arguments.truth or folder / 'truth.h5'}")
     return DONE
 

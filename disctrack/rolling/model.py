@@ -122,13 +122,22 @@ def effects_from_tables(
 ) -> tuple[Effect, ...]:
     """Effects of nested tables {effect: {parameter: value}}, as a scene or a saved model has them.
 
+    An effect named without any number has its nominal size. Once one is given, amounts that are not are null; shapes
+    of a law (an exponent) are nominal. Raises ModelError.
     formulas : {effect: {component: formula}} of effects that are not in the catalogue (effects.learned)
     """
     laws = {name: effect_from_formulas(name, law) for name, law in (formulas or {}).items()}
     for name in laws:
         if name not in tables:
             raise ModelError(f"the law by formula '{name}' has no numbers: give effects.{name}, or take it out")
-    return tuple((laws.get(name) or effect_class(name))(**values) for name, values in tables.items())
+    return tuple(_from_table(laws.get(name) or effect_class(name), values) for name, values in tables.items())
+
+
+def _from_table(effect: type[Effect], values: Mapping[str, float]) -> Effect:
+    amounts = [p.name for p in effect.parameters if not p.is_shape]
+    if values and set(values) <= {p.name for p in effect.parameters if p.is_shape}:
+        raise ModelError(f"effect '{effect.name}' has a shape but no amount: give {' or '.join(amounts)}")
+    return effect(**({p.name: p.null for p in effect.parameters if not p.is_shape} | dict(values) if values else {}))
 
 
 def effects_toml(effects: Sequence[Effect], section: str = "motion.rolling.effects") -> str:

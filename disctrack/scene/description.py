@@ -158,8 +158,10 @@ class RollingMotion:
     state: dict[str, float] = field(default_factory=dict)  # components of rolling.State [SI] that replace the above
     struck: dict[str, float] = field(default_factory=dict)  # in place of all that: upright and at rest, hit by a ball;
     # lateral_mm, vertical_mm from the middle of the upper face, impulse_N_s, friction of the table during the impact
-    effects: dict[str, dict[str, float]] = field(default_factory=lambda: {"km": {}, "kn": {}, "kz": {}})
-    # by their names in rolling.CATALOGUE; parameters not given take their nominal value, for these three the paper's
+    effects: dict[str, dict[str, float]] = field(
+        default_factory=lambda: {"km": {"k_m": 0.381e-7}, "kn": {"k_n": 0.381e-7}, "kz": {"k_z": 1e-5}}
+    )
+    # by their names in rolling.CATALOGUE; who names one names all, and numbers not given are zero (effects_from_tables)
     formulas: dict[str, dict[str, str]] = field(default_factory=dict)  # laws of further effects: component -> formula
 
 

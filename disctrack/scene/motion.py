@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.errors import SceneError
-from disctrack.scene.description import Scene
+from disctrack.scene.description import RollingMotion, Scene
 
 if TYPE_CHECKING:
     from disctrack.rolling import Model, Motion, State
@@ -101,6 +101,14 @@ def rolling_model(scene: Scene) -> Model:
 
     settings = scene.motion.rolling
     return Model(scene.declared_disc, scene.gravity_m_s2, effects_from_tables(settings.effects, settings.formulas))
+
+
+def effects_in_words(scene: Scene) -> str:
+    """The effects of a rolling scene with their sizes, and which of the usual ones it leaves out."""
+    model = rolling_model(scene)
+    named = ", ".join(f"{k} = {v:g} {model.parameters[k].unit}" for k, v in model.values.items()) or "none"
+    without = ", ".join(name for name in RollingMotion().effects if model.effect(name) is None)
+    return f"{named}; without {without}, which only a scene that names no effect has" if without else named
 
 
 def rolling_start(scene: Scene) -> State:

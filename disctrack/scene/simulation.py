@@ -51,7 +51,7 @@ def run_simulate(
     where the motion does. Raises SceneError, ModelError, OutputError.
     """
     from disctrack.scene.description import load_scene
-    from disctrack.scene.motion import rolling_model, rolling_start
+    from disctrack.scene.motion import effects_in_words, rolling_model, rolling_start
 
     scene = load_scene(scene_path)
     if scene.motion.kind != "rolling":
@@ -73,7 +73,7 @@ def run_simulate(
         "settings": json.dumps(settings, sort_keys=True),
     }
     write_motion(output, motion, attributes)
-    return SimulationRun(output, motion, f"{output}\n{summary(motion)}")
+    return SimulationRun(output, motion, f"{output}\n{summary(motion)}\neffects: {effects_in_words(scene)}")
 
 
 def summary(motion: Motion) -> str:
@@ -90,8 +90,7 @@ def summary(motion: Motion) -> str:
     lines += [f"{s.time:.5g} s: {s.before.name.lower()} -> {s.after.name.lower()}" for s in motion.switches[:6]]
     if len(motion.switches) > 6:
         lines.append(f"... {len(motion.switches) - 6} more changes between rolling, slip and flight")
-    effects = ", ".join(f"{k} = {v:g} {motion.model.parameters[k].unit}" for k, v in motion.model.values.items())
-    return "\n".join([*lines, f"effects: {effects or 'none'}"])
+    return "\n".join(lines)
 
 
 def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None = None) -> None:

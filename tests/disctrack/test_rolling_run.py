@@ -110,6 +110,25 @@ def test_an_effect_by_formula_is_simulated_and_saved(scene, tmp_path):
         run_simulate(scene, tmp_path / "no_numbers.h5")
 
 
+def test_a_number_that_a_scene_does_not_give_is_zero_and_what_it_leaves_out_is_said(scene, tmp_path):
+    scene.write_text(
+        SCENE.partition("[motion.rolling.effects")[0] + "[motion.rolling.effects.table_tilt]\ntilt_x = 0.0035\n"
+    )
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert run.motion.model.values == {"table_tilt.tilt_x": 0.0035, "table_tilt.tilt_y": 0.0}
+    assert "without km, kn, kz, which only a scene that names no effect has" in run.summary
+    assert effects_from_tables({"km": {}}) == (CATALOGUE["km"](),)
+    with pytest.raises(ModelError, match="rolling_power' has a shape but no amount: give k"):
+        effects_from_tables({"rolling_power": {"p": 1.5}})
+
+
+def test_a_scene_without_effects_has_those_of_the_paper_at_their_nominal_sizes(scene, tmp_path):
+    scene.write_text(SCENE.partition("[motion.rolling.effects")[0])
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert run.motion.model.effects == tuple(CATALOGUE[name]() for name in ("km", "kn", "kz"))
+    assert "; without" not in run.summary
+
+
 def test_effects_survive_their_toml():
     effects = tuple(effect() for effect in CATALOGUE.values())
     tables = tomllib.loads(effects_toml(effects))["motion"]["rolling"]["effects"]
