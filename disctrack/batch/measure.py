@@ -151,7 +151,7 @@ def _after_tracking(
 ) -> Record:
     """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
     files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
-    missing = _unreadable(findings)
+    missing = _shortcomings(findings)
     try:
         analysis, report = _analyse(path, trajectory, job)
         numbers |= analysed_numbers(analysis)
@@ -169,9 +169,10 @@ def _after_tracking(
     return Record(MEASURED, "; ".join(missing), provenance.fingerprint, asked, files, numbers)
 
 
-def _unreadable(findings: dict[str, Any]) -> list[str]:
+def _shortcomings(findings: dict[str, Any]) -> list[str]:
     reasons = findings.get("unreadable", [])
-    return [f"{len(reasons)} images could not be read, the first: {reasons[0]}"] if reasons else []
+    unreadable = [f"{len(reasons)} images could not be read, the first: {reasons[0]}"] if reasons else []
+    return [*unreadable, *findings.get("doubts", [])]
 
 
 def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Path | None]:

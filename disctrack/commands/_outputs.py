@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,10 +96,10 @@ def _positive(text: str) -> int:
 
 def track_into(
     path: Path, recording: Recording, rig: StereoRig, rig_name: str, pairs: ImagePairs, options: TrackOptions
-) -> tuple[list[str], list[Path], bool]:
+) -> tuple[list[str], list[Path], list[str]]:
     """Track, or reuse what is there; write trajectory, table, pictures, video.
 
-    returns : lines of the summary, files, and whether every image could be read
+    returns : lines of the summary, files, and what of the input could not be used, or had to be assumed
     Raises OutputError if `path` holds something else and may not be replaced.
     """
     check_rig(rig, pairs, rig_name)
@@ -123,7 +125,25 @@ def track_into(
         fresh = False
     lines += summary.trajectory_lines(trajectory, findings)
     files = [path, *_companions(path, trajectory, pairs, options, fresh)]
-    return lines, files, not findings.get("unreadable")
+    return lines, files, shortcomings(findings)
+
+
+def shortcomings(findings: Mapping[str, Any]) -> list[str]:
+    """What makes a result incomplete (exit code 3): images that could not be read, what had to be assumed."""
+    unreadable, doubts = len(findings.get("unreadable", [])), len(findings.get("doubts", []))
+    return [
+        *([f"{unreadable} image(s) could not be read; their frames have no answer"] if unreadable else []),
+        *([f"{doubts} warning(s) put the result in doubt"] if doubts else []),
+    ]
+
+
+def tell_shortcomings(found: Sequence[str]) -> int:
+    """Say on stderr what makes the result incomplete; returns the exit code."""
+    from disctrack.cli import DONE, INCOMPLETE
+
+    if found:
+        print(f"disctrack: {'; '.join(found)} (see above).", file=sys.stderr)
+    return INCOMPLETE if found else DONE
 
 
 def _companions(

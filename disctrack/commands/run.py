@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 
@@ -19,7 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate unless the recording names a rig, track, draw; returns the exit code."""
-    from disctrack.cli import DONE, INCOMPLETE
     from disctrack.commands import _calibration as calibration
     from disctrack.commands import _outputs as outputs
     from disctrack.files.whole import write_whole
@@ -39,13 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
         rig_name = "the rig from this recording's own calibration views"
         source = calibration.source_of(recording, calibration.settings_of(arguments))
         calibrated = calibration.calibrate_into(folder / "rig.h5", source, options.overwrite, options.figures)
-    lines, files, whole = outputs.track_into(
+    lines, files, shortcomings = outputs.track_into(
         folder / "trajectory.h5", recording, calibrated.rig, rig_name, pairs, options
     )
     text = [*calibrated.lines, *lines]
     write_whole(folder / "summary.txt", ("\n".join(text) + "\n").encode())
     files = [*calibrated.files, *files, folder / "summary.txt"]
     print("\n".join([*text, *summary.file_lines([outputs.relative(file) for file in files])]))
-    if not whole:
-        print("disctrack: some images could not be read; their frames have no answer (see above).", file=sys.stderr)
-    return DONE if whole else INCOMPLETE
+    return outputs.tell_shortcomings(shortcomings)

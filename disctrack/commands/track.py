@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 
@@ -20,7 +19,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Track; returns the exit code."""
     from calibration.rig_file import read_rig
-    from disctrack.cli import DONE, INCOMPLETE
     from disctrack.commands import _outputs as outputs
     from disctrack.errors import RecordingError
     from disctrack.recording.declaration import read_recording
@@ -39,8 +37,6 @@ def run(arguments: argparse.Namespace) -> int:
     options = outputs.track_options(arguments)
     pairs = pipeline.open_pairs(recording, options.frames)
     outputs.check_writable(path.parent)
-    lines, files, whole = outputs.track_into(path, recording, rig, str(rig_file), pairs, options)
+    lines, files, shortcomings = outputs.track_into(path, recording, rig, str(rig_file), pairs, options)
     print("\n".join([*lines, *summary.file_lines([outputs.relative(file) for file in files])]))
-    if not whole:
-        print("disctrack: some images could not be read; their frames have no answer (see above).", file=sys.stderr)
-    return DONE if whole else INCOMPLETE
+    return outputs.tell_shortcomings(shortcomings)

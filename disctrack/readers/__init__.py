@@ -9,6 +9,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from disctrack.errors import RecordingError
+
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
@@ -25,6 +27,7 @@ FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
     (CINE_SUFFIXES, "cine", "open_cine"),
     (HDF5_SUFFIXES, "hdf5", "open_hdf5"),
 )
+NUMBER = "{number}"  # in a pattern: these digits count the frames
 SUFFIXES = frozenset[str]().union(*(suffixes for suffixes, _, _ in FORMATS))
 
 
@@ -61,7 +64,8 @@ class FrameReader(Protocol):
 def open_frames(pattern: str, folder: Path, camera: str) -> FrameReader:
     """Reader of one camera's frames: a file pattern, relative to `folder`.
 
-    pattern : "left/*.png", "left.mkv", "stack.tif", or "frames.h5:/left" for a data set in an HDF5 file
+    pattern : "left/*.png", "left.mkv", "stack.tif", or "frames.h5:/left" for a data set in an HDF5 file;
+        "left/*_{number}_a.png" where the names alone do not tell which digits count the frames
     camera  : "left" or "right", for messages
     Raises RecordingError if nothing matches, or if no frame can be read.
     """
@@ -71,13 +75,20 @@ def open_frames(pattern: str, folder: Path, camera: str) -> FrameReader:
     files = match_files(pattern, folder, camera)
     suffix = files[0].suffix.lower()
     module, function = next((module, function) for suffixes, module, function in FORMATS if suffix in suffixes)
+    if NUMBER in member and suffix not in IMAGE_SUFFIXES:
+        raise RecordingError(f"{files[0]}: {NUMBER} in a pattern numbers images of a file each; leave it out here.")
     opener = getattr(import_module(f"disctrack.readers.{module}"), function)
     reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
     return reader
 
 
 def split_member(pattern: str) -> tuple[str, str]:
-    """Pattern of a file and the path inside it: "frames.h5:/left" is ("frames.h5", "/left"); "" for other patterns."""
+    """Pattern of the files and what else a pattern says, "" for most.
+
+    "frames.h5:/left" is ("frames.h5", "/left"), "a/{number}.png" is ("a/*.png", "a/{number}.png").
+    """
+    if NUMBER in pattern:
+        return pattern.replace(NUMBER, "*"), pattern
     file, colon, member = pattern.rpartition(":")
     if colon and Path(file).suffix.lower() in HDF5_SUFFIXES:
         return file, member

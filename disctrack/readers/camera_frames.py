@@ -71,6 +71,7 @@ class CameraFrames(RawFrames):
         header: CameraHeader,
         notes: tuple[str, ...] = (),
         timestamps: NDArray[np.float64] | None = None,
+        doubts: tuple[str, ...] = (),
     ) -> None:
         """Frames whose pixels begin at offsets (n,), below 0 where the file holds none; beyond its end they are lost.
 
@@ -91,6 +92,7 @@ class CameraFrames(RawFrames):
             frame_rate=header.frame_rate,
         )
         self.layout, self.header = layout, header
+        self.doubts = tuple(f"{camera} camera: {doubt}" for doubt in doubts)
         self.frame_bytes = layout.frame_bytes
         self._scratch = threading.local()
 

@@ -1,12 +1,10 @@
-"""Which files a pattern means, in which order, and which numbers are missing among them."""
+"""Which files a pattern means, and in which order."""
 
 from __future__ import annotations
 
 import glob
-import itertools
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from disctrack.errors import RecordingError
@@ -48,32 +46,3 @@ def file_number(file: Path) -> int | None:
     """The last run of digits in a file's name, which is the frame's number as the camera counted; None without one."""
     runs = re.findall(r"[0-9]+", file.stem)
     return int(runs[-1]) if runs else None
-
-
-# A camera drops or a disk loses a few files; where more are missing, the numbers are no frame count (time stamps, say).
-MOST_MISSING = 0.1
-
-
-def with_gaps(files: Sequence[Path]) -> tuple[list[Path | None], str | None]:
-    """Files with None in place of each missing number, and a note for the user where numbers are not consecutive.
-
-    Time is the frame's place in the sequence: closing a gap would shift all that follows.
-    """
-    numbers = [file_number(file) for file in files]
-    counted = [number for number in numbers if number is not None]
-    if len(counted) < len(files) or len(files) < 2:
-        return list(files), None
-    steps = {b - a for a, b in itertools.pairwise(counted)}
-    if steps == {1}:
-        return list(files), None
-    if len(steps) == 1 and min(steps) > 1:
-        return list(files), (
-            f"the file numbers go in steps of {min(steps)}; frames are taken as consecutive at the given frame rate"
-        )
-    missing = counted[-1] - counted[0] + 1 - len(counted)
-    if min(steps) < 1 or missing > MOST_MISSING * len(counted):
-        return list(files), "the file numbers are not consecutive; frames are taken as consecutive"
-    slots: list[Path | None] = [None] * (counted[-1] - counted[0] + 1)
-    for number, file in zip(counted, files, strict=True):
-        slots[number - counted[0]] = file
-    return slots, f"{missing} file(s) missing in the sequence; these frames are left without an answer"

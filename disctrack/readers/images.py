@@ -16,7 +16,7 @@ from calibration.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
 from disctrack.readers import Frame, FrameReader
 from disctrack.readers._png import PngHeader, decode_plain_grey
-from disctrack.readers.files import with_gaps
+from disctrack.readers.file_numbers import NumberedFiles, check_continuation, number_files
 from disctrack.readers.raw import MOST_PIXELS
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -25,22 +25,26 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
 
 
-def open_images(files: Sequence[Path], camera: str) -> FrameReader:
-    """One file per frame, or TIFF files of many pages each. Raises RecordingError if no frame can be read."""
+def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameReader:
+    """One file per frame, or TIFF files of many pages each. Raises RecordingError if no frame can be read.
+
+    pattern : tells by {number} which digits of the names count the frames; "" where the names alone must
+    """
     if files[0].suffix.lower() in (".tif", ".tiff"):
         from disctrack.readers.tiff import is_stack, open_stack
 
         if is_stack(files[0]) or is_stack(files[-1]):
+            check_continuation(files, camera)
             return open_stack(files, camera)
-    return open_image_sequence(files, camera)
+    return open_image_sequence(number_files(files, camera, pattern), camera)
 
 
-def open_image_sequence(files: Sequence[Path], camera: str) -> ImageSequence:
-    """Sequence of the files given in order; a missing number among them is a frame that cannot be read.
+def open_image_sequence(numbered: NumberedFiles, camera: str) -> ImageSequence:
+    """Sequence of numbered files; a missing number among them is a frame that cannot be read.
 
     Size and depth are those of the first frame that can be read. Raises RecordingError if there is none.
     """
-    slots, gap_note = with_gaps(files)
+    files = [file for file in numbered.slots if file is not None]
     first, stored, problem = None, None, ""
     for file in files:
         try:
@@ -51,9 +55,9 @@ def open_image_sequence(files: Sequence[Path], camera: str) -> ImageSequence:
             problem = problem or str(error)
     if first is None or stored is None:
         raise RecordingError(f"none of the {len(files)} {camera} images can be read; the first: {problem}")
-    notes = [f"{camera} camera: {note}" for note in (gap_note, *_depth_notes(stored, first)) if note]
+    notes = [f"{camera} camera: {note}" for note in (*numbered.notes, *_depth_notes(stored, first))]
     size = first.shape[1], first.shape[0]
-    return ImageSequence(slots, camera, size, first.dtype, tuple(notes))
+    return ImageSequence(numbered, camera, size, first.dtype, tuple(notes))
 
 
 def _depth_notes(stored: NDArray, grey: Frame) -> list[str]:
@@ -76,13 +80,15 @@ class ImageSequence:
 
     def __init__(
         self,
-        files: Sequence[Path | None],
+        numbered: NumberedFiles,
         camera: str,
         image_size: tuple[int, int],
         dtype: np.dtype,
         notes: tuple[str, ...] = (),
     ) -> None:
-        self.files = list(files)
+        self.numbered = numbered
+        self.files = list(numbered.slots)
+        self.doubts = tuple(f"{camera} camera: {doubt}" for doubt in numbered.doubts)
         self.camera = camera
         self.image_size = image_size
         self.dtype = dtype

@@ -63,11 +63,11 @@ def open_mraw(files: Sequence[Path], camera: str) -> CameraFrames:
     n = entries.whole("Total Frame")
     check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
     layout, saturation, notes = _as_stored(file, layout, saturation)
-    header, doubts = _header(entries, saturation)
+    header, remarks, doubts = _header(entries, saturation)
     if file.size >= (n + 1) * layout.frame_bytes:
         notes.append(f"{data_file.name} is longer than the {n} frames of its header; what follows them is not read")
     offsets = np.arange(n, dtype=np.int64) * layout.frame_bytes
-    return CameraFrames(file, camera, layout, offsets, header, (header.sentence(), *doubts, *notes))
+    return CameraFrames(file, camera, layout, offsets, header, (header.sentence(), *remarks, *notes), doubts=doubts)
 
 
 def _as_stored(file: RawFile, layout: PixelLayout, saturation: int) -> tuple[PixelLayout, int, list[str]]:
@@ -226,17 +226,18 @@ def _refuse_colour(entries: _Entries) -> None:
         )
 
 
-def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]]:
-    """Settings of the recording, and what about them cannot be."""
+def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
+    """Settings of the recording, what about them cannot be, and what had to be assumed of the frames' times."""
     rate = entries.number("Record Rate(fps)")
     if rate is None:
         shown = entries.text("Record Rate(fps)")[:40]
         raise RecordingError(f"{entries.file}: 'Record Rate(fps)' is {shown!r}; expected a number above 0. {_EXPORT}")
     step, doubts = _saved_step(entries)
+    remarks: list[str] = []
     nanoseconds = entries.number("Shutter Type2(nsec)")
     exposure = 1e-9 * nanoseconds if nanoseconds else entries.number("Shutter Speed(s)")
     if exposure is not None and exposure * rate > 1.001:
-        doubts.append(f"the header's exposure of {exposure:g} s is longer than a frame of {1 / rate:g} s; not used")
+        remarks.append(f"the header's exposure of {exposure:g} s is longer than a frame of {1 / rate:g} s; not used")
         exposure = None
     first = entries.text("Start Frame")
     name = entries.text("User Defined Camera Name")
@@ -254,7 +255,7 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
         recorded=_date(entries.text("Date"), entries.text("Time")),
         saturation=saturation,
     )
-    return header, doubts
+    return header, remarks, tuple(doubts)
 
 
 def _saved_step(entries: _Entries) -> tuple[int, list[str]]:

@@ -26,12 +26,16 @@ def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
     return None if times is None or _fault(times, frame_rate) else times
 
 
-def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) -> tuple[str, ...]:
-    """Warnings: stamps that are not used and why, frames lost by each camera, and cameras that do not run together.
+def check_time_stamps(
+    left: FrameReader, right: FrameReader, frame_rate: float
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Doubts: stamps that are not used and why, frames of one camera that the other has not; and warnings: frames lost
+    by each camera, and cameras that do not run together.
 
     frame_rate [Hz] as declared. Times count from frame 0 where the file has a camera's header, which tells how they lie
     to the other camera's.
     """
+    doubts: list[str] = []
     warnings: list[str] = []
     usable: list[Array] = []
     for camera, reader in zip(CAMERAS, (left, right), strict=True):
@@ -39,15 +43,18 @@ def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) 
             continue
         fault = _fault(reader.timestamps, frame_rate)
         if fault:
-            warnings.append(f"{camera} camera: time stamps are not used, frames are taken as evenly spaced: {fault}")
+            doubts.append(f"{camera} camera: time stamps are not used, frames are taken as evenly spaced: {fault}")
         else:
             usable.append(reader.timestamps)
             warnings += _lost_frames(camera, reader.timestamps, frame_rate)
     ours, theirs = header_of(left), header_of(right)
     offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
     if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
-        warnings += _between_cameras(usable[0], usable[1] + (0.0 if offset is None else offset[0]), 1.0 / frame_rate)
-    return tuple(warnings)
+        theirs_shifted = usable[1] + (0.0 if offset is None else offset[0])
+        slips = _slips(usable[0], theirs_shifted, 1.0 / frame_rate)
+        doubts += slips
+        warnings += [] if slips else _between_cameras(usable[0], theirs_shifted, 1.0 / frame_rate)
+    return tuple(doubts), tuple(warnings)
 
 
 def _fault(times: Array, frame_rate: float) -> str:
@@ -74,8 +81,8 @@ def _lost_frames(camera: str, times: Array, frame_rate: float) -> list[str]:
     return [f"{camera} camera: by its time stamps {lost} frame(s) are missing, after frame {_listed(gaps)}"]
 
 
-def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
-    """How the right camera's times differ from the left one's: where frames slip, a constant, a drift, the rest."""
+def _slips(left: Array, right: Array, period: float) -> list[str]:
+    """From where on frame i of both cameras is not the same instant, if anywhere."""
     later = right - left
     # against the first frames: what the clocks' zeros differ by is constant, lost frames come on top
     slips = np.rint((later - later[0]) / period).astype(int)
@@ -86,6 +93,12 @@ def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
             f"one camera lost frames that the other has (the offset changes at frame {_listed(changes)}). Poses from "
             "there on are wrong: take that frame from the other camera, too, or measure up to it with --frames"
         ]
+    return []
+
+
+def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
+    """How the right camera's times differ from the left one's: a constant, a drift, the rest."""
+    later = right - left
     warnings = []
     index = np.arange(len(later)) - 0.5 * (len(later) - 1)
     offset = float(np.median(later))

@@ -63,7 +63,8 @@ class VideoFile:
         self.bit_depth = self._bit_depth
         if codec_name not in _LOSSLESS:
             notes.append(f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss")
-        self.notes = tuple(f"{camera} camera: {note}" for note in (*notes, *_gap_notes(self._index.times)))
+        self.notes = tuple(f"{camera} camera: {note}" for note in notes)
+        self.doubts = tuple(f"{camera} camera: {doubt}" for doubt in _gap_doubts(self._index.times))
 
     def __len__(self) -> int:
         return len(self._index.times)
@@ -265,8 +266,8 @@ def _opened(file: Path, camera: str) -> Any:
         raise RecordingError(f"{file}: not a readable video for the {camera} camera ({error}).") from error
 
 
-def _gap_notes(times: NDArray[np.int64]) -> list[str]:
-    """A note where the container's clock skips: the recorder lost frames there."""
+def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
+    """A doubt where the container's clock skips: the recorder lost frames there."""
     steps = np.diff(times)
     if len(steps) < 3:
         return []

@@ -20,6 +20,7 @@ from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
+from disctrack.readers.file_numbers import check_same_numbers
 from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording.declaration import Recording
 from disctrack.track.motion_span import MotionSpan, find_motion
@@ -41,6 +42,7 @@ class ImagePairs:
     start: int
     stop: int
     warnings: tuple[str, ...] = ()  # where the cameras' headers leave doubt that the frames are simultaneous
+    doubts: tuple[str, ...] = ()  # what had to be assumed of the frames' instants: the result may be wrong by that
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -85,13 +87,18 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     )
     warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
     check_pair(left, right)
-    warnings += check_time_stamps(left, right, recording.frame_rate)
+    stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)
+    doubts = (
+        *(doubt for reader in (left, right) for doubt in getattr(reader, "doubts", ())),
+        *check_same_numbers(left, right),
+        *stamp_doubts,
+    )
     start, stop, _ = slice(*frames).indices(len(left))
     if stop <= start:
         raise RecordingError(
             f"{recording.folder}: --frames {frames[0]}:{frames[1]} holds no frame; the recording has {len(left)}."
         )
-    return ImagePairs(left, right, start, stop, warnings)
+    return ImagePairs(left, right, start, stop, (*warnings, *stamp_warnings), doubts)
 
 
 def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
@@ -153,7 +160,8 @@ def measure(
     seconds = time.perf_counter() - began
     findings = {
         "notes": list(pairs.notes),
-        "warnings": [*pairs.warnings, *tracking.warnings],
+        "warnings": [*pairs.warnings, *pairs.doubts, *tracking.warnings],
+        "doubts": [*pairs.doubts],
         "unreadable": [image.reason for image in unreadable],
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],

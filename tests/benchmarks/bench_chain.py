@@ -22,6 +22,7 @@ from bench_tracking import Timing, plain_script
 
 from calibration.rig_file import read_rig
 from disctrack.readers.blocks import default_threads
+from disctrack.readers.file_numbers import NumberedFiles
 from disctrack.readers.images import ImageSequence
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.stage import ImagePairs, measure, open_pairs
@@ -81,7 +82,7 @@ def report(recording: Recording, rig, folder: Path, arguments: argparse.Namespac
 
     def compressed() -> ImagePairs:  # anew, so that nothing is known of the files yet
         sequences = [
-            ImageSequence([Path(f) for f in names], camera, reader.image_size, reader.dtype)
+            ImageSequence(NumberedFiles(tuple(map(Path, names)), 0, 1), camera, reader.image_size, reader.dtype)
             for names, camera, reader in zip(files, ("left", "right"), (short.left, short.right), strict=True)
         ]
         return dataclasses.replace(short, left=sequences[0], right=sequences[1], start=0, stop=n)

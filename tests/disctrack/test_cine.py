@@ -263,7 +263,8 @@ def pair(folder: Path, rng, left=None, right=None):
 @pytest.mark.parametrize("declared", [2000.0, 2001.0])  # nominal, and as its clock may run
 def test_cameras_that_agree_say_nothing(tmp_path, rng, declared):
     readers = pair(tmp_path, rng)
-    assert check_headers(*readers, declared, "recording.toml") + check_time_stamps(*readers, declared) == ()
+    assert check_headers(*readers, declared, "recording.toml") == ()
+    assert check_time_stamps(*readers, declared) == ((), ())
 
 
 LATER = np.arange(-3, 4) / 2000
@@ -296,7 +297,7 @@ def test_frames_of_different_instants_are_an_error(tmp_path, rng, left, right, r
 )
 def test_frames_that_may_not_be_simultaneous_are_a_warning(tmp_path, rng, right, reason):
     readers = pair(tmp_path, rng, {}, right)
-    warnings = check_headers(*readers, 2000.0, "recording.toml") + check_time_stamps(*readers, 2000.0)
+    warnings = check_headers(*readers, 2000.0, "recording.toml") + sum(check_time_stamps(*readers, 2000.0), ())
     assert any(re.search(reason, warning) for warning in warnings)
 
 

@@ -135,7 +135,7 @@ def test_an_impossible_exposure_or_step_is_not_used_and_said(tmp_path, rng):
     assert header_of(reader).exposure is None
     assert header_of(reader).frame_rate == 2000
     assert any("longer than a frame" in note for note in reader.notes)
-    assert any("taken as consecutive" in note for note in reader.notes)
+    assert any("taken as consecutive" in doubt for doubt in reader.doubts)
 
 
 def test_header_and_frames_must_lie_together(tmp_path, rng):

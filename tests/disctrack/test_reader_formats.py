@@ -279,8 +279,8 @@ def test_frames_that_a_recorder_dropped_are_named(tmp_path):
             picture.pts = time
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
-    (note,) = open_frames("left.mkv", tmp_path, "left").notes
-    assert "after frame 11: 2 frame(s)" in note
+    (doubt,) = open_frames("left.mkv", tmp_path, "left").doubts
+    assert "after frame 11: 2 frame(s)" in doubt
 
 
 @pytest.mark.parametrize("place", [0.02, 0.3, 0.5, 0.9])

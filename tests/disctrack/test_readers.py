@@ -15,6 +15,7 @@ from numpy.testing import assert_array_equal
 from disctrack.errors import RecordingError
 from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.file_numbers import check_same_numbers
 from disctrack.readers.files import match_files
 from disctrack.readers.images import as_grey, decode
 
@@ -124,11 +125,82 @@ def test_a_missing_number_keeps_its_place_in_time(tmp_path, frames):
     assert any("missing" in note for note in reader.notes)
 
 
-def test_numbers_in_steps_are_consecutive_frames(tmp_path, frames):
-    write_sequence(tmp_path / "left", frames[:, 0], names=[f"{10 * i:05d}" for i in range(11)])
+@pytest.mark.parametrize("gone", [range(2, 9), [1, 2, 3, 5, 8], [9]])
+def test_a_gap_in_the_numbers_is_as_many_lost_frames_whatever_its_size(tmp_path, frames, gone):
+    files = write_sequence(tmp_path / "left", frames[:, 0])
+    for i in gone:
+        files[i].unlink()
     reader = open_frames("left/*.png", tmp_path, "left")
     assert len(reader) == 11
-    assert any("steps of 10" in note for note in reader.notes)
+    assert_array_equal(reader.read(10), frames[10, 0])
+    assert any(f"{len(gone)} file(s) missing" in note for note in reader.notes)
+
+
+def test_numbers_in_steps_are_consecutive_frames_and_in_doubt(tmp_path, frames):
+    files = write_sequence(tmp_path / "left", frames[:, 0], names=[f"{10 * i:05d}" for i in range(11)])
+    files[4].unlink()
+    reader = open_frames("left/*.png", tmp_path, "left")
+    assert len(reader) == 11
+    assert_array_equal(reader.read(5), frames[5, 0])
+    assert any("steps of 10" in doubt for doubt in reader.doubts)
+
+
+@pytest.mark.parametrize("stray", ["Copy of 000005", "000005 (1)", "000005_1", "background", "frame_000011"])
+def test_a_file_that_is_not_named_like_the_others_is_named_not_measured(tmp_path, frames, stray):
+    write_sequence(tmp_path / "left", frames[:, 0])
+    write_sequence(tmp_path / "left", frames[:1, 0], names=[stray])
+    with pytest.raises(RecordingError) as caught:
+        open_frames("left/*.png", tmp_path, "left")
+    assert f"{stray}.png: not named like the other 11 left frames" in str(caught.value)
+    pattern = str(caught.value).split('as "')[1].split('"')[0]  # the pattern that is proposed works
+    assert len(open_frames(pattern, tmp_path, "left")) == 11
+
+
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (["7", "07", "8"], "two left frames of number 7"),
+        (["a", "b", "c"], "hold no number"),
+        ([f"cam_{t}" for t in (1000013, 1001021, 1001998, 1003004, 1004017)], "no common step.*time stamps"),
+        ([f"2026-11-22_10-15-59.{t}" for t in (310, 411, 509, 613)], "no common step"),
+        ([f"take{take}_{i}" for take in (1, 2) for i in range(3)], "two left frames of number 0"),
+        (["0", "1", "20261122"], "no common step"),
+    ],
+)
+def test_names_that_are_no_clock_stop_the_run(tmp_path, frames, names, reason):
+    write_sequence(tmp_path / "left", frames[: len(names), 0], names=names)
+    with pytest.raises(RecordingError, match=reason):
+        open_frames("left/*.png", tmp_path, "left")
+
+
+def test_a_counter_beside_a_time_stamp_is_found_or_told_by_the_pattern(tmp_path, frames):
+    stamps = np.cumsum([7, 998, 1003, 1000, 2001, 997])
+    names = [f"cam2_{stamp}_{i}" for stamp, i in zip(stamps, (0, 1, 2, 3, 5, 6), strict=True)]
+    write_sequence(tmp_path / "left", frames[:6, 0], names=names)
+    assert len(open_frames("left/*.png", tmp_path, "left")) == 7
+    assert len(open_frames("left/cam2_*_{number}.png", tmp_path, "left")) == 7
+    with pytest.raises(RecordingError, match="two left frames of number 2"):
+        open_frames("left/cam{number}_*.png", tmp_path, "left")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "verdict"),
+    [
+        (range(11), None),
+        (range(100, 111), "taken as pairs"),
+        (range(1, 12), "equal numbers"),
+        (range(0, 22, 2), "equal"),
+    ],
+)
+def test_equal_numbers_are_the_same_instant(tmp_path, frames, theirs, verdict):
+    write_sequence(tmp_path / "left", frames[:, 0])
+    write_sequence(tmp_path / "right", frames[:, 1], names=[f"{i:06d}" for i in theirs])
+    left, right = (open_frames(f"{camera}/*.png", tmp_path, camera) for camera in ("left", "right"))
+    if verdict is not None and verdict.startswith("equal"):
+        with pytest.raises(RecordingError, match=verdict):
+            check_same_numbers(left, right)
+    else:
+        assert [verdict in doubt for doubt in check_same_numbers(left, right)] == ([True] if verdict else [])
 
 
 @pytest.mark.parametrize("block", [1, 3, 4, 11, 50])

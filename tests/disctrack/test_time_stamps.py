@@ -12,7 +12,8 @@ EVEN = 17.25 + np.arange(N) / RATE
 
 
 def warnings_of(left, right=EVEN) -> tuple[str, ...]:
-    return check_time_stamps(SimpleNamespace(timestamps=left), SimpleNamespace(timestamps=right), RATE)
+    doubts, warnings = check_time_stamps(SimpleNamespace(timestamps=left), SimpleNamespace(timestamps=right), RATE)
+    return (*warnings, *doubts)
 
 
 def without(times: np.ndarray, *lost: int) -> np.ndarray:
