@@ -21,6 +21,9 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 # In the order of the measurement: name -> (module, what it does).
 COMMANDS: dict[str, tuple[str, str]] = {
+    "init": ("disctrack.commands.init", "folder of frames -> a commented recording.toml"),
+    "print": ("disctrack.commands.print", "declared dots and board -> PDF to print, true to scale"),
+    "check": ("disctrack.commands.check", "what would a run trip over? seconds"),
     "run": ("disctrack.commands.run", "calibrate and track a recording: folder in, trajectory and pictures out"),
     "calibrate": ("disctrack.commands.calibrate", "views of a chessboard -> stereo rig with covariance"),
     "track": ("disctrack.commands.track", "recording and rig -> trajectory with covariance"),

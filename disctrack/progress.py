@@ -1,8 +1,14 @@
-"""Progress bars on stderr, silent where stderr is not a terminal."""
+"""Signs of life on stderr: a bar where there is work to count, a line with its time when a stage ends.
+
+On a terminal a bar or the name of the stage stands there while it lasts and vanishes at its end. Where stderr is no
+terminal (a log, a pipe) there are no bars, and the lines are the same.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import sys
+import time
 from collections.abc import Callable, Iterator
 
 from tqdm import tqdm
@@ -10,6 +16,33 @@ from tqdm import tqdm
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Function that is told how many more are done; the bar vanishes at the end."""
+    """Function that is told how many more are done; the bar vanishes at the end, and never goes beyond its end."""
     with tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
-        yield lambda n: bar.update(n) and None
+        yield lambda n: bar.update(max(0, min(n, total - bar.n))) and None
+
+
+@contextlib.contextmanager
+def stage(what: str) -> Iterator[None]:
+    """Name the stage while it lasts (terminals only), and write a line with its time when it has ended well."""
+    began = time.perf_counter()
+    _show(f"{what} ...")
+    try:
+        yield
+    except BaseException:
+        _show("")
+        raise
+    _show("")
+    print(f"{time.perf_counter() - began:7.1f} s  {what}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def steps(what: str) -> Iterator[Callable[[str], None]]:
+    """Function that is told which step begins; terminals show it, and the line at the end gives the time of all."""
+    with stage(what):
+        yield lambda step: _show(f"{what}: {step} ...")
+
+
+def _show(text: str) -> None:
+    """One line that the next one replaces; nothing where stderr is no terminal."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,399 @@
+"""What a run would trip over, found on a few views and a few frames in seconds.
+
+Each step looks at one thing and adds remarks: `fix` would stop a run or spoil its result, `look` deserves a look,
+`fine` tells what was seen. A step that cannot be made because an earlier one failed is left out and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
+from calibration.grey_levels import saturation_level
+from calibration.rig_file import read_rig
+from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
+from disctrack.errors import DiscTrackError, RecordingError
+from disctrack.first_look.declare import board_size, some_images
+from disctrack.frames import CAMERAS, rotation_from_quaternion
+from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.recording.declaration import ChessboardViews, Recording, read_recording
+from disctrack.track.dots import locate_on_disc
+from disctrack.track.own_scatter import without_shared_faults
+from disctrack.track.stage import ImagePairs, check_rig, open_pairs
+from disctrack.track.tracking import PairBlock, Tracking, TrackingSettings, track
+from disctrack.trajectory import MarkerStatus, Trajectory
+
+Array = NDArray[np.float64]
+
+VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
+PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
+FRAMES_AT_EACH = 40  # twice what the free refinement of the clock needs
+SLIPS = (-3, -2, -1, 1, 2, 3)  # frames that one camera may be ahead of the other
+SLIP_FRAMES = 12
+CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
+NARROW_PX = 6.0  # a dot's shorter width; below, the blur of one edge reaches the other (three sigma on each side)
+CLIPPED_SHARE = 0.002  # of an image's pixels that may be clipped: glints on the rim are
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One thing that was looked at."""
+
+    level: str  # "fine", "look" or "fix"
+    what: str  # heading of one word
+    found: str
+    advice: str = ""
+
+
+@dataclass
+class Check:
+    """What was seen; pictures for the page."""
+
+    recording: Recording | None = None
+    remarks: list[Remark] = field(default_factory=list)
+    calibration: StereoCalibration | None = None
+    table_images: tuple[NDArray, NDArray] | None = None
+    shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
+    raw: NDArray | None = None  # (2, h, w) a pair in which the disc was not found
+
+    def say(self, level: str, what: str, found: str, advice: str = "") -> None:
+        """Add a remark."""
+        self.remarks.append(Remark(level, what, found, advice))
+
+    @property
+    def worst(self) -> str:
+        """The gravest level among the remarks."""
+        levels = {remark.level for remark in self.remarks}
+        return next((level for level in ("fix", "look") if level in levels), "fine")
+
+    def lines(self) -> list[str]:
+        """For the command line: level, heading, finding; the advice on a line of its own."""
+        result = []
+        for remark in self.remarks:
+            result.append(f"{remark.level:<5} {remark.what:<12} {remark.found}")
+            if remark.advice:
+                result.append(f"{'':<5} {'':<12} -> {remark.advice}")
+        return result
+
+
+def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None) -> Check:
+    """Look at a recording's declaration, frames, views, light and motion.
+
+    progress is called with what is looked at next. Raises nothing that belongs to the recording: that is a remark.
+    """
+    seen = Check()
+    progress("declaration")
+    try:
+        recording = seen.recording = read_recording(folder)
+    except RecordingError as error:
+        seen.say("fix", "declaration", str(error), "every key: disctrack/docs/recording-toml.md")
+        return seen
+    seen.say("fine", "declaration", f"{recording.file} is complete")
+    pairs = _frames(seen, recording)
+    progress("chessboard")
+    rig = _rig(seen, recording)
+    if pairs is None:
+        return seen
+    progress("light")
+    _light(seen, recording, pairs)
+    if rig is None:
+        seen.say("look", "dots", "not looked for: that needs the cameras' calibration")
+        return seen
+    try:
+        check_rig(rig, pairs, "the calibration")
+    except RecordingError as error:
+        seen.say("fix", "size", str(error))
+        return seen
+    progress("dots")
+    _motion(seen, recording, rig, pairs)
+    return seen
+
+
+def _frames(seen: Check, recording: Recording) -> ImagePairs | None:
+    try:
+        pairs = open_pairs(recording)
+    except RecordingError as error:
+        seen.say("fix", "frames", str(error))
+        return None
+    width, height = pairs.left.image_size
+    seen.say(
+        "fine", "frames",
+        f"{len(pairs)} pairs of {width} x {height} px, {pairs.left.bit_depth} bit, "
+        f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz",
+    )  # fmt: skip
+    for text in (*pairs.notes, *pairs.warnings):
+        seen.say("look", "frames", text)
+    return pairs
+
+
+def _rig(seen: Check, recording: Recording) -> StereoRig | None:
+    if recording.rig_file is not None:
+        try:
+            rig = read_rig(recording.rig_file)
+        except DiscTrackError as error:
+            seen.say("fix", "rig", str(error))
+            return None
+        seen.say("fine", "rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.1f} mm")
+        return rig
+    chessboard, table = recording.chessboard, recording.table
+    assert chessboard is not None
+    assert table is not None
+    try:
+        views = find_views(chessboard.left, chessboard.right, recording.folder)
+        if table.view >= len(views):
+            raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
+        chosen = sorted({*_spread(len(views), VIEWS_LOOKED_AT), table.view})
+        some = ChessboardImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen))
+        board = Board(chessboard.inner_corners, chessboard.square)
+        settings = CalibrationSettings()
+        found, problems = calibrate_views(some, board, chosen.index(table.view), table.board_thickness, settings)
+    except DiscTrackError as error:
+        seen.say("fix", "chessboard", str(error), _other_board(recording, chessboard))
+        return None
+    seen.calibration = found
+    used = len(chosen) - len(problems) - len(found.rejected_views)
+    level = "fine" if used >= 0.7 * len(chosen) else "look"
+    advice = "" if level == "fine" else "the whole board must be in view of both cameras, with a light rim round it"
+    seen.say(level, "chessboard", f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all), "
+             f"rms {found.rms_px:.3f} px, baseline {1e3 * found.rig.baseline:.1f} mm", advice)  # fmt: skip
+    for view, why in found.rejected_views.items():
+        seen.say("look", "chessboard", f"view {chosen[view]} is not used: {why}")
+    for text in (*problems, *found.warnings):
+        seen.say("look", "chessboard", text)
+    return found.rig
+
+
+def _other_board(recording: Recording, declared: ChessboardViews) -> str:
+    """The board that the views show, if it is another than was declared."""
+    try:
+        images = [
+            image
+            for pattern, camera in ((declared.left, "left"), (declared.right, "right"))
+            for image in some_images(pattern, recording.folder, camera)
+        ]
+    except DiscTrackError:
+        return ""
+    size, seen = board_size(images)
+    if size is None or size == declared.inner_corners:
+        return ""
+    return (
+        f"{seen} of {len(images)} images tried show {size[0]} x {size[1]} inner corners: inner_corners = {list(size)}"
+    )
+
+
+def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:
+    images = _pairs_at(pairs, [round(place * (len(pairs) - 1)) for place in PLACES])
+    if not len(images):
+        seen.say("fix", "light", "none of the frames looked at can be read", "copy the frames again")
+        return
+    for camera, name in enumerate(CAMERAS):
+        side = images[:, camera]
+        saturation = saturation_level(side)
+        clipped = 0.0 if saturation is None else float(np.mean(side >= saturation))
+        low, high = np.percentile(side, [1.0, 99.0])
+        text = f"{name}: grey values {low:.0f} to {high:.0f}"
+        if clipped > CLIPPED_SHARE:
+            seen.say("look", "light", f"{text}, {100 * clipped:.1f} % of the pixels clipped at {saturation}",
+                     "expose for a shorter time, or close the aperture: clipped edges shift")  # fmt: skip
+        elif high - low < 1:
+            seen.say("fix", "light", f"{text}: the images are of one grey", "is the lens cap on, is the lamp lit?")
+        else:
+            seen.say("fine", "light", text)
+
+
+def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> None:
+    done: list[tuple[range, Tracking]] = []
+    for place in PLACES:
+        n = min(FRAMES_AT_EACH, len(pairs))
+        first = pairs.start + min(max(round(place * len(pairs)) - n // 2, 0), len(pairs) - n)
+        frames = range(first, first + n)
+        if any(frames.start < other.stop for other, _ in done):
+            continue
+        try:
+            done.append((frames, _track(recording, rig, pairs, frames)))
+        except DiscTrackError as error:
+            seen.say("look", "dots", f"frames {frames.start}-{frames.stop - 1}: {error}")
+            seen.raw = seen.raw if seen.raw is not None else _first(_pairs_at(pairs, [frames.start]))
+    if not done:
+        last = seen.remarks.pop()
+        seen.say("fix", "dots", f"the disc was found nowhere. {last.found}", "compare [markers] with the picture")
+        return
+    for frames, tracking in done:
+        row = len(frames) // 2
+        images = _first(_pairs_at(pairs, [frames[row]]))
+        if images is not None:
+            seen.shown.append((tracking.trajectory, row, images))
+    measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
+    total = sum(len(frames) for frames, _ in done)
+    seen.say(
+        "fine" if measured == total else "look", "dots", f"disc measured in {measured} of {total} frames looked at"
+    )
+    _dots(seen, [tracking for _, tracking in done])
+    _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
+    _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
+    for text in dict.fromkeys(text for _, tracking in done for text in tracking.warnings):
+        seen.say("look", "physics", text)
+
+
+def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:
+    """Track a stretch; slip: frames by which the right camera's are taken later than the left one's."""
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        if slip == 0:
+            yield from iter_pair_blocks(pairs.left, pairs.right, start, stop)
+            return
+        images = _pairs_at(pairs, list(range(start, stop)), slip)
+        yield _Block(np.arange(start, start + len(images)), images, np.ones(images.shape[:2], bool))
+
+    settings = TrackingSettings(refine_markers=False, first_pass=False)
+    return track(read_blocks, frames, rig, recording.disc, recording.frame_rate, gravity=recording.gravity,
+                 settings=settings)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Block:
+    frames: NDArray[np.int64]
+    images: NDArray
+    readable: NDArray[np.bool_]
+
+
+def _dots(seen: Check, tracks: list[Tracking]) -> None:
+    """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
+    status = np.concatenate([tracking.trajectory.marker_status for tracking in tracks])
+    with_pose = np.concatenate([tracking.trajectory.measured for tracking in tracks])
+    seen_share = np.mean(status[with_pose] == MarkerStatus.MEASURED, axis=0) if with_pose.any() else np.zeros((2, 1))
+    for dot in np.flatnonzero(seen_share.max(axis=0) < 0.1):
+        kinds, counts = np.unique(status[with_pose][:, :, dot], return_counts=True)
+        reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")
+        seen.say("fix", "dots", f"dot {dot} of [markers] centres_mm is measured in no image ({reason})",
+                 "is its centre right, and its sign? Numbers count from 0, in the order of centres_mm")  # fmt: skip
+    for camera, name in enumerate(CAMERAS):
+        if seen_share[camera].max() < 0.1:
+            seen.say("fix", "dots", f"the {name} camera measures no dot",
+                     "are left and right exchanged, does it see the upper face?")  # fmt: skip
+
+
+def _sharpness(
+    seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, looked: tuple[range, Tracking]
+) -> None:
+    frames, tracking = looked
+    trajectory = tracking.trajectory
+    rows = np.flatnonzero(trajectory.measured)
+    if not len(rows):
+        return
+    row = int(rows[len(rows) // 2])
+    images = _first(_pairs_at(pairs, [frames[row]]))
+    if images is None:
+        return
+    R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
+    for camera, (name, (R_cw, t_cw)) in enumerate(zip(CAMERAS, rig.camera_poses(), strict=True)):
+        one = rig.cameras[camera]
+        found = locate_on_disc(images[camera], one, R_cw @ R, R_cw @ t + t_cw, recording.disc,
+                               noise=tracking.noise[camera], blur_px=tracking.blur_px[camera])  # fmt: skip
+        if not np.isfinite(found.contrast).any():
+            continue
+        centre = R_cw @ t + t_cw
+        tilt = abs(float((R_cw @ R)[:, 2] @ centre)) / float(np.linalg.norm(centre))
+        width = one.fx * recording.disc.marker_diameter / float(centre[2])
+        level, contrast = float(np.nanmedian(found.level)), float(np.nanmedian(found.contrast))
+        noise = float(np.sqrt(tracking.noise[camera].variance(np.array(level))))
+        text = (
+            f"{name}: dots {width:.0f} px wide, blur {tracking.blur_px[camera]:.2f} px (sigma), contrast "
+            f"{100 * abs(contrast):.0f} %, {level * abs(contrast) / noise:.0f} times the noise"
+        )
+        if width * tilt < NARROW_PX:
+            seen.say("look", "sharpness", f"{text}; only {width * tilt:.1f} px across",
+                     "larger dots, a longer lens, or cameras that look more steeply")  # fmt: skip
+        elif 3 * tracking.blur_px[camera] > 0.5 * width * tilt:
+            seen.say("look", "sharpness", f"{text}: the blur of opposite edges overlaps",
+                     "focus on the disc, close the aperture, expose for a shorter time")  # fmt: skip
+        else:
+            seen.say("fine", "sharpness", text)
+    sigma = np.nanmedian(trajectory.coordinate_sigma[:, :3], axis=0)
+    shared = np.nanmedian(trajectory.calibration_sigma[:, :3], axis=0)
+    total = float(np.sqrt((sigma**2 + shared**2).max()))
+    text = (
+        f"expected of one frame: {1e6 * sigma.max():.2g} um by noise, {1e6 * shared.max():.2g} um by the calibration "
+        "(sigma of the worst of x, y, z; the run's own calibration uses all views)"
+    )
+    advice = "" if total < CLAIM else "more light, sharper or larger dots; more views of the board, tilted and all over"
+    seen.say("fine" if total < CLAIM else "look", "accuracy", text, advice)
+
+
+def _synchronisation(
+    seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, tracking: Tracking
+) -> None:
+    trajectory = tracking.trajectory
+    rms = float(np.sqrt(np.nanmean(trajectory.reprojection_rms_px**2)))
+    motion = np.linalg.norm(np.diff(trajectory.markers_px, axis=0), axis=-1)
+    if not np.isfinite(motion).any():
+        return
+    speed = float(np.nanmedian(motion))
+    if tracking.variance_factor > 4.0:  # dots disagree with every pose by more than twice their noise
+        better = _slip(recording, rig, pairs, frames, rms)
+        if better is not None:
+            slip, its_rms = better
+            seen.say("fix", "clock", f"left frame i and right frame i{slip:+d} show the same instant: that leaves "
+                     f"{its_rms:.3f} px, the declared pairing {rms:.3f} px",
+                     "export the same instants of both cameras")  # fmt: skip
+            return
+    moving = trajectory.rig.world_is_table and speed > 0.2
+    faults = None
+    if moving:
+        R = rotation_from_quaternion(trajectory.quaternion)
+        faults = without_shared_faults(trajectory.markers_px, trajectory.markers_covariance_px2, rig, recording.disc,
+                                       R, trajectory.q[:, :3])  # fmt: skip
+    if faults is None:
+        seen.say("fine", "clock", f"dots move by {speed:.2f} px per frame here: too few or too slow to tell a delay")
+        return
+    offset = abs(faults.delay) * speed  # in pixels, against what the dots' noise leaves open
+    noise = float(np.sqrt(np.nanmedian(np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1)) / 2))
+    unsure = offset < 3 * max(noise, 0.02)  # 0.02 px: what a rig within its calibration leaves
+    text = f"right camera {faults.delay:+.3f} frame periods after the left, by the dots' motion"
+    if unsure:
+        seen.say("fine", "clock", f"no delay between the cameras shows ({text})")
+    else:
+        seen.say("look", "clock", text, "are both cameras triggered by one signal, with one exposure time?")
+
+
+def _slip(
+    recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, rms: float
+) -> tuple[int, float] | None:
+    """The slip that fits far better than none, if any, and the dots' rms [px] with it."""
+    best: tuple[int, float] | None = None
+    for slip in SLIPS:
+        some = frames[max(0, -slip) : SLIP_FRAMES + max(0, -slip)]
+        if some.stop + slip > len(pairs.right) or some.start + slip < 0:
+            continue
+        try:
+            tried = _track(recording, rig, pairs, some, slip).trajectory
+        except DiscTrackError:
+            continue
+        its = float(np.sqrt(np.nanmean(tried.reprojection_rms_px**2)))
+        if tried.measured.all() and its < 0.5 * (rms if best is None else best[1]):
+            best = (slip, its)
+    return best
+
+
+def _pairs_at(pairs: ImagePairs, indices: list[int], slip: int = 0) -> NDArray:
+    """(k, 2, h, w) images of these frames; those that cannot be read are left out."""
+    found = []
+    for index in indices:
+        try:
+            found.append(np.stack([np.array(pairs.left.read(index)), np.array(pairs.right.read(index + slip))]))
+        except (RecordingError, IndexError):
+            continue
+    return np.array(found)
+
+
+def _first(images: NDArray) -> NDArray | None:
+    return images[0] if len(images) else None
+
+
+def _spread(n: int, most: int) -> list[int]:
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})

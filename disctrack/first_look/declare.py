@@ -1,0 +1,285 @@
+"""A recording.toml for a folder of frames: what the files tell is filled in, what they cannot tell is left to the user.
+
+A value that no file tells stands as a comment with FILL IN: the declaration is refused until it is given, so that no
+guess of ours becomes a measurement.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.chessboard import BoardNotFound, find_corners, grey_values
+from disctrack.errors import OutputError, RecordingError
+from disctrack.files.whole import write_whole
+from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
+from disctrack.readers import FrameReader, open_frames, split_member
+from disctrack.readers.camera_header import header_of
+from disctrack.readers.files import match_files
+from disctrack.readers.images import decode
+from disctrack.recording.declaration import FILE_NAME
+
+VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's
+LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
+LEAST_VIEWS = 2  # that must show the whole board
+OPTIONS = ("frame_rate_hz", "square_mm", "board_thickness_mm", "radius_mm", "thickness_mm", "mass_g", "diameter_mm")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the files of a folder tell."""
+
+    folder: Path
+    frames: CameraPair
+    described: str  # size, depth and number of the frames
+    frame_rate: float | None  # [Hz] where a camera's header or the frames' time stamps tell it
+    rate_source: str
+    views: CameraPair | None
+    views_count: int
+    inner_corners: tuple[int, int] | None
+    board_seen: str  # in how many of the views that were tried
+    rig_file: str | None  # where there are no views
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What `run_init` wrote."""
+
+    file: Path
+    found: Found
+    missing: tuple[str, ...]  # keys that the user has to fill in
+
+
+def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None) -> Declared:
+    """Write recording.toml into a folder of frames.
+
+    known : values of `OPTIONS` that the user gave; like : another recording.toml, or its folder, of the same disc,
+    board and table, from which everything is taken that the files do not tell
+    Raises RecordingError if no two cameras are found, OutputError if there is a recording.toml already.
+    """
+    folder = Path(folder)
+    file = folder / FILE_NAME
+    if file.exists():
+        raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` tells what it lacks.")
+    example = {} if like is None else _example(like)
+    found = look_into(folder)
+    text, missing = declaration(found, known or {}, example)
+    write_whole(file, text.encode())
+    return Declared(file, found, missing)
+
+
+def look_into(folder: Path) -> Found:
+    """What the frames of a folder tell. Raises RecordingError if no two cameras can be told apart."""
+    sequences = find_sequences(folder)
+    pairs = pair_cameras(sequences)
+    if not pairs:
+        seen = ", ".join(sequence.pattern for sequence in sequences[:6]) or "no file that frames are read from"
+        raise RecordingError(
+            f"{folder}: no two sequences whose names differ by the camera alone (left and right, cam1 and cam2, ...). "
+            f"It holds: {seen}. Put each camera's frames into a folder of its own, e.g. left/ and right/."
+        )
+    notes = []
+    views, inner_corners, board_seen = _views_among(folder, pairs)
+    candidates = [pair for pair in pairs if pair is not views] or pairs
+    lengths = {id(pair): _length(folder, pair.left) for pair in candidates}
+    frames = max(candidates, key=lambda pair: lengths[id(pair)])
+    if len(candidates) > 1:
+        others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
+        notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
+    if frames is views:
+        raise RecordingError(
+            f"{folder}: {frames.left.pattern} and {frames.right.pattern} show a chessboard, and nothing else is there. "
+            "Give the folder that holds the recording, with the chessboard views in a folder inside it."
+        )
+    left, right = frames.left.open(folder), frames.right.open(folder, "right")
+    rate, source = _frame_rate(left, right)
+    if not frames.named:
+        notes.append(f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left")
+    rig_file = None if views is not None else _rig_beside(folder)
+    width, height = left.image_size
+    return Found(
+        folder,
+        frames,
+        f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit",
+        rate,
+        source,
+        views,
+        0 if views is None else _length(folder, views.left),
+        inner_corners,
+        board_seen,
+        rig_file,
+        tuple(notes),
+    )
+
+
+def board_size(images: list[NDArray]) -> tuple[tuple[int, int] | None, int]:
+    """Inner corners (long side, short side) that most images show, and how many of them show these; None if none."""
+    counts: Counter[tuple[int, int]] = Counter()
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+    greys = [np.asarray(grey_values(image)[0]) for image in images]
+    for grey in greys:
+        stretched = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+        found, _, squares = cv2.findChessboardCornersSBWithMeta(stretched, (3, 3), flags)
+        if found and squares is not None and squares.size >= LEAST_CORNERS:
+            short, long = sorted(squares.shape[:2])
+            counts[long, short] += 1
+    # part of a board is often taken for one: of sizes seen twice the largest, and then what `calibrate` itself finds
+    for size, _ in sorted(counts.items(), key=lambda item: (item[1] < LEAST_VIEWS, -item[0][0] * item[0][1])):
+        seen = sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in greys)
+        if seen >= min(LEAST_VIEWS, len(images)):
+            return size, seen
+    return None, 0
+
+
+def _views_among(folder: Path, pairs: list[CameraPair]) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
+    """The pair that shows the chessboard: by its names, else by what is in the images, shortest first."""
+    named = [pair for pair in pairs if pair.looks_like_calibration]
+    others = sorted((pair for pair in pairs if pair not in named), key=lambda pair: _length(folder, pair.left))
+    tried = [*named, *(others if not named and len(pairs) > 1 else [])]
+    for pair in tried:
+        images = [image for side in (pair.left, pair.right) for image in some_images(side.pattern, folder)]
+        size, seen = board_size(images)
+        if size is not None:
+            return pair, size, f"found whole in {seen} of {len(images)} images tried"
+    if named:
+        return named[0], None, "no board found in the images that were tried"
+    return None, None, ""
+
+
+def some_images(pattern: str, folder: Path, camera: str = "left") -> list[NDArray]:
+    """A few of one camera's views; they may be in colour. Raises RecordingError."""
+    files = match_files(split_member(pattern)[0], folder, camera)
+    if len(files) > 1:
+        chosen = [files[i] for i in _spread(len(files), VIEWS_TRIED)]
+        return [decode(file.read_bytes(), str(file)) for file in chosen]
+    reader = open_frames(pattern, folder, camera)
+    return [np.array(reader.read(i)) for i in _spread(len(reader), VIEWS_TRIED)]
+
+
+def _spread(n: int, most: int) -> list[int]:
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
+
+
+def _length(folder: Path, sequence: Sequence) -> int:
+    return sequence.files if sequence.files > 1 else len(sequence.open(folder))
+
+
+def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, str]:
+    for camera, reader in (("left", left), ("right", right)):
+        header = header_of(reader)
+        if header is not None:
+            return header.frame_rate, f"says {Path(header.file).name}"
+        if reader.timestamps is not None and len(reader.timestamps) > 2:
+            step = float(np.median(np.diff(reader.timestamps)))
+            if np.isfinite(step) and step > 0:
+                return float(f"{1 / step:.6g}"), f"by the time stamps of the {camera} frames"
+        if reader.frame_rate is not None:
+            return float(reader.frame_rate), f"stated by the {camera} file"
+    return None, ""
+
+
+def _rig_beside(folder: Path) -> str | None:
+    """A rig file of disctrack in the folder or the one above."""
+    from calibration.rig_file import read_rig
+    from disctrack.errors import DiscTrackError
+
+    for place, shown in ((folder, ""), (folder.parent, "../")):
+        for file in sorted(place.glob("*.h5")):
+            try:
+                read_rig(file)
+            except DiscTrackError:
+                continue
+            return f"{shown}{file.name}"
+    return None
+
+
+def _example(like: Path) -> Mapping[str, Any]:
+    file = like / FILE_NAME if like.is_dir() else like
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{file}: cannot be taken as an example: {error}.") from error
+
+
+def declaration(found: Found, known: Mapping[str, float], example: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """Text of the recording.toml, and the keys that nobody told."""
+    missing: list[str] = []
+
+    def line(section: str, key: str, value: Any, example_text: str, remark: str) -> str:
+        """One key: what the files tell, else what the user gave, else the example's, else left to fill in."""
+        if value is None:
+            value = known.get(key, example.get(section, {}).get(key))
+        if value is None:
+            missing.append(f"[{section}] {key}")
+            return _aligned(f"# {key} = {example_text}", f"FILL IN: {remark}")
+        return _aligned(f"{key} = {_toml(value)}", remark)
+
+    f = found.frames
+    rate_remark = f"frames per second, {found.rate_source}" if found.rate_source else "frames per second of the cameras"
+    lines = [
+        "# Lengths in mm, masses in g, times in s. Every key: disctrack/docs/recording-toml.md",
+        f"name = {_toml(found.folder.resolve().name)}",
+        "",
+        "[cameras]                       # frame i of the left and of the right must show the same instant",
+        line("cameras", "frame_rate_hz", found.frame_rate, "1000.0", rate_remark),
+        _aligned(f"left = {_toml(f.left.pattern)}", found.described),
+        f"right = {_toml(f.right.pattern)}",
+        "",
+        "[disc]",
+        line("disc", "radius_mm", None, "37.5", "caliper"),
+        line("disc", "thickness_mm", None, "6.0", "caliper, with the paper"),
+        line("disc", "mass_g", None, "209.69", "balance, with the paper"),
+        "",
+        "[markers]                       # round dots on the upper face, all of one size",
+        line("markers", "diameter_mm", None, "7.0", "as printed"),
+        line(
+            "markers", "centres_mm", None, "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5], [6.5, -11.3]]",
+            "[x, y] of every dot from the disc's centre",
+        ),
+        "",
+        *_calibration_lines(found, line),
+        "[gravity]",
+        line("gravity", "g_m_s2", example.get("gravity", {}).get("g_m_s2", 9.81), "9.81", "9.78 (equator) to 9.83"),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n", tuple(missing)
+
+
+def _calibration_lines(found: Found, line: Any) -> list[str]:
+    if found.views is None and found.rig_file is not None:
+        return ["[calibration]", _aligned(f"rig = {_toml(found.rig_file)}", "a rig that was calibrated before"), ""]
+    left, right = (None, None) if found.views is None else (found.views.left.pattern, found.views.right.pattern)
+    corners = None if found.inner_corners is None else list(found.inner_corners)
+    count = f"{found.views_count} views" if found.views is not None else "views of a chessboard, 15 to 40 of them"
+    return [
+        "[calibration]                   # synchronised views of a flat chessboard",
+        line("calibration", "left", left, '"calibration/left/*.png"', count),
+        line("calibration", "right", right, '"calibration/right/*.png"', "the same views, in the same order"),
+        line("calibration", "inner_corners", corners, "[9, 6]", f"long side first; {found.board_seen or 'count them'}"),
+        line("calibration", "square_mm", None, "6.0", "side of a square, measured over many squares"),
+        "",
+        "[table]                         # the lab frame: k up from the table, which is z = 0",
+        line("table", "view", 0, "0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
+        line("table", "board_thickness_mm", None, "3.0", "height of the printed face above the table"),
+        "",
+    ]
+
+
+def _aligned(text: str, remark: str) -> str:
+    return f"{text:<32}# {remark}" if len(text) < 32 else f"{text}  # {remark}"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -1,0 +1,165 @@
+"""What a folder holds: sequences of frames, which two of them are the cameras, which two show the chessboard."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from disctrack.errors import RecordingError
+from disctrack.readers import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, FrameReader, open_frames
+from disctrack.readers.files import natural_key
+
+DEEPEST = 4  # folders below the recording that are looked into
+_OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
+_CALIBRATION_WORDS = re.compile(r"cal|chess|checker|board|target|views", re.IGNORECASE)
+# Words that tell the cameras apart, left first; numbers and single letters are compared by their order.
+_SIDES = (("left", "right"), ("l", "r"), ("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha"))
+_TOKEN = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+|[^A-Za-z0-9]+")
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Frames of one camera, as `[cameras] left` would name them."""
+
+    pattern: str  # relative to the folder
+    kind: str  # suffix of the files
+    files: int
+
+    def open(self, folder: Path, camera: str = "left") -> FrameReader:
+        """Reader of its frames. Raises RecordingError."""
+        return open_frames(self.pattern, folder, camera)
+
+
+@dataclass(frozen=True)
+class CameraPair:
+    """Two sequences whose names differ by the camera alone."""
+
+    left: Sequence
+    right: Sequence
+    named: bool  # True where the names say which is left
+
+    @property
+    def looks_like_calibration(self) -> bool:
+        """True where the names speak of a calibration."""
+        return bool(_CALIBRATION_WORDS.search(self.left.pattern) and _CALIBRATION_WORDS.search(self.right.pattern))
+
+
+def find_sequences(folder: Path) -> list[Sequence]:
+    """Sequences of frames in the folder and below, results of earlier runs left out."""
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: no such folder. Give the folder that holds the frames.")
+    found: list[Sequence] = []
+    for place, names in _folders(folder):
+        inside = place.relative_to(folder)
+        images = [name for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+        found += _image_sequences(inside, images)
+        headers = {Path(name).stem for name in names if Path(name).suffix.lower() in MRAW_SUFFIXES - {".mraw"}}
+        for name in names:
+            suffix, path = Path(name).suffix.lower(), (inside / name).as_posix()
+            if suffix in HDF5_SUFFIXES:
+                found += [Sequence(f"{path}:{stack}", suffix, 1) for stack in _stacks(place / name)]
+            elif suffix in SUFFIXES - IMAGE_SUFFIXES and not (suffix == ".mraw" and Path(name).stem in headers):
+                found.append(Sequence(path, suffix, 1))
+    return found
+
+
+def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
+    """Pairs of sequences whose names differ in one word or number, each sequence in one pair at most."""
+    waiting = sorted(sequences, key=lambda sequence: natural_key(sequence.pattern))
+    pairs = []
+    while waiting:
+        first = waiting.pop(0)
+        tokens = _TOKEN.findall(first.pattern)
+        partners = [(other, difference) for other in waiting if (difference := _difference(tokens, other, first))]
+        # a known pair of words first, then numbers, then anything
+        partners.sort(key=lambda item: (not _is_side(*item[1]), not item[1][0].isdigit()))
+        if partners:
+            other, (ours, theirs) = partners[0]
+            waiting.remove(other)
+            named = _is_side(ours, theirs)
+            swap = named and _sides(ours, theirs)[::-1] in _SIDES
+            pairs.append(CameraPair(*((other, first) if swap else (first, other)), named))
+    return pairs
+
+
+def _folders(folder: Path) -> Iterable[tuple[Path, list[str]]]:
+    for place, inside, names in os.walk(folder):
+        depth = len(Path(place).relative_to(folder).parts)
+        inside[:] = sorted(
+            name for name in inside if depth < DEEPEST and not name.startswith(".") and not _OWN_FOLDERS.match(name)
+        )
+        yield Path(place), sorted((name for name in names if not name.startswith(".")), key=natural_key)
+
+
+def _image_sequences(inside: Path, names: list[str]) -> list[Sequence]:
+    """Images of one folder, grouped by what is left of their names when the counting number is taken out."""
+    alike: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
+    for name in names:
+        parts = re.split(r"([0-9]+)", name)
+        alike[tuple(parts[::2])].append(parts)
+    groups: dict[tuple[str, str], int] = defaultdict(int)
+    for members in alike.values():
+        runs = list(zip(*(parts[1::2] for parts in members), strict=True))
+        counter = max(range(len(runs)), key=lambda k: (len(set(runs[k])), len(runs[k][0]), k), default=None)
+        for parts in members:
+            shown = list(parts)
+            if counter is not None and (len(members) > 1 or not _holds_many(Path("".join(parts)))):
+                shown[2 * counter + 1] = "*"
+            groups["".join(shown), Path("".join(parts)).suffix.lower()] += 1
+    suffixes = [suffix for _, suffix in groups]
+    result = []
+    for (pattern, suffix), count in groups.items():
+        alone = suffixes.count(suffix) == 1 and "*" in pattern
+        shown_pattern = f"*{Path(pattern).suffix}" if alone and inside != Path() else pattern
+        result.append(Sequence((inside / shown_pattern).as_posix(), suffix, count))
+    return result
+
+
+def _holds_many(file: Path) -> bool:
+    """A TIFF may be a stack, or one image of many."""
+    return file.suffix.lower() in (".tif", ".tiff")
+
+
+def _stacks(file: Path) -> list[str]:
+    """Paths of the data sets in an HDF5 file that can be frames: (n, height, width) of 8 or 16 bit."""
+    import h5py
+
+    found: list[str] = []
+
+    def visit(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset) and item.ndim == 3 and item.dtype in ("u1", "u2"):
+            found.append(f"/{name}")
+
+    try:
+        with h5py.File(file, "r") as opened:
+            opened.visititems(visit)
+    except OSError:  # not HDF5, or damaged: no frames to name
+        return []
+    return sorted(found, key=natural_key)
+
+
+def _difference(tokens: list[str], other: Sequence, first: Sequence) -> tuple[str, str] | None:
+    """The one token in which the other's name differs, as (ours, theirs); None if there is none, or more than one."""
+    theirs = _TOKEN.findall(other.pattern)
+    if other.kind != first.kind or len(theirs) != len(tokens):
+        return None
+    differing = {(a, b) for a, b in zip(tokens, theirs, strict=True) if a != b}
+    if len(differing) != 1:
+        return None
+    a, b = differing.pop()
+    return (a, b) if a[0].isalnum() and b[0].isalnum() else None
+
+
+def _sides(ours: str, theirs: str) -> tuple[str, str]:
+    """The words that tell the cameras apart: "camleft" and "camright" differ in "left" and "right"."""
+    common = next((i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b), 0)
+    return ours[common:].lower(), theirs[common:].lower()
+
+
+def _is_side(ours: str, theirs: str) -> bool:
+    words = _sides(ours, theirs)
+    return words in _SIDES or words[::-1] in _SIDES

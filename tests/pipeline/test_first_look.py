@@ -1,0 +1,206 @@
+"""Before the first run: a declaration is written, faults are named, printed sheets are true to scale."""
+
+import os
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from calibration.chessboard import BoardNotFound, find_corners
+from disctrack.cli import main
+from disctrack.disc import MA_2014
+from disctrack.first_look.declare import board_size
+from disctrack.first_look.sequences import find_sequences, pair_cameras
+from disctrack.first_look.targets import board_figure, dots_figure
+
+DPI = 150
+
+
+def linked(folder: Path, to: Path) -> Path:
+    """A copy of a recording whose images are links."""
+    for file in folder.rglob("*"):
+        place = to / file.relative_to(folder)
+        if file.is_dir():
+            place.mkdir(parents=True, exist_ok=True)
+        elif file.suffix == ".png":
+            place.parent.mkdir(parents=True, exist_ok=True)
+            os.symlink(file.resolve(), place)
+        else:
+            shutil.copy(file, place)
+    return to
+
+
+def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(sample_clip, tmp_path, capsys):
+    folder = linked(sample_clip, tmp_path / "clip")
+    declared = tomllib.loads((folder / "recording.toml").read_text())
+    (folder / "recording.toml").unlink()
+    assert main(["init", str(folder), "--frame-rate-hz", "1000"]) == 0
+    written = tomllib.loads((folder / "recording.toml").read_text())
+    for section, key in (
+        ("cameras", "left"), ("cameras", "right"), ("cameras", "frame_rate_hz"),
+        ("calibration", "left"), ("calibration", "right"), ("calibration", "inner_corners"), ("table", "view"),
+    ):  # fmt: skip
+        assert written[section][key] == declared[section][key], key
+    told = capsys.readouterr().out
+    missing = {
+        key for key in ("radius_mm", "thickness_mm", "mass_g", "diameter_mm", "centres_mm", "square_mm") if key in told
+    }
+    assert len(missing) == 6
+    # what is not known is refused, by name, and not guessed
+    assert main(["run", str(folder)]) == 1
+    assert "square_mm is missing" in capsys.readouterr().err
+
+
+def test_init_takes_the_rest_from_an_earlier_recording_of_the_same_disc(sample_clip, tmp_path):
+    folder = linked(sample_clip, tmp_path / "clip")
+    (folder / "recording.toml").unlink()
+    assert main(["init", str(folder), "--like", str(sample_clip)]) == 0
+    written, declared = (tomllib.loads((f / "recording.toml").read_text()) for f in (folder, sample_clip))
+    declared["name"] = "clip"
+    assert written == declared
+    assert main(["init", str(folder)]) == 1  # and never replaces what is there
+
+
+@pytest.mark.parametrize(
+    ("names", "pairs"),
+    [
+        (["cam1/a_001.png", "cam1/a_002.png", "cam2/a_001.png", "cam2/a_002.png"], [("cam1/*.png", "cam2/*.png")]),
+        (["R_7.tif", "R_8.tif", "L_7.tif", "L_8.tif"], [("L_*.tif", "R_*.tif")]),
+        (["x_0001_right.bmp", "x_0002_right.bmp", "x_0001_left.bmp", "x_0002_left.bmp"],
+         [("x_*_left.bmp", "x_*_right.bmp")]),
+        (["f0001_cam1.png", "f0002_cam1.png", "f0001_cam2.png", "f0002_cam2.png"],
+         [("f*_cam1.png", "f*_cam2.png")]),
+        (["take_C001H001S0001.cihx", "take_C001H001S0001.mraw", "take_C002H001S0001.cihx", "take_C002H001S0001.mraw"],
+         [("take_C001H001S0001.cihx", "take_C002H001S0001.cihx")]),
+        (["camLeft.mkv", "camRight.mkv", "notes.txt"], [("camLeft.mkv", "camRight.mkv")]),
+        (["results/left/1.png", "results/right/1.png"], []),
+        (["left/1.png", "left/2.png", "notes.txt"], []),
+    ],
+)  # fmt: skip
+def test_cameras_are_told_apart_by_their_names(names, pairs, tmp_path):
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    found = pair_cameras(find_sequences(tmp_path))
+    assert [(pair.left.pattern, pair.right.pattern) for pair in found] == pairs
+
+
+def test_stacks_in_one_hdf5_file_are_the_two_cameras(tmp_path, rng):
+    with h5py.File(tmp_path / "frames.h5", "w") as file:
+        for name in ("right", "left"):
+            stack = file.create_dataset(name, data=rng.integers(0, 255, (3, 40, 50), np.uint8))
+            stack.attrs["frame_rate"] = 2000.0
+    assert main(["init", str(tmp_path)]) == 0
+    written = tomllib.loads((tmp_path / "recording.toml").read_text())
+    assert written["cameras"] == {"frame_rate_hz": 2000.0, "left": "frames.h5:/left", "right": "frames.h5:/right"}
+
+
+@pytest.mark.slow
+def test_board_size_is_found_on_photographs_and_not_where_there_is_none(shared_data, rng):
+    files = sorted((shared_data / "opencv_stereo_chessboard").glob("left*.jpg"))[:6]
+    assert board_size([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files])[0] == (9, 6)
+    assert board_size([rng.integers(0, 255, (240, 320), np.uint8)] * 2)[0] is None
+
+
+def drawn(figure):
+    """Grey values of a sheet, and pixels per millimetre."""
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return cv2.cvtColor(np.asarray(canvas.buffer_rgba())[..., :3].copy(), cv2.COLOR_RGB2GRAY), DPI / 25.4
+
+
+def test_printed_dots_lie_where_they_are_declared():
+    image, scale = drawn(dots_figure(MA_2014))
+    _, _, stats, centres = cv2.connectedComponentsWithStats((image < 100).astype(np.uint8))
+    diameter = 1e3 * MA_2014.marker_diameter * scale
+    dots = np.array(
+        [c for s, c in zip(stats, centres, strict=True) if abs(s[4] / (np.pi * diameter**2 / 4) - 1) < 0.05]
+    )
+    assert len(dots) == 6 * MA_2014.n_markers  # six faces on a sheet
+    distances = np.linalg.norm(dots[:, None] - dots[None], axis=-1) / scale
+    declared = 1e3 * MA_2014.marker_centres_body[:, :2]
+    # one face: the dots nearest to that of the upper left; half a pixel is 0.08 mm
+    for a in range(len(declared)):
+        for b in range(a):
+            wanted = np.linalg.norm(declared[a] - declared[b])
+            assert np.sum(abs(distances - wanted) < 0.08) >= 2 * 6
+
+
+@pytest.mark.parametrize(("corners", "square"), [((9, 6), 20.0), ((6, 4), 15.0), ((8, 6), 10.0)])
+def test_printed_board_is_the_one_that_is_declared(corners, square):
+    sharp, scale = drawn(board_figure(corners, square))
+    image = cv2.GaussianBlur(sharp, (0, 0), 1.0)  # as a scanner sees it
+    found = find_corners(image, corners)
+    assert not isinstance(found, BoardNotFound), found
+    grid = found.points.reshape(corners[1], corners[0], 2)
+    steps = np.concatenate([np.diff(grid, axis=0).reshape(-1, 2), np.diff(grid, axis=1).reshape(-1, 2)])
+    assert np.linalg.norm(steps, axis=1) / scale == pytest.approx(square, abs=0.1)
+    first, along_j = grid[0, 0], grid[1, 0]
+    outside = np.rint(first - 0.5 * (grid[0, 1] - first) - 0.5 * (along_j - first)).astype(int)
+    assert image[outside[1], outside[0]] < 50  # dark beside corner 0
+
+
+def checked(folder: Path, capsys) -> tuple[int, str]:
+    code = main(["check", str(folder), "--no-figures"])
+    return code, re.sub(r"\s+", " ", capsys.readouterr().out)
+
+
+def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, capsys):
+    assert main(["check", str(sample_clip), "-o", str(tmp_path / "check.png")]) == 0
+    told = capsys.readouterr().out
+    assert "\nfix " not in told
+    assert "\nlook " not in told
+    for what in ("declaration", "frames", "chessboard", "light", "dots", "sharpness", "accuracy"):
+        assert f"fine  {what}" in told
+    assert cv2.imread(str(tmp_path / "check.png")) is not None
+
+
+def declare(folder: Path, old: str, new: str) -> None:
+    file = folder / "recording.toml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def renumber_right(folder: Path) -> None:
+    """The right camera one frame late: its frame i shows what the left one's shows in i - 1."""
+    files = sorted((folder / "right").glob("*.png"))
+    targets = [file.resolve() for file in files]
+    for file in files:
+        file.unlink()
+    for i, file in enumerate(files):
+        os.symlink(targets[max(i - 1, 0)], file)
+
+
+FAULTS = {
+    "a key is missing": (lambda f: declare(f, "mass_g = 209.69", ""), "mass_g is missing", 1),
+    "frames are missing": (lambda f: (f / "left/000017.png").unlink(), "missing", 0),
+    "other corners": (lambda f: declare(f, "[9, 6]", "[8, 5]"), "inner_corners = [9, 6]", 1),
+    "no dot there": (lambda f: declare(f, "[6.5000, -11.2583]", "[0.5, 0.5]"), "dot 5", 1),
+    "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "lowest point", 0),
+    "cameras exchanged": (
+        lambda f: declare(declare(f, 'left = "left/', 'left = "_') or f, 'right = "right/', 'right = "left/')
+        or declare(f, 'left = "_', 'left = "right/'), "exchanged", None,
+    ),
+    "one frame late": (renumber_right, "right frame i+1 show the same instant", 1),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_check_names_the_fault(fault, sample_clip, tmp_path, capsys):
+    folder = linked(sample_clip, tmp_path / "clip")
+    plant, words, expected = FAULTS[fault]
+    plant(folder)
+    code, told = checked(folder, capsys)
+    assert words in told, told
+    assert re.search(r"(^| )(look|fix) ", told), told
+    if expected is not None:
+        assert code == expected, told
