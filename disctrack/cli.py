@@ -53,7 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.command is None:
             _parser([]).print_help()
             return USAGE
-        return int(arguments.run(arguments))
+        from disctrack.files.inputs import inputs_kept  # here, so that --help does not wait for what it imports
+
+        with inputs_kept():
+            return int(arguments.run(arguments))
     except KeyboardInterrupt:
         return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`

@@ -16,6 +16,7 @@ from disctrack.analyse.power_laws import (
 )
 from disctrack.analyse.propagation import Series, common_sigma
 from disctrack.errors import AnalysisError, OutputError
+from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.trajectory_file import read_provenance, read_setup, read_trajectory, write_group
 from disctrack.frames import euler_jacobian
@@ -71,6 +72,7 @@ def run_analyse(
     from disctrack.analyse.report import write_report  # matplotlib is wanted here only
 
     path = Path(path)
+    keep(path)
     folder = Path(output) if output is not None else path.with_name(f"{path.stem}_analysis")
     if (folder / "report.html").exists() and not overwrite:
         raise OutputError(

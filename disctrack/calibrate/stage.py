@@ -14,6 +14,7 @@ from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
 from calibration.rig_file import read_rig, write_rig
 from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
+from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import whole_file
 from disctrack.progress import progress_bar
@@ -79,6 +80,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
 
 def given_rig(file: Path) -> CalibrationResult:
     """A rig that a recording shares with others. Raises RigFileError."""
+    keep(file)
     rig = read_rig(file)
     return CalibrationResult(rig, [f"{'calibration':<13} {file}: baseline {rig.baseline * 1e3:.3f} mm"], [])
 
@@ -88,6 +90,7 @@ def calibrate_into(path: Path, source: CalibrationSource, overwrite: bool, figur
 
     Raises OutputError if `path` holds something else and may not be replaced.
     """
+    refuse_input(path)
     provenance = source.provenance
     if path.exists() and not overwrite:
         lines = _reusable(path, provenance)

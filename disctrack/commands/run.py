@@ -20,6 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate unless the recording names a rig, track, draw; returns the exit code."""
     from disctrack.commands import _calibration as calibration
     from disctrack.commands import _outputs as outputs
+    from disctrack.files.inputs import refuse_input
     from disctrack.files.whole import write_whole
     from disctrack.recording.declaration import read_recording
     from disctrack.track import stage as pipeline
@@ -29,6 +30,8 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.output or recording.folder / outputs.RESULTS
     options = outputs.track_options(arguments)
     pairs = pipeline.open_pairs(recording, options.frames)
+    for name in ("trajectory.h5", "summary.txt"):
+        refuse_input(folder / name)
     outputs.check_writable(folder)
     if recording.rig_file is not None:
         rig_name = str(recording.rig_file)

@@ -21,6 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
     from calibration.rig_file import read_rig
     from disctrack.commands import _outputs as outputs
     from disctrack.errors import RecordingError
+    from disctrack.files.inputs import keep, refuse_input
     from disctrack.recording.declaration import read_recording
     from disctrack.track import stage as pipeline
     from disctrack.track import summary
@@ -33,9 +34,11 @@ def run(arguments: argparse.Namespace) -> int:
             f"{rig_file}: no such rig file. Calibrate first (disctrack calibrate {arguments.recording} -o rig.h5), "
             "or name the rig with --rig."
         )
+    keep(rig_file)
     rig = read_rig(rig_file)
     options = outputs.track_options(arguments)
     pairs = pipeline.open_pairs(recording, options.frames)
+    refuse_input(path)
     outputs.check_writable(path.parent)
     lines, files, shortcomings = outputs.track_into(path, recording, rig, str(rig_file), pairs, options)
     print("\n".join([*lines, *summary.file_lines([outputs.relative(file) for file in files])]))

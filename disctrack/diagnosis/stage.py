@@ -24,6 +24,7 @@ from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import sentence
 from disctrack.errors import AnalysisError, OutputError
+from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
@@ -133,10 +134,14 @@ def run_diagnose(
     from disctrack.diagnosis.pages.report import write_report  # matplotlib is wanted here only
 
     path = Path(path)
+    keep(path)
+    keep(Path(model))
     folder = Path(output) if output is not None else path.with_name(f"{path.stem}_diagnosis")
     report = folder / "diagnosis.json"
     if report.exists() and not overwrite:
         raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
+    for name in (report.name, "model.toml"):
+        refuse_input(folder / name)
     provenance = read_provenance(path)
     trajectory = with_declared_dots(read_trajectory(path), read_findings(path))
     try:

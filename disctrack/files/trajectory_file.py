@@ -138,7 +138,7 @@ def write_group(
         created = file.create_group(group, track_order=True)
         write_variables(created, variables, axes)
         created.attrs.update(dict(attributes or {}))
-    write_whole(path, buffer.getbuffer())
+    write_whole(path, buffer.getbuffer(), adds_to_input=True)
 
 
 def read_group(

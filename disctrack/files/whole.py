@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from disctrack.errors import OutputError
+from disctrack.files.inputs import refuse_input
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full. Free some space, or choose another place with -o",
@@ -24,14 +25,17 @@ _REMEDIES = {
 
 
 @contextlib.contextmanager
-def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
+def whole_file(path: Path, suffix: str = "", adds_to_input: bool = False) -> Iterator[Path]:
     """Path to write to; when the block ends without an error it becomes `path` in one step, otherwise it is removed.
 
     A killed process leaves `<name>.<host>-<process>.part`, which the next one that writes
     into the folder from this host clears away.
     suffix : end of the temporary name, for writers that derive the format from it
-    Raises OutputError if the disk is full, read-only or not ours.
+    adds_to_input : the content is that of the file with something added, as when a stage adds its group
+    Raises OutputError if the disk is full, read-only or not ours, or if `path` is an input (`inputs.refuse_input`).
     """
+    if not adds_to_input:
+        refuse_input(path)
     part = path.with_name(f"{path.name}.{_host()}-{os.getpid()}.part{suffix}")
     try:
         make_folder(path.parent)
@@ -48,9 +52,9 @@ def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
-def write_whole(path: Path, content: bytes | memoryview) -> None:
+def write_whole(path: Path, content: bytes | memoryview, adds_to_input: bool = False) -> None:
     """Write `content` to `path`, whole or not at all. Raises OutputError."""
-    with whole_file(path) as part, part.open("wb") as stream:
+    with whole_file(path, adds_to_input=adds_to_input) as part, part.open("wb") as stream:
         stream.write(content)
 
 

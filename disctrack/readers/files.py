@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 from disctrack.errors import RecordingError
+from disctrack.files.inputs import keep
 from disctrack.readers import SUFFIXES
 
 
@@ -22,6 +23,8 @@ def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
         raise RecordingError(
             f"{folder / pattern}: no image matched for the {camera} camera. {_what_is_there(pattern, folder)}"
         )
+    for file in files:
+        keep(file)
     return sorted(files, key=lambda file: natural_key(str(file)))
 
 

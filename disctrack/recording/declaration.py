@@ -12,8 +12,9 @@ from typing import Any
 
 from disctrack.disc import Disc, disc_from_mm
 from disctrack.errors import RecordingError
+from disctrack.files.inputs import RECORDING_FILE, keep
 
-FILE_NAME = "recording.toml"
+FILE_NAME = RECORDING_FILE
 
 # Every key that a recording.toml may hold, in the order of the reference example.
 KEYS: dict[str, tuple[str, ...]] = {
@@ -73,6 +74,7 @@ def read_recording(path: str | Path) -> Recording:
     Raises RecordingError that names the file, the key, what was found, what was expected and what to do.
     """
     file = _recording_file(Path(path))
+    keep(file)
     declared = _parse_toml(file)
     _refuse_unknown_keys(file, declared)
     cameras, disc, markers = (_Section(file, declared, name) for name in ("cameras", "disc", "markers"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -61,9 +62,11 @@ def write_recording(
         raise OutputError(f"{target}: exists; choose another name for the truth or remove it")
     motion = motion or motion_of(scene)
     truth = _truth(scene, motion, rig_of(scene))
-    part = folder.with_name(folder.name + ".part")
+    part = Path()
     try:
-        shutil.rmtree(part, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent))
+        part.chmod(0o755)  # as any new folder, not the user's alone
         for name in ("left", "right", "calibration/left", "calibration/right"):
             (part / name).mkdir(parents=True)
         (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
@@ -80,7 +83,8 @@ def write_recording(
             f"{folder}: the recording cannot be written ({error}); check the disk and the rights"
         ) from error
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        if part.name:
+            shutil.rmtree(part, ignore_errors=True)
     return truth
 
 

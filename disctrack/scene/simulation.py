@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from disctrack.errors import OutputError, SceneError
+from disctrack.files.inputs import keep, refuse_input
 from disctrack.frames import quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion, Regime
 from disctrack.rolling.simulate import simulate
@@ -53,6 +54,8 @@ def run_simulate(
     from disctrack.scene.description import load_scene
     from disctrack.scene.motion import effects_in_words, rolling_model, rolling_start
 
+    keep(scene_path)
+    refuse_input(output)
     scene = load_scene(scene_path)
     if scene.motion.kind != "rolling":
         raise SceneError(
