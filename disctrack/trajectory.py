@@ -81,6 +81,9 @@ class Trajectory:
     q: Array  # (n, 6) x, y, z [m], psi, theta, phi [rad] unwrapped
     pose_covariance: Array  # (n, 6, 6) noise of this frame, in POSE_COMPONENTS (frames.py); calibration not included
     calibration_sensitivity: Array  # (n, 6, 30) d pose / d RIG_PARAMETERS at fixed pixels; common to all frames
+    systematic_covariance: (
+        Array  # (n, 6, 6) what repeats or varies slowly and is not the rig's: dots' misfit beyond noise
+    )
     quaternion: Array  # (n, 4) w, x, y, z; body to world, continuous
     frame_status: NDArray[np.uint8]  # (n,) FrameStatus
     reprojection_rms_px: Array  # (n, 2) per camera
@@ -109,9 +112,9 @@ class Trajectory:
 
     @property
     def calibration_covariance(self) -> Array:
-        """(n, 6, 6) part of the pose's covariance that comes from the rig and is common to all frames."""
+        """(n, 6, 6) part of the pose's covariance that frames share: the rig's, and `systematic_covariance`."""
         S = self.calibration_sensitivity
-        return S @ self.rig.covariance @ np.swapaxes(S, -1, -2)
+        return S @ self.rig.covariance @ np.swapaxes(S, -1, -2) + self.systematic_covariance
 
     @property
     def coordinate_sigma(self) -> Array:
@@ -120,8 +123,13 @@ class Trajectory:
 
     @property
     def calibration_sigma(self) -> Array:
-        """(n, 6) standard deviation of q from the rig's covariance [m, rad]; an error that all frames share."""
+        """(n, 6) standard deviation of q that frames share [m, rad]: from the rig, and systematic."""
         return _coordinate_sigma(self.q, self.calibration_covariance)
+
+    @property
+    def systematic_sigma(self) -> Array:
+        """(n, 6) standard deviation of q from `systematic_covariance` alone [m, rad]."""
+        return _coordinate_sigma(self.q, self.systematic_covariance)
 
 
 def part(trajectory: Trajectory, rows: slice) -> Trajectory:

@@ -39,8 +39,9 @@ _CONVENTIONS = {
     "euler_convention": "R_world_body = Rz(psi) Rx(theta) Rz(phi); psi precession, theta nutation, phi spin; rad",
     "quaternion_convention": "(w, x, y, z), body to world",
     "pixel_convention": "(0, 0) is the centre of the top-left pixel, x right, y down",
-    "sigma_convention": "*_sigma and pose_covariance are the noise of that frame alone; *_sigma_calibration is common "
-    "to all frames and comes from the rig's covariance",
+    "sigma_convention": "*_sigma and pose_covariance are the noise of that frame alone; *_sigma_calibration is what "
+    "frames share: the rig's covariance, and systematic_covariance (misfit of the dots beyond their noise, tolerances "
+    "of the disc). The whole variance is the sum of both squares",
 }
 
 
@@ -265,7 +266,11 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
     parts = (
         ("", "", trajectory.q),
         ("_sigma", "standard deviation, noise of this frame: ", trajectory.coordinate_sigma),
-        ("_sigma_calibration", "standard deviation, calibration: ", trajectory.calibration_sigma),
+        (
+            "_sigma_calibration",
+            "standard deviation shared by frames, calibration and systematic: ",
+            trajectory.calibration_sigma,
+        ),
     )
     for ending, what, values in parts:
         for i, name in enumerate(COORDINATES):
@@ -280,6 +285,12 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
             ("time", "pose_component", "pose_component_2"),
             mixed,
             "covariance of the pose, noise of this frame; calibration not included",
+        ),
+        "systematic_covariance": Variable(
+            trajectory.systematic_covariance,
+            ("time", "pose_component", "pose_component_2"),
+            mixed,
+            "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise",
         ),
         "reprojection_rms_px": Variable(
             trajectory.reprojection_rms_px, ("time", "camera"), "px", "root mean square of observed - projected dots"
@@ -417,6 +428,8 @@ def _trajectory(file: h5py.File) -> Trajectory:
         q=np.column_stack([root[name] for name in COORDINATES]),
         pose_covariance=root["pose_covariance"],
         calibration_sensitivity=calibration["sensitivity"],
+        # files of earlier versions counted it as noise of single frames
+        systematic_covariance=root.get("systematic_covariance", np.zeros_like(root["pose_covariance"])),
         quaternion=root["quaternion"],
         frame_status=root["status"],
         reprojection_rms_px=root["reprojection_rms_px"],
@@ -490,6 +503,7 @@ def _check_shapes(trajectory: Trajectory) -> None:
         "frame": (n,),
         "q": (n, 6),
         "pose_covariance": (n, 6, 6),
+        "systematic_covariance": (n, 6, 6),
         "calibration_sensitivity": (n, 6, len(RIG_PARAMETERS)),
         "quaternion": (n, 4),
         "frame_status": (n,),

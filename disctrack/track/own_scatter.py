@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, StereoRig
 from disctrack.disc import Disc
 from disctrack.track.as_printed import DOT_SIGMA, declared_places_kept, places_sigma, shared_normal_equations
-from disctrack.track.pose import PoseFits, fit_poses
+from disctrack.track.pose import PoseFits, fit_poses, whitening
 
 Array = NDArray[np.float64]
 
 MIN_FRAMES = 20
+LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
 ITERATIONS = 3
 # How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
@@ -107,12 +108,69 @@ def without_shared_faults(
     )
 
 
+@dataclass(frozen=True)
+class Scatter:
+    """Variance of the dots about the fitted poses over what the image noise predicts, and what it is made of."""
+
+    whole: float  # at least 1
+    noise: float  # from one frame to the next
+    systematic: float  # the rest: repeats, or varies slowly
+    systematic_px: tuple[float, float]  # rms of that rest per axis, left and right camera
+
+
+def split_scatter(fits: PoseFits, markers_covariance_px2: Array, faults: SharedFaults | None) -> Scatter:
+    """What the dots do not fit, as noise and as what repeats.
+
+    Where no three successive frames are complete, all that passes a refinement of what frames share is noise.
+    """
+    whole = trimmed_reduced_chi_square(fits)
+    noise = frame_to_frame_chi_square(fits, markers_covariance_px2)
+    if noise is None:
+        whole = max(1.0, whole)
+        noise = whole if faults is None else min(whole, max(1.0, faults.reduced_chi_square))
+    noise = max(noise, LEAST_NOISE)
+    # chance alone: both are means over n frames, the second differences of overlapping triples tell half as much
+    freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))
+    by_chance = 3.0 * noise * np.sqrt(6.0 / max(freedom, 1.0))
+    systematic = whole - noise if whole - noise > by_chance else 0.0
+    rms = (0.0, 0.0)
+    if systematic:
+        share = systematic / whole * 2 * float(fits.used.sum()) / freedom  # the poses take their part of the residuals
+        square = np.where(fits.used[..., None], fits.residuals_px**2, np.nan)
+        # of a normal distribution the median square is 0.455 variances; smears and objects in view do not count
+        left, right = (float(np.sqrt(np.nanmedian(square[:, camera]) / 0.455 * share)) for camera in (0, 1))
+        rms = (left, right)
+    return Scatter(max(1.0, whole), noise, systematic, (rms[0], rms[1]))
+
+
+def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> float | None:
+    """Reduced chi-square of the dots by what changes from one frame to the next alone; None where too few tell.
+
+    Second differences in time of the residuals about the fitted poses, (r[i-1] - 2 r[i] + r[i+1]) / sqrt(6), hold the
+    noise of single frames in full. What repeats, or changes slowly beside the frame rate, is not in them: the lens
+    beyond its polynomial, misprinted dots, gradients of light. The motion is not either, as every frame has its pose.
+    """
+    same = (fits.used[:-2] & fits.used[1:-1] & fits.used[2:]).sum((1, 2)) * 2 - 6
+    steady = (fits.used[:-2] == fits.used[1:-1]).all((1, 2)) & (fits.used[2:] == fits.used[1:-1]).all((1, 2))
+    rows = np.flatnonzero(steady & (same >= 6))
+    if len(rows) < MIN_FRAMES:
+        return None
+    used = fits.used[rows + 1]
+    residuals = fits.residuals_px
+    bend = residuals[rows] - 2.0 * residuals[rows + 1] + residuals[rows + 2]
+    W = whitening(np.where(used[..., None, None], markers_covariance_px2[rows + 1], np.eye(2)))
+    whitened = np.where(used[..., None], (W @ np.where(used[..., None], bend, 0.0)[..., None])[..., 0], 0.0)
+    return _trimmed_mean(np.sum(whitened**2, axis=(1, 2, 3)) / (6.0 * same[rows]))
+
+
 def trimmed_reduced_chi_square(fits: PoseFits) -> float:
     """Mean reduced chi-square of the frames, without the twentieth that fits worst (smears, objects in view)."""
-    reduced = np.sort(fits.reduced_chi_square[fits.degrees_of_freedom >= 6])
-    if len(reduced) < MIN_FRAMES:
-        return 1.0
-    kept = reduced[: int(0.95 * len(reduced))]
+    reduced = fits.reduced_chi_square[fits.degrees_of_freedom >= 6]
+    return 1.0 if len(reduced) < MIN_FRAMES else _trimmed_mean(reduced)
+
+
+def _trimmed_mean(reduced: Array) -> float:
+    kept = np.sort(reduced)[: int(0.95 * len(reduced))]
     # the 5 % that are cut hold more than 5 % of the sum: 18 degrees of freedom lose 4 % of their mean
     return float(kept.mean() / 0.96)
 

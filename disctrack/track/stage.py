@@ -167,6 +167,7 @@ def measure(
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,
         "noise_factor": tracking.noise_factor,
+        "systematic_px": list(tracking.systematic_px),
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
         "acquisitions": tracking.acquisitions,

@@ -37,7 +37,7 @@ from disctrack.track.dots import (
     typical_noise,
 )
 from disctrack.track.motion_span import StillScene
-from disctrack.track.own_scatter import SharedFaults, trimmed_reduced_chi_square, without_shared_faults
+from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -67,6 +67,7 @@ NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every th
 MIN_GOOD_DOT_IMAGES = 6
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
+ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
@@ -96,10 +97,10 @@ class Tracking:
     noise: tuple[NoiseModel, NoiseModel]  # left, right
     blur_px: tuple[float, float]
     as_built: AsBuilt
-    variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared;
-    # the covariances of the poses are multiplied by it (never by less than 1)
-    noise_factor: float  # the same with cameras, dots and clock free (`own_scatter`): the dots' own scatter, by which
-    # their covariances are multiplied
+    variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared
+    noise_factor: float  # the part of it that changes from frame to frame (`own_scatter`), by which the covariances of
+    # dots and poses are multiplied; what is left of the other makes `Trajectory.systematic_covariance`
+    systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     warnings: tuple[str, ...]
 
@@ -592,12 +593,13 @@ def _assemble(
     if settings.refine_markers and faults is not None:
         as_built = _without_false_shifts(as_built, first.disc, faults)
     fits = _fit_all(tables, as_built, settings.reject_outliers)
-    factor = max(1.0, trimmed_reduced_chi_square(fits))
-    noise_factor = factor if faults is None else min(factor, max(1.0, faults.reduced_chi_square))
+    scatter = split_scatter(fits, tables.covariance_px2, faults)
+    factor, noise_factor = scatter.whole, scatter.noise
     tables.covariance_px2 *= noise_factor  # in place: nobody else holds them
-    fits.covariance[...] *= factor
+    systematic = fits.covariance * scatter.systematic
+    fits.covariance[...] *= noise_factor
     fits = replace(fits, chi_square=fits.chi_square / factor)
-    trajectory = _trajectory(fits, tables, as_built, time, pairs, frame_rate, gravity)
+    trajectory = _trajectory(fits, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     return Tracking(
         trajectory=trajectory,
         noise=(first.noise[0], first.noise[1]),
@@ -605,8 +607,9 @@ def _assemble(
         as_built=as_built,
         variance_factor=factor,
         noise_factor=noise_factor,
+        systematic_px=scatter.systematic_px,
         acquisitions=sum(f.acquisitions for f in followers),
-        warnings=_warnings(first, factor, noise_factor, trajectory),
+        warnings=_warnings(first, factor, faults, scatter, trajectory),
     )
 
 
@@ -644,6 +647,7 @@ def _fit_all(tables: _Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseF
 
 def _trajectory(
     fits: PoseFits,
+    systematic: Array,
     tables: _Tables,
     as_built: AsBuilt,
     time: Array,
@@ -674,6 +678,7 @@ def _trajectory(
         q=np.column_stack([fits.t_world_body, euler]),
         pose_covariance=fits.covariance,
         calibration_sensitivity=fits.sensitivity,
+        systematic_covariance=systematic,
         quaternion=quaternion,
         frame_status=status,
         reprojection_rms_px=rms,
@@ -698,9 +703,11 @@ def _table_gap(trajectory: Trajectory) -> Array:
 
 
 def _warnings(
-    follower: _Follower, variance_factor: float, noise_factor: float, trajectory: Trajectory
+    follower: _Follower, variance_factor: float, faults: SharedFaults | None, scatter: Scatter, trajectory: Trajectory
 ) -> tuple[str, ...]:
     warnings = []
+    own = variance_factor if faults is None else max(1.0, faults.reduced_chi_square)
+    systematic_px = max(scatter.systematic_px)
     one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
     if one > both:
         warnings.append(
@@ -719,15 +726,15 @@ def _warnings(
                 f"{camera} camera: the light round the dots is clipped at grey value {saturation}, which hides part of "
                 "their edges and of the noise: positions may be off by a micrometre. Expose for a shorter time"
             )
-    if variance_factor > FAULTY * noise_factor:
+    if variance_factor > FAULTY * own and systematic_px > ORDINARY_PX:
         warnings.append(
-            f"the dots miss their fitted places by {np.sqrt(variance_factor / noise_factor):.1f} times their own "
-            "scatter: a camera moved, was refocused or lags since the calibration. disctrack diagnose tells which; "
-            "calibrate again, or check the synchronisation"
+            f"the dots miss their fitted places by {np.sqrt(variance_factor / own):.1f} times their own "
+            f"scatter ({systematic_px:.3f} px): a camera moved, was refocused or lags since the calibration. "
+            "disctrack diagnose tells which; calibrate again, or check the synchronisation"
         )
-    elif variance_factor > 4.0:
+    elif scatter.noise > 4.0:
         warnings.append(
-            f"the dots scatter {np.sqrt(variance_factor):.1f} times more than the image noise explains: they are not "
+            f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
             "round, or their edges are not sharp, or the images were processed"
         )
     gap = _table_gap(trajectory)

@@ -53,6 +53,7 @@ def trajectory() -> Trajectory:
         q=q,
         pose_covariance=np.broadcast_to(np.eye(6) * 1e-12, (n, 6, 6)).copy(),
         calibration_sensitivity=np.ones((n, 6, 30)),
+        systematic_covariance=np.zeros((n, 6, 6)),
         quaternion=quaternion_from_rotation(R),
         frame_status=status,
         reprojection_rms_px=np.full((n, 2), 0.01),

@@ -11,8 +11,9 @@ from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion
 from disctrack.scene.description import CameraFault, Faults
 from disctrack.track.as_printed import declared_places_kept
-from disctrack.track.own_scatter import without_shared_faults
-from tests.oracles.measured_disc import measured
+from disctrack.track.own_scatter import split_scatter, without_shared_faults
+from disctrack.track.pose import fit_poses
+from tests.oracles.measured_disc import SIGMA_PX, measured
 
 N = 160
 # relative scatter of chi-square with 18 degrees of freedom in N frames: sqrt(2 / 18 / N) = 2.6 %; four of these
@@ -55,6 +56,30 @@ def test_noise_of_the_dots_themselves_remains(rng):
     trajectory = measured(n=N)
     doubled = trajectory.markers_px + np.sqrt(3) * 0.006 * rng.standard_normal(trajectory.markers_px.shape)
     assert_allclose(judged(replace(trajectory, markers_px=doubled)).reduced_chi_square, 4.0, rtol=TOLERANCE)
+
+
+def test_what_repeats_is_not_noise_and_noise_does_not_repeat(rng):
+    """A smooth field in the image is told apart from white noise; both sizes are known here."""
+    trajectory = measured(n=N)
+    field = 0.02 * np.sqrt(2) * np.sin(trajectory.markers_px[..., ::-1] * 2 * np.pi / 300 + [0.3, 1.1])
+    white = SIGMA_PX * rng.standard_normal(trajectory.markers_px.shape)
+
+    def split(markers):
+        R = rotation_from_quaternion(trajectory.quaternion)
+        covariance = trajectory.markers_covariance_px2
+        centres = trajectory.disc.marker_centres_body
+        return split_scatter(
+            fit_poses(markers, covariance, trajectory.rig, centres, R, trajectory.q[:, :3]), covariance, None
+        )
+
+    # second differences of triples that overlap tell half as much as independent frames
+    # second differences of triples that overlap tell half as much as independent frames
+    smooth = split(trajectory.markers_px + field)
+    assert_allclose(smooth.noise, 1.0, atol=2 * TOLERANCE)
+    assert_allclose(smooth.systematic_px, 0.02, rtol=0.35)  # a few places of the image stand for the whole
+    rough = split(trajectory.markers_px + white)
+    assert_allclose(rough.noise, 2.0, rtol=2 * TOLERANCE)
+    assert rough.systematic_px == (0.0, 0.0)
 
 
 def test_misprinted_dot_is_found_where_it_is_and_the_others_stay():

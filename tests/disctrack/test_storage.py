@@ -60,6 +60,7 @@ def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
         q=q,
         pose_covariance=np.where(lost[:, None, None], np.nan, halves @ np.swapaxes(halves, 1, 2)),
         calibration_sensitivity=rng.normal(size=(n, 6, N_RIG)),
+        systematic_covariance=np.full((n, 6, 6), 0.25),
         quaternion=quaternion,
         frame_status=status,
         reprojection_rms_px=rng.uniform(0, 0.05, (n, 2)),

@@ -162,6 +162,7 @@ def tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig
         q=np.column_stack([position, unwrap_euler(euler_from_rotation(R))]),
         pose_covariance=np.broadcast_to(P if noise else pose_covariance(), (n, 6, 6)).copy(),
         calibration_sensitivity=np.zeros((n, 6, N_RIG)) if sensitivity is None else sensitivity,
+        systematic_covariance=np.zeros((n, 6, 6)),
         quaternion=continuous_quaternions(quaternion_from_rotation(R)),
         frame_status=status,
         reprojection_rms_px=np.full((n, 2), 0.02),

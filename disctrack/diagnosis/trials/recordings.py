@@ -205,6 +205,7 @@ def _tracked(pixels: Array, dots: Array, q: Array, rig: StereoRig, disc: Disc, r
         q=np.column_stack([fits.t_world_body, angles]),
         pose_covariance=fits.covariance,
         calibration_sensitivity=fits.sensitivity,
+        systematic_covariance=np.zeros((len(fits.covariance), 6, 6)),
         quaternion=continuous_quaternions(quaternion_from_rotation(fits.R_world_body)),
         frame_status=np.zeros(n, np.uint8),
         reprojection_rms_px=np.sqrt(np.nanmean(fits.residuals_px**2, axis=(2, 3))),
