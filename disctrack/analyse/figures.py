@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,24 +12,14 @@ from numpy.typing import NDArray
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import Series
+from disctrack.pages.figures import Drawn, dress
+from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 Array = NDArray[np.float64]
 
-INK, MUTED, GRID = "#1d2733", "#6b7885", "#e3e8ed"
-BLUE, RED, GREEN, AMBER = "#1f6f8b", "#c8553d", "#4f8a4c", "#c8922d"
 BAND = 3.0  # sigmas shown as a band
 INSET_DURATION = 0.3  # [s] last stage, as in the paper's figures 4 and 10
 MIN_INSET_SHARE = 2.5  # the inset is drawn when the recording is this many times longer
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """One figure with what is said below it."""
-
-    name: str  # of the file
-    title: str
-    caption: str
-    figure: Figure
 
 
 def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
@@ -62,18 +51,6 @@ def _axes(width: float = 7.2, height: float = 3.6) -> tuple[Figure, Axes]:
     axes = figure.add_subplot()
     dress(axes)
     return figure, axes
-
-
-def dress(axes: Axes) -> None:
-    """Grid, colours and spines of every plot."""
-    axes.grid(True, color=GRID, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    for spine in axes.spines.values():
-        spine.set_color(MUTED)
-    axes.tick_params(colors=INK, labelsize=9)
-    axes.xaxis.label.set_color(INK)
-    axes.yaxis.label.set_color(INK)
 
 
 def _band(axes: Axes, time: Array, series: Series, scale: float, colour: str, label: str) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
+from disctrack.files.json_text import json_file
 from disctrack.files.trajectory_file import read_provenance
 from disctrack.files.whole import write_whole
 
@@ -66,7 +67,7 @@ def stages_asked(options: BatchOptions) -> dict[str, Any]:
 def write_record(folder: Path, record: Record) -> None:
     """Write it whole. Raises OutputError."""
     document = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **record.__dict__}
-    write_whole(folder / RECORD, (json.dumps(document, indent=1) + "\n").encode())
+    write_whole(folder / RECORD, json_file(document))
 
 
 def read_record(folder: Path) -> Record | None:

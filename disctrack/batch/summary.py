@@ -17,6 +17,7 @@ from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places, options_as_json
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
 from disctrack.errors import OutputError
+from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
@@ -89,7 +90,7 @@ def write_summary(
             "columns": COLUMNS,
             "recordings": rows,
         }
-        write_whole(folder / "summary.json", (json.dumps(document, indent=1) + "\n").encode())
+        write_whole(folder / "summary.json", json_file(document))
         write_whole(folder / "summary.csv", _as_csv(rows).encode())
         problem = write_index(folder / "index.html", rows, compare=options.report)
     files = tuple(folder / name for name in ("summary.json", "summary.csv", "index.html"))

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from calibration import StereoCalibration
 from disctrack.frames import CAMERAS
-from disctrack.track.figures import COLOURS, INK
+from disctrack.pages.palette import COLOURS, INK
 
 COVERAGE_CELLS = 8
 
@@ -41,7 +41,10 @@ def _magnification(found: StereoCalibration, typical: float) -> float:
 def _arrows(axes: Axes, found: StereoCalibration, camera: int, typical: float) -> None:
     refinement, scale = found.refinement, _magnification(found, typical)
     mine = refinement.observations.camera == camera
-    for select, colour, most in ((refinement.kept, COLOURS[CAMERAS[camera]], np.inf), (~refinement.kept, "red", 4.0)):
+    for select, colour, most in (
+        (refinement.kept, COLOURS[CAMERAS[camera]], np.inf),
+        (~refinement.kept, "red", 4.0),
+    ):
         pixels = refinement.observations.pixels[mine & select]
         arrows = refinement.residuals[mine & select] * scale
         length = np.linalg.norm(arrows, axis=1, keepdims=True)

@@ -155,7 +155,8 @@ def _companions(
         storage.write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
         yield path.with_suffix(".csv")
     if options.figures:
-        from disctrack.track.figures import FIGURES, save_figure
+        from disctrack.pages.figures import save_figure
+        from disctrack.track.figures import FIGURES
 
         for name, make in FIGURES.items():
             picture = path.with_name(f"{prefix}{name}.png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import sentence
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.json_text import json_file
 from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
@@ -153,7 +153,7 @@ def run_diagnose(
         result = replace(result, moment=beside.moment)
     document = {"recording": provenance.recording, **as_json(result, beside)}
     write_diagnosis(path, result, beside, document)
-    write_whole(report, (json.dumps(document, indent=1) + "\n").encode())
+    write_whole(report, json_file(document))
     toml = folder / "model.toml"
     text = model_toml(result.system, result.after_fit.values, provenance.recording)
     write_whole(toml, text.encode())

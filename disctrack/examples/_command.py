@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import io
-import json
-import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from disctrack.analyse.figures import GRID, INK
 from disctrack.errors import DiscTrackError, OutputError
+from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
-
-DPI = 150
+from disctrack.pages.figures import save_figure
 
 
 @dataclass(frozen=True)
@@ -50,36 +44,9 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
         outcome = diagnose() if data is None else diagnose(given.folder)
         print(outcome.table)
         if given.output is not None:
-            write_whole(
-                given.output / "diagnosis.json", (json.dumps(finite(outcome.document), indent=1) + "\n").encode()
-            )
-            write_whole(given.output / f"{name}.png", png(outcome.figure))
+            write_whole(given.output / "diagnosis.json", json_file(outcome.document))
+            save_figure(outcome.figure, given.output / f"{name}.png")
     except DiscTrackError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def finite(x: Any) -> Any:
-    """The same with None for numbers that JSON does not know."""
-    if isinstance(x, dict):
-        return {k: finite(v) for k, v in x.items()}
-    if isinstance(x, list | tuple):
-        return [finite(v) for v in x]
-    return None if isinstance(x, float) and not math.isfinite(x) else x
-
-
-def png(figure: Figure) -> bytes:
-    """The figure as a file."""
-    FigureCanvasAgg(figure)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()
-
-
-def dress(axes: Axes) -> None:
-    """Grid and spines as in the other figures."""
-    axes.grid(True, color=GRID, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(colors=INK, labelsize=9)

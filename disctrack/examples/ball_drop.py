@@ -19,7 +19,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from disctrack.analyse.figures import AMBER, BLUE, GREEN, MUTED, RED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out
@@ -27,8 +26,10 @@ from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
 from disctrack.diagnosis.engine.search import CLASS_GAIN
 from disctrack.diagnosis.engine.system import Quantity, Subset
 from disctrack.diagnosis.pages.general import document, fit_errors
-from disctrack.examples._command import Outcome, command, dress
+from disctrack.examples._command import Outcome, command
 from disctrack.examples.ball_system import GRAVITY, BallDrops, Drop, height_noise, read_drops
+from disctrack.pages.figures import dress
+from disctrack.pages.palette import AMBER, BLUE, GREEN, MUTED, RED
 
 Array = NDArray[np.float64]
 

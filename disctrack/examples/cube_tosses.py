@@ -19,7 +19,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from disctrack.analyse.figures import BLUE, MUTED, RED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out
@@ -27,7 +26,7 @@ from disctrack.diagnosis.engine.search import CLASS_GAIN
 from disctrack.diagnosis.engine.system import Subset, Values
 from disctrack.diagnosis.pages.general import document, fit_errors, memory, portmanteau
 from disctrack.diagnosis.pages.words import quantity_text
-from disctrack.examples._command import Outcome, command, dress
+from disctrack.examples._command import Outcome, command
 from disctrack.examples.cube_checks import checks
 from disctrack.examples.cube_data import (
     FRAME_RATE,
@@ -37,6 +36,8 @@ from disctrack.examples.cube_data import (
 )
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import CHANNELS, GROUPS, HELD_OUT, CubeTosses, white_chi_square
+from disctrack.pages.figures import dress
+from disctrack.pages.palette import BLUE, MUTED, RED
 
 Array = NDArray[np.float64]
 

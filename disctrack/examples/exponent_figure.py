@@ -8,19 +8,19 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from disctrack.analyse.figures import AMBER, BLUE, GREEN, INK, MUTED, RED
 from disctrack.diagnosis.engine.system import Values
-from disctrack.examples._command import dress
 from disctrack.examples.exponent_analysis import THIN_DISC, Explanation
 from disctrack.examples.exponent_report import Answer
 from disctrack.examples.exponent_system import ExponentSystem, Series
+from disctrack.pages.figures import dress
+from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED, SKY
 
 Array = NDArray[np.float64]
 
 AXES = ((0, 1), (0, 2))  # pairs of exponents that are shown against each other
 LABELS = (r"$n_\theta$", r"$n_{\dot\psi}$", "$n_E$")
 FRACTIONS = (0.0, 0.5, 1.0)  # of the fitted size
-_STYLES = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (AMBER, "D"), ("#7a4fb5", "v"), ("#0d8a8a", "P"))
+_STYLES = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (AMBER, "D"), (PURPLE, "v"), (SKY, "P"))
 
 
 def draw(system: ExponentSystem, answer: Answer) -> Figure:

@@ -11,7 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from disctrack.analyse.figures import AMBER, BLUE, GREEN, INK, INSET_DURATION, MIN_INSET_SHARE, MUTED, RED, Drawn, dress
+from disctrack.analyse.figures import INSET_DURATION, MIN_INSET_SHARE
+from disctrack.pages.figures import Drawn, dress
+from disctrack.pages.palette import AMBER, BLUE, INK, MUTED, SERIES
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import ExponentTable, RepeatGroup
 from disctrack.repeats.runs import INDEX, QUANTITIES, Run
@@ -19,7 +21,6 @@ from disctrack.repeats.spread import Spread
 
 Array = NDArray[np.float64]
 
-COLOURS = (BLUE, RED, GREEN, AMBER, "#7a5aa6", "#3aa6a0", "#a63d6a", MUTED)
 MOST_NAMED = 8  # runs in a legend
 FITTED_LABELS = {"n_energy": "n_E", "n_theta": "n_θ", "n_psidot": "n_ψ̇", "k_m": "k_m (10⁻⁷ m s²)"}
 FITTED_SCALES = {"n_energy": 1.0, "n_theta": 1.0, "n_psidot": 1.0, "k_m": 1e7}
@@ -43,7 +44,7 @@ def slug(name: str) -> str:
 
 
 def _colour(i: int) -> str:
-    return COLOURS[i % len(COLOURS)]
+    return SERIES[i % len(SERIES)]
 
 
 def _lines(axes: Axes, time: Array, values: Array, runs: Sequence[Run], width: float = 0.9) -> None:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from disctrack.analyse.report import STYLE, draw, gallery, html_table
+from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
+from disctrack.pages.figures import draw, gallery
+from disctrack.pages.html import bullets, page, paragraph, section, table, warning
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import Comparison, ExponentTable, RepeatGroup
 from disctrack.repeats.figures import FITTED_SCALES, fitted_figure, group_figures, slug, with_sigma
@@ -43,25 +43,21 @@ def write(comparison: Comparison, folder: Path) -> Written:
     parts = [_table_section(t, f, pictures) for t, f in zip(comparison.tables, fitted, strict=True)]
     parts += [_group_section(g, f, pictures) for g, f in zip(comparison.groups, by_group, strict=True)]
     fragment = "\n".join([*parts, _left_out(comparison)])
-    page = folder / "repeats.html"
-    head = (
-        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Repeats</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head>'
-        f"<body><main><h1>Repeats compared</h1><p class=lead>{escape(_lead(comparison))}</p>"
-    )
+    written = folder / "repeats.html"
     tables = {
         "runs.csv": _csv(_runs_table(comparison)),
         "averages.csv": _csv(_averages_table(comparison)),
-        "repeats.json": json.dumps(as_json(comparison), indent=1, allow_nan=False) + "\n",
+        "repeats.json": json_file(as_json(comparison)),
     }
     for number, group in enumerate(comparison.groups, 1):
         if group.spread is not None:
             tables[f"spread_{number:02d}_{slug(group.name)}.csv"] = _csv(_spread_table(group.spread))
-    for name, text in tables.items():
-        write_whole(folder / name, text.encode())
+    for name, content in tables.items():
+        write_whole(folder / name, content)
         files.append(folder / name)
-    write_whole(page, f"{head}{fragment}</main></body></html>\n".encode())
-    return Written(page, fragment, (page, *files))
+    lead = paragraph(_lead(comparison), "lead")
+    write_whole(written, page("Repeats compared", [lead, fragment]).encode())
+    return Written(written, fragment, (written, *files))
 
 
 def _lead(comparison: Comparison) -> str:
@@ -73,11 +69,11 @@ def _lead(comparison: Comparison) -> str:
     )
 
 
-def _table_section(table: ExponentTable, figure: Any, pictures: dict[str, str]) -> str:
+def _table_section(found: ExponentTable, figure: Any, pictures: dict[str, str]) -> str:
     """As the paper's tables 2 and 3, with sigmas."""
     rows = [
         (group, str(trial), run.name, *(_cell(name, run.fitted[name]) for name in FITTED))
-        for group, trial, run in table.rows
+        for group, trial, run in found.rows
     ]
     for label, cell in (
         ("mean ± standard error of the scatter", lambda n, a: _two(n, a.mean, a.standard_error)),
@@ -85,15 +81,14 @@ def _table_section(table: ExponentTable, figure: Any, pictures: dict[str, str]) 
         ("χ² / degrees of freedom", lambda n, a: f"{a.chi_square:.3g} / {a.degrees_of_freedom}" if a.n > 1 else ""),
         ("Birge ratio", lambda n, a: f"{a.birge_ratio:.2f}" if a.n > 1 else ""),
     ):
-        cells = [cell(n, table.averages[n]) if n in table.averages else "-" for n in FITTED]
+        cells = [cell(n, found.averages[n]) if n in found.averages else "-" for n in FITTED]
         rows.append((label, "", "", *cells))
     header = ("case", "trial", "recording", "n_E", "n_θ", "n_ψ̇", "t_f (s)", "k_m (10⁻⁷ m s²)")
     caption = "As tables 2 and 3 of Ma et al. 2014 (value ± σ of one run). t_f is on each recording's own clock."
-    verdicts = "".join(f"<li>{escape(name)}: {escape(a.verdict)}</li>" for name, a in table.averages.items() if a.n > 1)
-    sources = sorted({run.k_m_source for _, _, run in table.rows})
-    said = f"<ul>{verdicts}</ul><p>k_m: {escape(_k_m_words(sources))}</p>"
+    verdicts = bullets(f"{name}: {a.verdict}" for name, a in found.averages.items() if a.n > 1)
+    said = paragraph(f"k_m: {_k_m_words(sorted({run.k_m_source for _, _, run in found.rows}))}")
     picture = gallery([figure], pictures) if figure else ""
-    return f"<section><h2>{escape(table.title)}</h2>{html_table(caption, header, rows)}{said}{picture}</section>"
+    return section(found.title, [table(caption, header, rows), verdicts, said, picture])
 
 
 def _k_m_words(sources: Sequence[str]) -> str:
@@ -115,20 +110,13 @@ def _two(name: str, value: float, sigma: float) -> str:
 
 
 def _group_section(group: RepeatGroup, figures: Sequence[Any], pictures: dict[str, str]) -> str:
-    parts = [f"<section><h2>{escape(group.name)}: {len(group.runs)} run{'s' * (len(group.runs) > 1)}</h2>"]
-    if group.remarks:
-        parts.append("<div class=warn><ul>" + "".join(f"<li>{escape(r)}</li>" for r in group.remarks) + "</ul></div>")
-    if group.spread is None:
-        return "".join([*parts, "<p>No repeat of this one.</p></section>" if len(group.runs) == 1 else "</section>"])
-    return "".join(
-        [
-            *parts,
-            _clock_table(group, group.spread),
-            _parts_table(group.spread),
-            gallery(figures, pictures),
-            "</section>",
-        ]
-    )
+    title = f"{group.name}: {len(group.runs)} run{'s' * (len(group.runs) > 1)}"
+    parts: list[str] = [warning("Mind", group.remarks)]
+    if group.spread is not None:
+        parts += [_clock_table(group, group.spread), _parts_table(group.spread), gallery(figures, pictures)]
+    elif len(group.runs) == 1:
+        parts.append(paragraph("No repeat of this one."))
+    return section(title, parts)
 
 
 def _clock_table(group: RepeatGroup, found: Spread) -> str:
@@ -139,7 +127,7 @@ def _clock_table(group: RepeatGroup, found: Spread) -> str:
         rows.append((run.name, zero, group.alignment.method[i], *offsets))
     header = ("recording", "time zero (s)", "by", "x (mm)", "y (mm)", "ψ (deg)", "φ (deg)")
     caption = f"On one clock, zero at {group.alignment.zero}; offsets from the mean of the runs."
-    return html_table(caption, header, rows)
+    return table(caption, header, rows)
 
 
 def _parts_table(found: Spread) -> str:
@@ -152,19 +140,17 @@ def _parts_table(found: Spread) -> str:
         for q, part in zip(QUANTITIES, found.parts, strict=True)
     ]
     header = ("coordinate", "spread", "measurement", "clock", "the motion's own", "verdict")
-    return html_table("Standard deviation over the runs, rms over the time that they share.", header, rows)
+    return table("Standard deviation over the runs, rms over the time that they share.", header, rows)
 
 
 def _left_out(comparison: Comparison) -> str:
-    if not comparison.left_out:
-        return ""
     rows = [(str(item.path), item.reason) for item in comparison.left_out]
-    return f"<section><h2>Not compared</h2>{html_table('Files and reasons.', ('file', 'reason'), rows)}</section>"
+    return section("Not compared", [table("Files and reasons.", ("file", "reason"), rows)]) if rows else ""
 
 
 def as_json(comparison: Comparison) -> dict[str, Any]:
     """The comparison without its curves, of JSON's types; null where there is no number. SI and radians."""
-    return _plain(
+    return plain(
         {
             "groups": [
                 {
@@ -215,24 +201,13 @@ def _spread_json(found: Spread | None) -> dict[str, Any] | None:
     }
 
 
-def _plain(item: Any) -> Any:
-    """NaN and infinity as None, tuples as lists."""
-    if isinstance(item, dict):
-        return {key: _plain(value) for key, value in item.items()}
-    if isinstance(item, list | tuple):
-        return [_plain(value) for value in item]
-    if isinstance(item, float | np.floating):
-        return float(item) if np.isfinite(item) else None
-    return item.item() if isinstance(item, np.generic) else item
-
-
 def _runs_table(comparison: Comparison) -> Iterable[Sequence[Any]]:
     yield ["table", "case", "trial", "recording", "surface", *(c for n in FITTED for c in (n, f"{n}_sigma")),
            "k_m_sigma_calibration", "k_m_source", "outlier_in", "file"]  # fmt: skip
-    for number, table in enumerate(comparison.tables, 1):
-        for i, (group, trial, run) in enumerate(table.rows):
+    for number, found in enumerate(comparison.tables, 1):
+        for i, (group, trial, run) in enumerate(found.rows):
             numbers = [v for n in FITTED for v in (run.fitted[n].value, run.fitted[n].sigma)]
-            away = " ".join(name for name, a in table.averages.items() if i in a.outliers)
+            away = " ".join(name for name, a in found.averages.items() if i in a.outliers)
             yield [number, group, trial, run.name, run.surface, *numbers, run.fitted["k_m"].sigma_calibration,
                    run.k_m_source, away, str(run.path)]  # fmt: skip
 
@@ -241,7 +216,7 @@ def _averages_table(comparison: Comparison) -> Iterable[Sequence[Any]]:
     fields = ("n", "mean", "standard_error", "weighted", "sigma", "sigma_internal", "sigma_external", "chi_square",
               "degrees_of_freedom", "p_value", "birge_ratio", "agree")  # fmt: skip
     yield ["over", "quantity", "value", "value_sigma", *fields]
-    sets = [(table.title, table.averages) for table in comparison.tables]
+    sets = [(t.title, t.averages) for t in comparison.tables]
     sets += [(group.name, group.averages) for group in comparison.groups if len(group.runs) > 1]
     for name, averages in sets:
         for quantity, item in averages.items():
@@ -261,12 +236,12 @@ def _spread_table(found: Spread) -> Iterable[Sequence[Any]]:
         ]
 
 
-def _csv(rows: Iterable[Sequence[Any]]) -> str:
+def _csv(rows: Iterable[Sequence[Any]]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text)
     for row in rows:
         writer.writerow([_csv_cell(cell) for cell in row])
-    return text.getvalue()
+    return text.getvalue().encode()
 
 
 def _csv_cell(cell: Any) -> Any:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from disctrack.files.whole import whole_file
 from disctrack.frames import CAMERAS, COORDINATES
+from disctrack.pages.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
 
-COLOURS = {"left": "#1f6f8b", "right": "#c8553d"}
-INK = "#222222"
 BAND = 3.0  # sigmas shown as a band: one is thinner than the line in most recordings
 _LABELS = {
     "x": ("x", "mm", 1e3),
@@ -29,14 +25,6 @@ _LABELS = {
     "theta": ("nutation θ", "deg", 180 / np.pi),
     "phi": ("spin φ", "deg", 180 / np.pi),
 }
-
-
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure whole; the format follows from the name. Raises OutputError."""
-    FigureCanvasAgg(figure)
-    with whole_file(path) as part:
-        figure.savefig(part, format=path.suffix[1:], dpi=130)
-    return path
 
 
 def coordinates_figure(trajectory: Trajectory) -> Figure:
@@ -77,7 +65,11 @@ def _sigmas(axes: Axes, trajectory: Trajectory, i: int, sigma: Array, shared: Ar
     axes.plot(trajectory.time, sigma * scale, color=COLOURS["left"], linewidth=0.9, label="this frame's noise")
     if np.nanmax(shared, initial=0.0) > 0:
         axes.plot(
-            trajectory.time, shared * scale, color=COLOURS["right"], linewidth=0.9, label="calibration, shared by all"
+            trajectory.time,
+            shared * scale,
+            color=COLOURS["right"],
+            linewidth=0.9,
+            label="calibration, shared by all",
         )
     finite = np.concatenate([sigma, shared])
     finite = finite[np.isfinite(finite) & (finite > 0)] * scale
@@ -113,7 +105,7 @@ def reprojection_figure(trajectory: Trajectory) -> Figure:
     error.set_ylim(bottom=0)
     error.legend(frameon=False, fontsize=8)
     chi.plot(trajectory.time, trajectory.reduced_chi_square, color=INK, linewidth=0.8)
-    chi.axhline(1.0, color="#888888", linewidth=0.8, linestyle="--")
+    chi.axhline(1.0, color=MUTED, linewidth=0.8, linestyle="--")
     chi.set_ylabel("reduced χ²")
     chi.set_ylim(bottom=0)
     used.set_ylabel("dots used")
@@ -148,8 +140,8 @@ def dots_figure(trajectory: Trajectory) -> Figure:
 
 def _dot(axes: Axes, residuals: Array, colour: str, reach: float) -> None:
     good = residuals[np.isfinite(residuals).all(axis=1)]
-    axes.axhline(0, color="#bbbbbb", linewidth=0.6)
-    axes.axvline(0, color="#bbbbbb", linewidth=0.6)
+    axes.axhline(0, color=MUTED, linewidth=0.6)
+    axes.axvline(0, color=MUTED, linewidth=0.6)
     axes.plot(good[:, 0], good[:, 1], ".", color=colour, markersize=2, alpha=0.35)
     if len(good) > 1:
         mean, error = good.mean(axis=0), 3 * good.std(axis=0) / np.sqrt(len(good))

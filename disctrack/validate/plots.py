@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
+from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED
 from disctrack.validate.comparison import Comparison, joined
 from disctrack.validate.efficiency import Efficiency
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, Stress
@@ -18,8 +19,7 @@ from disctrack.validate.trial import Trial
 Array = NDArray[np.float64]
 
 _UM, _DEG = 1e6, 180 / np.pi
-AXES = ("#1f6f8b", "#e09f3e", "#9e2a2b")
-POSITION, TURN, CLAIM_COLOUR, GREY = "#1f6f8b", "#c8553d", "#222222", "#9a9a9a"
+AXES = (BLUE, AMBER, RED)
 
 
 def error_figure(trials: Sequence[Trial], law: float) -> Figure:
@@ -34,9 +34,9 @@ def error_figure(trials: Sequence[Trial], law: float) -> Figure:
     _points(middle, parts, lambda c: np.abs(c.error[:, 3:]) * _DEG, AXES, "xyz")
     _claim(middle, CLAIM_ROTATION * _DEG, "claim 0.05°")
     middle.set(title="rotation vector, world axes", ylabel="|error| (deg)")
-    _points(right, parts, lambda c: np.abs(c.angles) * _DEG, ("#5f4b8b", GREY, "#2a9d8f"), ("ψ", "θ", "φ"))
+    _points(right, parts, lambda c: np.abs(c.angles) * _DEG, (PURPLE, MUTED, GREEN), ("ψ", "θ", "φ"))
     theta = np.geomspace(0.45, 90, 200)
-    right.plot(theta, law * _DEG / np.sin(np.radians(theta)), color=CLAIM_COLOUR, lw=1.2,
+    right.plot(theta, law * _DEG / np.sin(np.radians(theta)), color=INK, lw=1.2,
                label=f"σ = {law * _DEG * 1e3:.2f} mdeg / sin θ")  # fmt: skip
     _claim(right, CLAIM_ROTATION * _DEG, "claim 0.05°")
     right.set(title="Euler angles", ylabel="|error| (deg)")
@@ -72,7 +72,7 @@ def _points(
 
 
 def _claim(axes: Axes, value: float, label: str) -> None:
-    axes.axhline(value, color=CLAIM_COLOUR, lw=1.2, ls="--", label=label)
+    axes.axhline(value, color=INK, lw=1.2, ls="--", label=label)
 
 
 def bound_figure(e: Efficiency) -> Figure:
@@ -81,14 +81,14 @@ def bound_figure(e: Efficiency) -> Figure:
     axes = figure.subplots(1, 3)
     theta = np.degrees(e.q[:, 4])
     panels = (
-        ("position, rms of the axes", "µm", _UM, [0, 1, 2], POSITION),
-        ("rotation, per axis", "mdeg", _DEG * 1e3, [6], TURN),
-        ("ψ", "mdeg", _DEG * 1e3, [3], "#5f4b8b"),
+        ("position, rms of the axes", "µm", _UM, [0, 1, 2], BLUE),
+        ("rotation, per axis", "mdeg", _DEG * 1e3, [6], RED),
+        ("ψ", "mdeg", _DEG * 1e3, [3], PURPLE),
     )
     for panel, (title, unit, scale, columns, colour) in zip(axes, panels, strict=True):
         marks = (
-            (e.bound_image, "_", GREY, "bound, whole image"),
-            (e.bound, "_", CLAIM_COLOUR, "bound, dots"),
+            (e.bound_image, "_", MUTED, "bound, whole image"),
+            (e.bound, "_", INK, "bound, dots"),
             (e.reported, "x", colour, "reported σ"),
         )
         for values, mark, ink, label in marks:  # no lines: every pose has its own psi, phi and place
@@ -132,18 +132,18 @@ def stress_figure(stresses: Sequence[Stress]) -> Figure:
     for panel, stress in zip(panels, stresses, strict=False):
         level = np.array([s.level for s in stress.levels])
         for values, colour, label in (
-            (np.array([s.position for s in stress.levels]) / CLAIM_POSITION, POSITION, "position"),
-            (np.array([s.rotation for s in stress.levels]) / CLAIM_ROTATION, TURN, "rotation"),
+            (np.array([s.position for s in stress.levels]) / CLAIM_POSITION, BLUE, "position"),
+            (np.array([s.rotation for s in stress.levels]) / CLAIM_ROTATION, RED, "rotation"),
         ):
             panel.plot(level, values, "o-", color=colour, ms=4, label=label)
         lost = np.array([s.lost for s in stress.levels])
-        panel.axhline(1, color=CLAIM_COLOUR, ls="--", lw=1, label="claim")
+        panel.axhline(1, color=INK, ls="--", lw=1, label="claim")
         for x, share in zip(level[lost > 0], lost[lost > 0], strict=True):
             panel.annotate(f"{100 * share:.0f} % lost", (x, 0.97), xycoords=("data", "axes fraction"), fontsize=7,
-                           rotation=90, ha="right", va="top", color=CLAIM_COLOUR)  # fmt: skip
+                           rotation=90, ha="right", va="top", color=INK)  # fmt: skip
         low, high = stress.fails_between
         if np.isfinite(high):
-            panel.axvspan(max(low, level[0] * 0.5), high, color=TURN, alpha=0.15, lw=0)
+            panel.axvspan(max(low, level[0] * 0.5), high, color=RED, alpha=0.15, lw=0)
         panel.set(xscale="log", yscale="log", title=stress.name, xlabel=stress.unit, ylabel="rms / claim")
         panel.set_xticks(stress_ticks(level), [f"{x:g}" for x in stress_ticks(level)])
         panel.xaxis.set_minor_formatter(NullFormatter())

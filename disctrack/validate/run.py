@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -11,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from disctrack.files.whole import make_folder, whole_file, write_whole
+from disctrack.files.json_text import json_file
+from disctrack.files.whole import make_folder, write_whole
 from disctrack.scene.description import BoardSettings, CameraSettings, RigSettings, Scene
 from disctrack.validate.controls import Control, planted_faults
 from disctrack.validate.efficiency import measure_efficiency
@@ -100,8 +100,7 @@ def validate(
 
 def write_validation(folder: Path, summary: Summary, trials: list[Trial], seconds: float) -> list[Path]:
     """Write validation.json, validation.md and the pictures; returns the files. Raises OutputError."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
+    from disctrack.pages.figures import save_figure
     from disctrack.validate.plots import bound_figure, error_figure, stress_figure
 
     make_folder(folder)
@@ -113,13 +112,10 @@ def write_validation(folder: Path, summary: Summary, trials: list[Trial], second
     text = markdown(summary) + "\n" + "\n".join(f"![{name[:-4].replace('_', ' ')}]({name})" for name in figures) + "\n"
     tree = {**as_json(summary), "seconds": seconds, "seeds": [trial.scene.seed for trial in trials]}
     files = [folder / "validation.json", folder / "validation.md"]
-    write_whole(files[0], (json.dumps(tree, indent=1) + "\n").encode())
+    write_whole(files[0], json_file(tree))
     write_whole(files[1], text.encode())
     for name, figure in figures.items():
-        FigureCanvasAgg(figure)
-        with whole_file(folder / name) as part:
-            figure.savefig(part, format="png", dpi=130)
-        files.append(folder / name)
+        files.append(save_figure(figure, folder / name))
     return files
 
 

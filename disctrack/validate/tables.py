@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from disctrack.files.json_text import plain
 from disctrack.validate.comparison import QUANTITIES, Consistency
 from disctrack.validate.efficiency import Efficiency
 from disctrack.validate.summary import CONSISTENT, Row, Summary, complaints, verdict
@@ -172,17 +173,5 @@ def as_json(summary: Summary) -> dict[str, Any]:
     return {
         **head,
         "psi_phi_limit_deg": {"rms": summary.law_limit_deg(1), "95 %": summary.law_limit_deg(2)},
-        **_plain(tree),
+        **plain(tree),
     }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value

@@ -10,6 +10,7 @@ from calibration.camera import Camera, StereoRig, rotation_from_vector
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, quaternion_from_rotation, rotation_from_euler
+from disctrack.pages.figures import save_figure
 from disctrack.track import figures as plots
 from disctrack.track import overlay
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -71,7 +72,7 @@ def trajectory() -> Trajectory:
 
 @pytest.mark.parametrize("name", sorted(plots.FIGURES))
 def test_every_figure_is_drawn_and_not_blank(trajectory, tmp_path, name):
-    path = plots.save_figure(plots.FIGURES[name](trajectory), tmp_path / f"{name}.png")
+    path = save_figure(plots.FIGURES[name](trajectory), tmp_path / f"{name}.png")
     assert cv2.imread(str(path)).std() > 5
     assert [file.name for file in tmp_path.iterdir()] == [f"{name}.png"]
 
@@ -84,7 +85,7 @@ def test_a_trajectory_without_any_answer_can_be_drawn(trajectory, tmp_path, name
         if isinstance(value := getattr(trajectory, f.name), np.ndarray) and value.dtype.kind == "f" and f.name != "time"
     }
     lost = dataclasses.replace(trajectory, **nothing, frame_status=np.full(12, FrameStatus.NOT_CONVERGED, np.uint8))
-    plots.save_figure(plots.FIGURES[name](lost), tmp_path / f"{name}.png")
+    save_figure(plots.FIGURES[name](lost), tmp_path / f"{name}.png")
 
 
 def test_the_coordinates_are_drawn_in_millimetres_and_degrees(trajectory):

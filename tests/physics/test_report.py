@@ -11,9 +11,10 @@ import pytest
 
 from disctrack.analyse.stage import run_analyse
 from disctrack.files.trajectory_file import Provenance, write_trajectory
+from disctrack.pages.palette import BLUE
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-BLUE_BGR = np.array([0x8B, 0x6F, 0x1F])  # of the curves
+BLUE_BGR = np.array([int(BLUE[i : i + 2], 16) for i in (5, 3, 1)])  # of the curves
 
 
 @pytest.fixture(scope="module")

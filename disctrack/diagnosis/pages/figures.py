@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from disctrack.analyse.figures import AMBER, BLUE, GRID, INK, MUTED, RED, Drawn
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import frequencies, simulated
 from disctrack.diagnosis.disc.free_runs import Evidence, Measured, force_of
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
+from disctrack.pages.figures import Drawn, dress
+from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 Array = NDArray[np.float64]
 
@@ -36,13 +37,6 @@ def all_figures(result: DiscDiagnosis, beside: Evidence | None) -> tuple[Drawn, 
         found.append(force(result, beside.measured))
     found.append(candidates(result))
     return tuple(replace(d, name=f"{i:02d}_{d.name}") for i, d in enumerate(found, start=1))
-
-
-def _dress(axes: Axes) -> None:
-    axes.grid(True, color=GRID, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(colors=INK, labelsize=9)
 
 
 def superposed(result: DiscDiagnosis, beside: Evidence) -> Drawn:
@@ -72,7 +66,7 @@ def superposed(result: DiscDiagnosis, beside: Evidence) -> Drawn:
         path.plot(1e3 * motion.q[:, 0], 1e3 * motion.q[:, 1], **style)
     labels = ((theta, "nutation angle [deg]"), (rate, "precession rate [rad/s]"), (path, "y [mm]"))
     for axes, label in labels:
-        _dress(axes)
+        dress(axes)
         axes.set_xlabel("time [s]")
         axes.set_ylabel(label)
     _frame(theta, np.degrees(q[:, 4]))
@@ -111,7 +105,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
         series = [*((delta[:, i], sigma[:, i]) for i in range(3)), theta]
         for row, ((label, scale, unit), (value, noise)) in enumerate(zip(rows, series, strict=True)):
             axes = grid[row, column]
-            _dress(axes)
+            dress(axes)
             axes.fill_between(system.time, -2 * scale * noise, 2 * scale * noise, color=GRID, lw=0)
             axes.plot(system.time, scale * value, lw=0.7, color=colour)
             axes.set_ylabel(f"{label} [{unit}]")
@@ -137,7 +131,7 @@ def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
     left.semilogy(system.time, 1e3 * np.linalg.norm(sigma[:, :3], axis=1), lw=1, color=MUTED, label="noise")
     right.semilogy(system.time, np.degrees(noise), lw=1, color=MUTED, label="noise")
     for axes, label in ((left, "error of the position [mm]"), (right, "error of the nutation [deg]")):
-        _dress(axes)
+        dress(axes)
         axes.axvline(last, color=AMBER, lw=1)
         axes.set_xlabel("time [s]")
         axes.set_ylabel(label)
@@ -154,7 +148,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     tried = diagnosis.tried[:N_TRIED]
     figure = Figure(figsize=(9.5, 0.6 + 0.28 * max(len(tried), 3)), layout="constrained")
     axes = figure.add_subplot()
-    _dress(axes)
+    dress(axes)
     gains = [max(t.gain if t.gain is not None else t.score, 1e-2) for t in tried]
     named = {f.candidate.name for f in diagnosis.found}
     alike = {r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from}
@@ -177,7 +171,7 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
     if result.learned is not None:
         law = result.system.time, learned_moment(result.system, result.learned.fit, result.learned.law)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        _dress(axes)
+        dress(axes)
         value, sigma = 1e6 * missing.moment[:, i], 1e6 * missing.sigma[:, i]
         axes.fill_between(missing.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
         axes.plot(missing.time, value, lw=1.3, color=RED, label="missing")
@@ -203,7 +197,7 @@ def force(result: DiscDiagnosis, measured: Measured) -> Drawn:
     figure = Figure(figsize=(9.5, 5.4), layout="constrained")
     grid = figure.subplots(3, 1, sharex=True)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        _dress(axes)
+        dress(axes)
         value, sigma = 1e3 * (measured.force - before)[:, i], 1e3 * measured.force_sigma[:, i]
         axes.fill_between(system.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
         axes.plot(system.time, value, lw=1.1, color=RED, label="missing")
@@ -229,7 +223,7 @@ def spectrum(result: DiscDiagnosis) -> Drawn:
     rate = float(1.0 / np.median(np.diff(system.time)))
     figure = Figure(figsize=(9.5, 3.2), layout="constrained")
     axes = figure.add_subplot()
-    _dress(axes)
+    dress(axes)
     for fit, colour, name in ((result.diagnosis.before, RED, "before"), (result.after_fit, BLUE, "after")):
         residual = system.pose_residual(fit.values)[present]
         if np.isfinite(residual).all():

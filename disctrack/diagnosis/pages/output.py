@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from disctrack.diagnosis.disc.separation import Separation
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Found, Tried
 from disctrack.diagnosis.pages.words import shown
+from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.trajectory_file import write_group
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
@@ -25,16 +25,11 @@ if TYPE_CHECKING:
 GROUP = "diagnosis"
 
 
-def _number(x: float | None) -> float | None:
-    """JSON knows no infinities."""
-    return None if x is None or not np.isfinite(x) else float(x)
-
-
 def _parameters(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
     found = []
     for q in quantities:
         name, value, sigma = shown(q, fit)
-        amount = {"name": name, "value": _number(value), "sigma": _number(sigma)}
+        amount = {"name": name, "value": value, "sigma": sigma}
         found.append(amount | {"unit": q.unit, "meaning": q.meaning})
     return found
 
@@ -47,8 +42,8 @@ def _separation(separation: Separation | None) -> dict[str, Any] | None:
         "theta_deg": separation.theta_deg,
         "omega3_rad_s": separation.omega3,
         "duration_s": separation.duration,
-        "angle_deg": _number(np.degrees(separation.angle)),
-        "sigmas": _number(separation.sigmas),
+        "angle_deg": np.degrees(separation.angle),
+        "sigmas": separation.sigmas,
     }
 
 
@@ -70,17 +65,17 @@ def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None]
         "class": [
             {
                 "name": r.candidate.name,
-                "angle_deg": _number(np.degrees(r.angle)),
-                "delta_chi_square": _number(r.loss),
+                "angle_deg": np.degrees(r.angle),
+                "delta_chi_square": r.loss,
                 "parameters": _parameters(r.candidate.quantities, r.fit),
                 "separated_by": _separation(apart.get(r.candidate.name)),
             }
             for r in found.cannot_be_told_from
         ],
-        "score": _number(found.gain),
-        "threshold": _number(found.threshold),
-        "significance_sigma": _number(np.sqrt(max(found.gain, 0.0))),
-        "held_out_gain": _number(found.held_out_gain),
+        "score": found.gain,
+        "threshold": found.threshold,
+        "significance_sigma": np.sqrt(max(found.gain, 0.0)),
+        "held_out_gain": found.held_out_gain,
     }
 
 
@@ -89,22 +84,22 @@ def _errors(errors: Errors | None, longer: tuple[Ahead, ...] = ()) -> dict[str, 
         return None
     w = errors.whiteness
     return {
-        "reduced_chi_square": _number(errors.reduced_chi_square),
-        "reduced_chi_square_pose": _number(errors.reduced_chi_square_pose),
-        "rms_px": _number(errors.rms_px),
-        "rms_position_um": _number(errors.position_um),
-        "rms_theta_mdeg": _number(errors.theta_mdeg),
+        "reduced_chi_square": errors.reduced_chi_square,
+        "reduced_chi_square_pose": errors.reduced_chi_square_pose,
+        "rms_px": errors.rms_px,
+        "rms_position_um": errors.position_um,
+        "rms_theta_mdeg": errors.theta_mdeg,
         "held_out": {
-            "ratio_to_noise_floor": _number(errors.ratio_to_floor),
+            "ratio_to_noise_floor": errors.ratio_to_floor,
             "free_run": [
                 {
                     "horizon_s": a.horizon,
-                    "theta_deg": _number(a.theta_deg),
-                    "psi_deg": _number(a.psi_deg),
-                    "position_mm": _number(a.position_mm),
-                    "noise_theta_deg": _number(a.noise_theta_deg),
-                    "noise_psi_deg": _number(a.noise_psi_deg),
-                    "noise_position_mm": _number(a.noise_position_mm),
+                    "theta_deg": a.theta_deg,
+                    "psi_deg": a.psi_deg,
+                    "position_mm": a.position_mm,
+                    "noise_theta_deg": a.noise_theta_deg,
+                    "noise_psi_deg": a.noise_psi_deg,
+                    "noise_position_mm": a.noise_position_mm,
                 }
                 for a in (*errors.ahead, *longer)
             ],
@@ -124,9 +119,9 @@ def tried_json(tried: Tried) -> dict[str, Any]:
     return {
         "name": tried.candidate.name,
         "kind": tried.candidate.kind,
-        "score": _number(tried.score),
-        "refit_gain": _number(tried.gain),
-        "held_out_gain": _number(tried.held_out_gain),
+        "score": tried.score,
+        "refit_gain": tried.gain,
+        "held_out_gain": tried.held_out_gain,
         "reason": tried.reason,
     }
 
@@ -147,11 +142,11 @@ def _learned(learned: Learned) -> dict[str, Any]:
         "formulas": law.formulas,
         "share_of_resamples": list(law.share),
         "phase_locked": law.locked,
-        "mean_power_W": _number(learned.power),
+        "mean_power_W": learned.power,
         "parameters": _parameters(law.candidate.quantities, learned.fit),
         "class": [],
-        "score": _number(learned.gain),
-        "held_out_gain": _number(learned.held_out_gain),
+        "score": learned.gain,
+        "held_out_gain": learned.held_out_gain,
     }
 
 
@@ -161,7 +156,7 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
     apart = result.separated_by
     effects = [effect_json(f, diagnosis.after, apart.get(f.candidate.name)) for f in diagnosis.found]
     rows, longer = result.system.rows, beside.ahead if beside else ()
-    return {
+    document = {
         "verdict": diagnosis.verdict,
         "sentence": result.sentence,
         "reason": diagnosis.reason,
@@ -173,12 +168,13 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
         | {"parameters": _declared(diagnosis.before)},
         "after": (_errors(result.after, tuple(a for _, a in longer)) or {})
         | {"parameters": _declared(result.after_fit)},
-        "noise_variance_over_stated": _number(diagnosis.noise),
+        "noise_variance_over_stated": diagnosis.noise,
         "energy_J": result.energy,
         "energy_before_J": beside.energy_before if beside else {},
         "tried": [tried_json(t) for t in diagnosis.tried],
         "settings": vars(diagnosis.settings),
     }
+    return dict(plain(document))
 
 
 def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, document: dict[str, Any]) -> None:
@@ -216,7 +212,7 @@ def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, 
     attributes = {
         "verdict": result.diagnosis.verdict,
         "sentence": result.sentence,
-        "diagnosis": json.dumps(document),
+        "diagnosis": json_text(document),
     }
     write_group(path, GROUP, variables, axes=axes, attributes=attributes)
 

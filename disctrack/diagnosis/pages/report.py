@@ -2,90 +2,62 @@
 
 from __future__ import annotations
 
-import base64
-import io
-from html import escape
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from disctrack.analyse.figures import Drawn
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.disc.free_runs import Evidence
 from disctrack.diagnosis.engine.search import Found
 from disctrack.diagnosis.pages.figures import all_figures
 from disctrack.diagnosis.pages.words import effect_text, law_text, quantity_text
-from disctrack.files.whole import whole_file, write_whole
-
-_DPI = 150
-_STYLE = """body{font:16px/1.5 system-ui,sans-serif;color:#1d2733;background:#fff;margin:0}
-main{max-width:60rem;margin:0 auto;padding:1.5rem}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
-.lead{font-size:1.1rem;border-left:4px solid #1f6f8b;padding-left:.8rem}table{border-collapse:collapse;width:100%}
-th,td{text-align:left;padding:.25rem .6rem;border-bottom:1px solid #e3e8ed;font-variant-numeric:tabular-nums}
-img{max-width:100%}figcaption{color:#6b7885;font-size:.9rem}figure{margin:1rem 0}.wide{overflow-x:auto}"""
+from disctrack.files.whole import write_whole
+from disctrack.pages.figures import draw, gallery
+from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, text
 
 
 def write_report(folder: Path, result: DiscDiagnosis, beside: Evidence | None, recording: str) -> tuple[Path, ...]:
     """Write diagnosis.html and figures/*.png; returns the files. Raises OutputError."""
-    files, pictures = [], []
-    with rc_context({"font.size": 10}):
-        for drawn in all_figures(result, beside):
-            FigureCanvasAgg(drawn.figure)
-            path = folder / "figures" / f"{drawn.name}.png"
-            buffer = io.BytesIO()
-            drawn.figure.savefig(buffer, format="png", dpi=_DPI)
-            with whole_file(path) as part:
-                part.write_bytes(buffer.getvalue())
-            files.append(path)
-            pictures.append(_figure(drawn, buffer.getvalue()))
-    page = folder / "diagnosis.html"
-    write_whole(page, _page(result, beside, recording, pictures).encode())
-    return (page, *files)
+    figures = all_figures(result, beside)
+    files, pictures = draw(folder, figures, ["png"])
+    written = folder / "diagnosis.html"
+    write_whole(written, _page(result, beside, recording, gallery(figures, pictures)).encode())
+    return (written, *files)
 
 
-def _figure(drawn: Drawn, png: bytes) -> str:
-    source = base64.b64encode(png).decode()
-    return (
-        f'<figure><img alt="{escape(drawn.title)}" src="data:image/png;base64,{source}">'
-        f"<figcaption>{escape(drawn.caption)}</figcaption></figure>"
-    )
-
-
-def _page(result: DiscDiagnosis, beside: Evidence | None, recording: str, pictures: list[str]) -> str:
-    title = escape(f"{recording}: what does the model lack?")
+def _page(result: DiscDiagnosis, beside: Evidence | None, recording: str, figures: str) -> str:
+    verdict = f"Verdict: <b>{text(result.diagnosis.verdict)}</b>. Model: {text(result.model)}. "
     parts = [
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
-        f"<body><main><h1>{title}</h1><p class=lead>{escape(result.sentence)}</p>",
-        f"<p>Verdict: <b>{escape(result.diagnosis.verdict)}</b>. Model: {escape(result.model)}. "
-        f"{escape(result.diagnosis.reason[:1].upper() + result.diagnosis.reason[1:])}.</p>",
-        "".join(f"<p>{escape(text[:1].upper() + text[1:])}.</p>" for text in result.notes),
-        _effects(result),
-        _before_after(result, beside),
-        *pictures,
-        _tried(result),
+        paragraph(result.sentence, "lead"),
+        paragraph(Markup(verdict + text(_said(result.diagnosis.reason)))),
+        *(paragraph(_said(note)) for note in result.notes),
+        section("Missing effects", [_effects(result)]),
+        section("Before and after", _before_after(result, beside)),
+        section("In pictures", [figures]),
+        section("What was tried", [_tried(result)]),
     ]
-    return "\n".join(part for part in parts if part) + "\n</main></body></html>\n"
+    return page(f"{recording}: what does the model lack?", parts)
+
+
+def _said(note: str) -> str:
+    return f"{note[:1].upper()}{note[1:]}."
 
 
 def _effects(result: DiscDiagnosis) -> str:
-    items = "".join(
-        f"<li>{escape(effect_text(f, result.diagnosis))}. Without it chi-square rises by {f.gain:.5g}, "
+    items = [
+        f"{effect_text(f, result.diagnosis)}. Without it chi-square rises by {f.gain:.5g}, "
         f"{np.sqrt(max(f.gain, 0.0)):.4g} sigmas (noise alone: {f.threshold:.3g}); on held-out data it gains "
-        f"{f.held_out_gain:.4g}. "
-        f"{escape(_class_text(f, result))}</li>"
+        f"{f.held_out_gain:.4g}. {_class_text(f, result)}"
         for f in result.diagnosis.found
-    )
+    ]
     if result.learned is not None:
         learned = result.learned
-        items += (
-            f"<li>{escape(law_text(learned.law, learned.fit))}; mean power {1e3 * learned.power:.3g} mW, chosen in "
-            f"{100 * min(learned.law.share):.0f} % of the resamples; chi-square falls by {learned.gain:.5g}.</li>"
+        items.append(
+            f"{law_text(learned.law, learned.fit)}; mean power {1e3 * learned.power:.3g} mW, chosen in "
+            f"{100 * min(learned.law.share):.0f} % of the resamples; chi-square falls by {learned.gain:.5g}."
         )
-    return f"<h2>Missing effects</h2><ul>{items}</ul>" if items else ""
+    return bullets(items)
 
 
 DISTINCT = 5.0  # sigmas from which on a recording tells two effects apart
@@ -106,10 +78,10 @@ def _class_text(found: Found, result: DiscDiagnosis) -> str:
     return " ".join(texts)
 
 
-def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> str:
+def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[str]:
     before, after = result.before, result.after
     if before is None or after is None or beside is None:
-        return ""
+        return []
     both = (before, after)
     rows = [
         ("reduced chi-square of the dots", *(f"{e.reduced_chi_square:.4g}" for e in both)),
@@ -125,12 +97,10 @@ def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> str:
         *_laws(result),
         *_energy(result, beside),
     ]
-    body = "".join(f"<tr><td>{escape(a)}<td>{escape(b)}<td>{escape(c)}</tr>" for a, b, c in rows)
     reached = {a.horizon for a in after.ahead} | {a.horizon for _, a in beside.ahead}
     short = [f"{h:g}" for h in HORIZONS if h not in reached]
-    remark = f"<p>The recording is too short for free runs of {' and '.join(short)} s.</p>" if short else ""
-    head = "<table><tr><th><th>before<th>after</tr>"
-    return f"<h2>Before and after</h2><div class=wide>{head}{body}</table></div>{remark}"
+    remark = f"The recording is too short for free runs of {' and '.join(short)} s." if short else ""
+    return [table("", ("", "before", "after"), rows), paragraph(remark)]
 
 
 def _line(errors: Errors) -> str:
@@ -179,10 +149,9 @@ def _energy(result: DiscDiagnosis, beside: Evidence) -> list[tuple[str, str, str
 
 
 def _tried(result: DiscDiagnosis) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(t.candidate.name)}<td>{t.score:.4g}<td>{'' if t.gain is None else format(t.gain, '.4g')}"
-        f"<td>{'' if t.held_out_gain is None else format(t.held_out_gain, '.4g')}<td>{escape(t.reason)}</tr>"
+    number = lambda value: "" if value is None else f"{value:.4g}"  # noqa: E731
+    rows = [
+        (t.candidate.name, number(t.score), number(t.gain), number(t.held_out_gain), t.reason)
         for t in result.diagnosis.tried
-    )
-    head = "<tr><th>candidate<th>score<th>gain, refitted<th>gain, held out<th>outcome</tr>"
-    return f"<h2>What was tried</h2><div class=wide><table>{head}{rows}</table></div>" if rows else ""
+    ]
+    return table("", ("candidate", "score", "gain, refitted", "gain, held out", "outcome"), rows) if rows else ""

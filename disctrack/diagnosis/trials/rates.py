@@ -10,7 +10,6 @@ Every trial draws a motion, a rig with a calibration error of its own, and the n
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -26,6 +25,7 @@ from disctrack.diagnosis.engine.system import Values
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted, hidden_effect
 from disctrack.diagnosis.trials.recordings import Unseen, measured
 from disctrack.errors import DiscTrackError
+from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 from disctrack.rolling import Model, simulate, steady_precession
 from disctrack.scene.description import Faults, Scene
@@ -319,7 +319,7 @@ def main() -> None:
                     flush=True,
                 )
     if arguments.output:
-        write_whole(arguments.output, (json.dumps([asdict(r) for r in done], indent=1) + "\n").encode())
+        write_whole(arguments.output, json_file([asdict(r) for r in done]))
 
 
 if __name__ == "__main__":

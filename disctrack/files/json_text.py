@@ -1,0 +1,31 @@
+"""JSON as every file of ours has it: no NaN, no infinity, no NumPy."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+
+def plain(item: Any) -> Any:
+    """The item of JSON's types: null for a number that is not finite, lists for tuples and arrays, text for keys."""
+    if isinstance(item, dict):
+        return {str(key): plain(value) for key, value in item.items()}
+    if isinstance(item, list | tuple):
+        return [plain(value) for value in item]
+    if isinstance(item, np.ndarray | np.generic):
+        return plain(item.tolist())
+    if isinstance(item, float):
+        return item if np.isfinite(item) else None
+    return item
+
+
+def json_text(document: Any, indent: int | None = None) -> str:
+    """The document as JSON that every reader takes."""
+    return json.dumps(plain(document), indent=indent, allow_nan=False)
+
+
+def json_file(document: Any) -> bytes:
+    """The document as a file for people and programs."""
+    return (json_text(document, indent=1) + "\n").encode()

@@ -1,0 +1,93 @@
+"""Figures: how axes look, how they are written, and how a page shows them."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from disctrack.files.whole import whole_file
+from disctrack.pages.html import Markup
+from disctrack.pages.palette import GRID, INK, MUTED
+
+DPI = 150
+LARGE = 400_000  # [bytes] vector graphics beyond it go into a page as a bitmap: thousands of points
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One figure with what is said below it."""
+
+    name: str  # of the file
+    title: str
+    caption: str
+    figure: Figure
+
+
+def dress(axes: Axes) -> None:
+    """Grid, colours and spines of every plot."""
+    axes.grid(True, color=GRID, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    for spine in axes.spines.values():
+        spine.set_color(MUTED)
+    axes.tick_params(colors=INK, labelsize=9)
+    axes.xaxis.label.set_color(INK)
+    axes.yaxis.label.set_color(INK)
+
+
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure whole; the format follows from the name. Raises OutputError."""
+    FigureCanvasAgg(figure)
+    kind = path.suffix[1:]
+    with whole_file(path) as part:
+        figure.savefig(part, format=kind, dpi=DPI, metadata={"CreationDate": None} if kind == "pdf" else None)
+    return path
+
+
+def draw(
+    folder: Path, figures: Sequence[Drawn], kinds: Sequence[str] = ("png", "pdf")
+) -> tuple[list[Path], dict[str, str]]:
+    """Write figures/*.png, *.pdf (`kinds`); returns them, and a data URI per name. Raises OutputError."""
+    written: list[Path] = []
+    pictures: dict[str, str] = {}
+    with rc_context({"font.size": 10, "svg.fonttype": "path", "svg.hashsalt": "disctrack", "mathtext.fontset": "cm"}):
+        for drawn in figures:
+            FigureCanvasAgg(drawn.figure)
+            drawn.figure.draw_without_rendering()
+            drawn.figure.set_layout_engine("none")  # laid out once, for all formats
+            written += [save_figure(drawn.figure, folder / "figures" / f"{drawn.name}.{kind}") for kind in kinds]
+            pictures[drawn.name] = _inline(drawn.figure)
+    return written, pictures
+
+
+def _inline(figure: Figure) -> str:
+    """The figure as a data URI: vector graphics, or a bitmap where those would be larger."""
+    kind, content = "svg+xml", _bytes(figure, "svg", {"Date": None})
+    if len(content) > LARGE:
+        kind, content = "png", _bytes(figure, "png")
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _bytes(figure: Figure, kind: str, metadata: dict[str, None] | None = None) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
+    return buffer.getvalue()
+
+
+def gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> Markup:
+    """Figures with their captions; `pictures` holds a data URI per figure's name."""
+    items = "".join(
+        f'<figure><img src="{pictures[drawn.name]}" alt="{escape(drawn.title)}">'
+        f"<figcaption><b>{escape(drawn.title)}.</b> {escape(drawn.caption)}</figcaption></figure>"
+        for drawn in figures
+    )
+    return Markup(f"<div class=gallery>{items}</div>" if items else "")

@@ -1,0 +1,112 @@
+"""Pages of HTML that need no other file: one frame, one style for light, dark, phone and print.
+
+Text is escaped here; what is HTML already is a `Markup`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from disctrack.pages.palette import AMBER, BLUE, GRID, INK, RED
+
+
+class Markup(str):
+    """HTML that goes into a page as it is."""
+
+
+def text(item: str) -> Markup:
+    """The item as HTML."""
+    return item if isinstance(item, Markup) else Markup(escape(item))
+
+
+def page(title: str, parts: Iterable[str], *, head: str = "") -> str:
+    """A whole page. parts : HTML, one below the other; empty ones are left out.   head : HTML for its head"""
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style>{head}</head>\n'
+        f"<body><main><h1>{escape(title)}</h1>\n" + "\n".join(p for p in parts if p) + "\n</main></body></html>\n"
+    )
+
+
+def section(title: str, parts: Iterable[str]) -> Markup:
+    """A part of a page under its own heading; nothing where there is nothing to show."""
+    inner = "\n".join(p for p in parts if p)
+    return Markup(f"<section><h2>{escape(title)}</h2>\n{inner}</section>" if inner else "")
+
+
+def paragraph(said: str, kind: str = "") -> Markup:
+    """A paragraph. kind : "lead" for the one that begins a page"""
+    return Markup(f"<p{f' class={kind}' if kind else ''}>{text(said)}</p>" if said else "")
+
+
+def bullets(items: Iterable[str]) -> Markup:
+    """A list; nothing if it is empty."""
+    inner = "".join(f"<li>{text(item)}</li>" for item in items)
+    return Markup(f"<ul>{inner}</ul>" if inner else "")
+
+
+def warning(title: str, items: Iterable[str]) -> Markup:
+    """A box that is not to be overlooked; nothing where nothing is to be said."""
+    inner = bullets(items)
+    return Markup(f"<div class=warn><b>{escape(title)}</b>{inner}</div>" if inner else "")
+
+
+def tiles(named: Iterable[tuple[str, str]]) -> Markup:
+    """The few numbers that come first: (name, value)."""
+    inner = "".join(f"<div class=tile><b>{text(value)}</b><span>{text(name)}</span></div>" for name, value in named)
+    return Markup(f"<div class=tiles>{inner}</div>")
+
+
+def table(
+    caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], classes: Sequence[str] | None = None
+) -> Markup:
+    """A table that scrolls by itself where the screen is narrow. classes : CSS class of each row"""
+    rows = list(rows)
+    kinds = [f" class={escape(kind, quote=True)}" for kind in classes] if classes else [""] * len(rows)
+    top = "".join(f"<th>{text(cell)}</th>" for cell in header)
+    body = "".join(
+        f"<tr{kind}>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>"
+        for kind, row in zip(kinds, rows, strict=True)
+    )
+    said = f"<caption>{text(caption)}</caption>" if caption else ""
+    return Markup(f"<div class=scroll><table>{said}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>")
+
+
+def details(title: str, parts: Iterable[str]) -> Markup:
+    """What opens when its title is clicked."""
+    return Markup(f"<details><summary>{escape(title)}</summary>{''.join(parts)}</details>")
+
+
+STYLE = f"""
+:root{{color-scheme:light dark;--ink:{INK};--soft:#4d5a67;--back:#f5f7f9;--card:#fff;--line:{GRID};--mark:{BLUE};
+--warn:#fff6e5;--edge:{AMBER};--bad:{RED}}}
+@media (prefers-color-scheme:dark){{:root{{--ink:#e6ebf0;--soft:#aab5c0;--back:#14191f;--card:#1c232b;--line:#323c47;
+--mark:#6db9e8;--warn:#33290f;--bad:#ff9a5c}}}}
+html{{color:var(--ink);background:var(--back);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}}
+body{{margin:0}}main{{max-width:1180px;margin:0 auto;padding:2rem 1.5rem 4rem}}
+h1{{font-size:1.7rem;line-height:1.25;margin:.2rem 0 1rem}}h2{{font-size:1.25rem;margin:0 0 .8rem}}
+a{{color:var(--mark)}}
+section{{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:1.3rem 1.5rem;margin:1.4rem 0}}
+.lead{{font-size:1.05rem;max-width:60rem}}
+.tiles{{display:grid;grid-template-columns:repeat(auto-fit,minmax(210px,1fr));gap:.9rem;margin:1.2rem 0}}
+.tile{{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:.8rem 1rem}}
+.tile b{{display:block;font-size:1.15rem}}.tile span{{color:var(--soft);font-size:.88rem}}
+.warn{{background:var(--warn);border:1px solid var(--edge);border-radius:10px;padding:.9rem 1.2rem;margin:1.2rem 0}}
+.warn ul{{margin:.4rem 0 0;padding-left:1.2rem;overflow-wrap:anywhere}}
+.gallery{{columns:2 420px;column-gap:1.6rem}}
+figure{{margin:0 0 1.3rem;break-inside:avoid}}
+figure img{{width:100%;height:auto;display:block;background:#fff;border-radius:4px}}
+figcaption{{color:var(--soft);font-size:.88rem;line-height:1.45;margin-top:.35rem}}
+.scroll{{overflow-x:auto}}table{{border-collapse:collapse;font-size:.85rem;margin:.6rem 0 1rem}}
+caption{{text-align:left;color:var(--soft);padding-bottom:.35rem}}
+th,td{{text-align:left;padding:.28rem .9rem .28rem 0;border-bottom:1px solid var(--line);white-space:nowrap;
+font-variant-numeric:tabular-nums}}
+th{{color:var(--soft);font-weight:600}}tr.failed td,tr.not td{{color:var(--bad)}}
+details{{margin:.6rem 0}}summary{{cursor:pointer;color:var(--mark)}}
+@media (max-width:40rem){{main{{padding:1rem .8rem 3rem}}section{{padding:1rem .9rem}}h1{{font-size:1.35rem}}
+.gallery{{columns:1}}}}
+@media print{{:root{{color-scheme:light;--ink:#000;--soft:#333;--back:#fff;--card:#fff;--line:#ccc;--warn:#fff;
+--mark:#000;--bad:#000}}main{{max-width:none;padding:0}}section{{border:0;padding:0}}.scroll{{overflow:visible}}
+td,th{{white-space:normal}}details>*{{display:block}}}}
+"""

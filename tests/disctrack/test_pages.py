@@ -1,0 +1,97 @@
+"""Pages and JSON: what stands in them is what was given, whatever it is."""
+
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from disctrack.files.json_text import json_file, json_text, plain
+from disctrack.pages import palette
+from disctrack.pages.figures import Drawn, draw, gallery
+from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, warning
+
+
+class Tree(HTMLParser):
+    """Tags that were opened and not closed, the text of cells, and every tag seen."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.seen, self.cells = [], [], []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "td":
+            self.cells.append(data)
+
+
+def test_a_page_is_whole_and_shows_text_as_text():
+    nasty = "<script>alert('ψ & 1 < 2')</script>"
+    parts = [
+        paragraph(nasty, "lead"),
+        warning(nasty, [nasty]),
+        section(nasty, [table(nasty, ["a", nasty], [(nasty, "1"), (Markup("<b>2</b>"), "3")], ["done", "failed"])]),
+    ]
+    tree = Tree(page(nasty, parts))
+    assert tree.open == []
+    assert "script" not in tree.seen
+    assert nasty in tree.cells
+    assert tree.seen.count("b") == 2  # the warning's title, and what was said to be HTML
+
+
+def test_nothing_to_show_leaves_no_empty_frame():
+    assert not warning("mind", [])
+    assert not bullets([])
+    assert not section("empty", ["", paragraph("")])
+    with pytest.raises(ValueError, match="zip"):
+        table("", ["a"], [("1",), ("2",)], ["done"])
+
+
+def test_a_figure_is_written_whole_and_shown(tmp_path):
+    figure = Figure()
+    figure.add_subplot().plot([0, 1], color=palette.BLUE)
+    drawn = Drawn("01_line", "A line", "rises & falls", figure)
+    files, pictures = draw(tmp_path, [drawn])
+    assert [f.name for f in files] == ["01_line.png", "01_line.pdf"]
+    assert (tmp_path / "figures/01_line.pdf").read_bytes().startswith(b"%PDF")
+    shown = gallery([drawn], pictures)
+    assert "data:image/svg+xml;base64," in shown
+    assert "rises &amp; falls" in shown
+
+
+def luminance(colour):
+    channels = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return linear
+
+
+def test_colours_stay_apart_for_a_reader_without_green_receptors():
+    """Deuteranopia by the matrix of Vienot, Brettel and Mollon (1999); distances in linear light."""
+    blind = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]])
+    seen = [blind @ luminance(c) for c in (palette.BLUE, palette.RED, palette.GREEN, palette.AMBER, palette.SKY)]
+    apart = min(np.linalg.norm(a - b) for i, a in enumerate(seen) for b in seen[:i])
+    worst_before = np.linalg.norm(blind @ luminance("#c8553d") - blind @ luminance("#4f8a4c"))  # red, green
+    assert apart > 0.1 > worst_before
+
+
+def test_json_holds_no_number_that_json_does_not_know():
+    document = {
+        "a": [np.nan, np.float32(np.inf), (1, np.int64(2))],
+        "b": {3: np.array([[1.0, np.nan]]), "t": np.bool_(True)},
+        "c": "ψ",
+    }
+    expected = {"a": [None, None, [1, 2]], "b": {"3": [[1.0, None]], "t": True}, "c": "ψ"}
+    assert json.loads(json_text(document)) == expected == plain(document)
+    assert json_file(document).endswith(b"}\n")
