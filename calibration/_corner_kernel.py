@@ -24,6 +24,8 @@ N_CORNER = (
     9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
 )
 FLAT = 0.995  # |S| above which a pixel lies inside a square and shows the image's noise alone
+MIN_BLUR = 0.3  # px, just above the square pixel's own: edges may be sharper, by sharpening, than any lens makes them
+NEAR = 0.3  # sigmas that a full step may still move the corner where no smaller residual is found
 _FAR = 5.0  # sigmas from an edge: S has reached its level to 6e-7
 _X, _W = np.polynomial.legendre.leggauss(8)
 _N_NODES = 8
@@ -65,8 +67,11 @@ def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def normal_equations(image, window, p, curvature, noise, H, g):  # type: ignore[no-untyped-def]
+def normal_equations(image, window, p, curvature, noise, weights, first_pass, H, g):  # type: ignore[no-untyped-def]
     """Weighted sums of one corner; H (9, 9) and g (9,) are filled. Returns chi-square, and sums over pixels.
+
+    weights : of the window's pixels; filled in the first pass from the noise at the model's grey values, then left, so
+    that chi-square is one function of p and Gauss-Newton's step goes down on it
 
     window (13,): x0, x1, y0, y1 [px, inclusive]; centre x, y; inverse of the local axes, row by row; half widths along
     i and j [squares]; largest step [px].
@@ -121,7 +126,9 @@ def normal_equations(image, window, p, curvature, noise, H, g):  # type: ignore[
             gradient[5], gradient[6], gradient[7], gradient[8] = light, light * S, base * dx, base * dy
             model = base * light
             residual = image[y, x] - model
-            weight = 1.0 / (noise[0] + noise[1] * max(model, 0.0))
+            if first_pass:
+                weights[y - y0, x - x0] = 1.0 / (noise[0] + noise[1] * max(model, 0.0))
+            weight = weights[y - y0, x - x0]
             for i in range(first, N_CORNER):
                 gi = gradient[i] * weight
                 g[i] += gi * residual
@@ -177,11 +184,14 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
     H_new, g_new = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
     L = np.zeros((N_CORNER, N_CORNER))
     covariance[:] = np.nan
-    sums = normal_equations(image, window, p, curvature, noise, H, g)
+    weights = np.empty((max(int(window[3] - window[2]) + 1, 1), max(int(window[1] - window[0]) + 1, 1)))
+    sums = normal_equations(image, window, p, curvature, noise, weights, True, H, g)
     if sums[1] < 4 * N_CORNER:
         return sums, False
     damping, converged = 1e-3, False
     for _ in range(iterations):
+        if p[4] <= MIN_BLUR and g[4] < 0.0:  # held at its bound, so that the others go to their own minimum
+            H[4, :4], H[5:, 4], H[4, 4], g[4] = 0.0, 0.0, 1.0, 0.0
         step = g.copy()
         if not cholesky_solve(H, damping, step, L):
             damping = 10.0 * damping
@@ -189,11 +199,11 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
                 break
             continue
         trial = p + step
-        trial[4] = min(max(trial[4], 0.5 * p[4], 0.3), 2.0 * p[4])
+        trial[4] = min(max(trial[4], 0.5 * p[4], MIN_BLUR), 2.0 * p[4])
         reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
         accepted = reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
         if accepted:
-            sums_new = normal_equations(image, window, trial, curvature, noise, H_new, g_new)
+            sums_new = normal_equations(image, window, trial, curvature, noise, weights, False, H_new, g_new)
             accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
         if accepted:
             blur_step = trial[4] - p[4]  # as clamped: edges sharper than the pixel hold it at its lower bound
@@ -214,6 +224,11 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
         if not cholesky_solve(H, 0.0, unit, L):
             return sums, False
         covariance[0, axis], covariance[1, axis] = unit[0], unit[1]
+    if not converged:  # what is left to go may be small beside the error: the box's share of the slope is approximate
+        step = g.copy()
+        cholesky_solve(H, 0.0, step, L)
+        square = NEAR**2 * max(sums[0] / sums[1], 1.0)
+        converged = step[0] ** 2 < square * covariance[0, 0] and step[1] ** 2 < square * covariance[1, 1]
     return sums, converged
 
 

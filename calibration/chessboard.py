@@ -16,6 +16,7 @@ from calibration.corner_fit import CornerView, fit_view, local_axes
 from calibration.grey_levels import level_step
 
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
+MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
 MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
 
 
@@ -70,9 +71,8 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int]) -> CornerView |
     view = fit_view(values, rough, inner_corners)
     if view.accepted.mean() < MIN_ACCEPTED:
         return BoardNotFound(
-            f"only {view.accepted.sum()} of {len(view.accepted)} corners look like two crossing edges; "
-            f"is {inner_corners[0]} x {inner_corners[1]} the number of INNER corners? "
-            f"(first reason: {next(r for r in view.reasons if r)})"
+            f"only {view.accepted.sum()} of {len(view.accepted)} corners lie on a regular grid: the board is covered "
+            f"or bent, or {inner_corners[0]} x {inner_corners[1]} is not the number of its inner corners"
         )
     beyond = _larger_board(values, view, inner_corners)
     if beyond:
@@ -124,6 +124,11 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
     corners = grid.reshape(-1, 2)
     orders = board_orders(inner_corners)
     signs = [_first_square_is_dark(corners[order], grey, inner_corners) for order in orders]
+    if max(abs(sign) for sign in signs) < MIN_ALTERNATION:
+        return BoardNotFound(
+            f"the squares between the corners found are not light and dark in turn: {columns} x {rows} is not the "
+            "number of the board's inner corners, or it is no chessboard"
+        )
     dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
     if not dark:
         return BoardNotFound(
@@ -137,15 +142,21 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
 
 
 def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> float:
-    """Positive if the square outside corner 0 is dark, judged from the squares' colours all over the board."""
+    """Above 0 if the square outside corner 0 is dark, below if it is light; 1 where all neighbouring squares agree.
+
+    Neighbours are compared with each other, so that a shadow across the board does not count.
+    """
     columns, rows = inner_corners
     grid = corners.reshape(rows, columns, 2)
     centres = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
-    x, y = np.rint(centres).astype(int).reshape(-1, 2).T
-    values = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)]
+    x, y = np.rint(centres).astype(int).transpose(2, 0, 1)
+    values = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)].astype(float)
     j, i = np.mgrid[: rows - 1, : columns - 1]
-    like_first = (i + j).ravel() % 2 == 0  # the square inside corner 0 has the colour of the one outside it
-    return float(values[~like_first].mean() - values[like_first].mean())
+    turned = values * np.where(
+        (i + j) % 2, 1.0, -1.0
+    )  # the square inside corner 0 has the colour of the one outside it
+    steps = [np.sign(turned[:, 1:] + turned[:, :-1]).ravel(), np.sign(turned[1:] + turned[:-1]).ravel()]
+    return float(np.concatenate(steps).mean())
 
 
 def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:

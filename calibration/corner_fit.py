@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibration._corner_kernel import N_CORNER, fit_corners
 from calibration.camera import Array
+from calibration.robust_corners import LEAST_SIGMA, saddle_points, smooth_grid
 
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
 MIN_WINDOW = 0.3
@@ -21,6 +22,7 @@ EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
 MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of two crossing edges
 BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
 MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered or in glare
+ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
 MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 
 
@@ -29,11 +31,11 @@ class CornerView:
     """Inner corners of one view, in the order of `Board.points`."""
 
     image_size: tuple[int, int]  # width, height [px]
-    points: Array  # (n, 2) [px]; NaN where no fit was possible
+    points: Array  # (n, 2) [px]
     covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
     accepted: NDArray[np.bool_]  # (n,)
     reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds
-    chi_square: Array  # (n,) reduced, of the pixels on the edges
+    chi_square: Array  # (n,) reduced, of the pixels on the edges; NaN where a saddle point stands in for their fit
     contrast: Array  # (n,) light minus dark [grey]
     blur: Array  # (n,) sigma of the edges [px]
     spacing: float  # median distance of neighbouring corners [px]
@@ -73,7 +75,7 @@ def fit_view(grey: Array, rough: Array, inner_corners: tuple[int, int]) -> Corne
         starts = np.where(ok[:, None], fit.found, starts)
     fit = _with_smaller_windows(grey, fit, windows, starts, curvature, noise)
     displaced = _displacement(fit.found[:, :2], axes, inner_corners)
-    return _judged(grey, fit, displaced, noise, axes)
+    return _judged(grey, fit, displaced, noise, axes, rough, inner_corners)
 
 
 @dataclass(frozen=True)
@@ -236,41 +238,50 @@ def _line_curvature(points: Array, ok: NDArray[np.bool_], angles: Array, inner_c
     return curvature
 
 
-def _judged(grey: Array, fit: _Fit, displaced: Array, noise: Array, axes: Array) -> CornerView:
-    """Test every corner, and say why one does not hold."""
-    found, covariance, sums, converged = fit.found, fit.covariance, fit.sums, fit.converged
+def _judged(
+    grey: Array, fit: _Fit, displaced: Array, noise: Array, axes: Array, rough: Array, counts: tuple[int, int]
+) -> CornerView:
+    """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
+    found, sums = fit.found, fit.sums
+    spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
     with np.errstate(invalid="ignore", divide="ignore"):
         chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
     contrast = 2 * np.abs(found[:, 6])
+    converged = fit.converged & np.isfinite(fit.covariance).all((1, 2))
     typical = float(np.median(contrast[converged])) if converged.any() else 0.0
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
     chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
-    reasons = []
-    for i in range(len(found)):
-        if not converged[i] or not np.isfinite(covariance[i]).all():
-            reasons.append("no fit: fewer pixels than parameters, or no crossing edges near the rough corner")
-        elif not displaced[i] < MAX_DISPLACEMENT:
-            reasons.append(f"{displaced[i]:.2f} squares away from where its neighbours put it")
-        elif contrast[i] < MIN_CONTRAST_RATIO * typical:
-            reasons.append(f"contrast {contrast[i]:.1f} grey, the view's median is {typical:.1f}")
-        elif chi_square[i] > chi_limit:
-            reasons.append(
-                f"edges do not fit: reduced chi-square {chi_square[i]:.1f}, the view's median is {spread:.1f}"
-            )
-        else:
-            reasons.append("")
-    accepted = np.array([not reason for reason in reasons])
-    enlarged = covariance * np.maximum(chi_square, 1.0)[:, None, None]
+    faint = converged & (contrast < MIN_CONTRAST_RATIO * typical)
+    fine = converged & (displaced < MAX_DISPLACEMENT) & ~faint & (chi_square < chi_limit)
+    covariance = fit.covariance * np.maximum(chi_square, 1.0)[:, None, None]
+    points, reasons = found[:, :2].copy(), np.where(faint, "covered, or in glare", "").astype(object)
+    saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing)
+    expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts)
+    _, sigma_saddle = smooth_grid(saddles, counts)
+    if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points lie smoother than the fine fits do
+        fine = np.zeros_like(fine)
+        expected, sigma = smooth_grid(saddles, counts)
+    # edges that fit badly on both sides alike leave the corner where it is: no more error than the grid's scatter shows
+    stated = float(np.sqrt(np.median(np.trace(covariance[fine], axis1=1, axis2=2)) / 2)) if fine.any() else sigma
+    covariance = np.maximum(min(sigma / stated, 1.0) ** 2, 1 / np.maximum(chi_square, 1.0))[:, None, None] * covariance
+    sigma_saddle = max(sigma_saddle, LEAST_SIGMA)
+    off = np.linalg.norm(saddles - expected, axis=-1)
+    stands = ~fine & ~faint & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
+    points[~fine] = saddles[~fine]
+    covariance[~fine] = sigma_saddle**2 * np.eye(2)
+    chi_square = np.where(fine, chi_square, np.nan)
+    for i in np.flatnonzero(~fine & ~stands & ~faint):
+        reasons[i] = f"{off[i]:.1f} px from where the other corners put it (they scatter by {sigma_saddle:.2f} px)"
     return CornerView(
         image_size=(grey.shape[1], grey.shape[0]),
-        points=np.where(converged[:, None], found[:, :2], np.nan),
-        covariance=np.where(converged[:, None, None], enlarged, np.nan),
-        accepted=accepted,
-        reasons=tuple(reasons),
+        points=points,
+        covariance=covariance,
+        accepted=fine | stands,
+        reasons=tuple(str(reason) for reason in reasons),
         chi_square=chi_square,
         contrast=contrast,
         blur=found[:, 4],
-        spacing=float(np.median(np.linalg.norm(axes, axis=-1))),
+        spacing=spacing,
         noise=(float(noise[0]), float(noise[1])),
     )

@@ -102,6 +102,43 @@ def test_edges_sharper_than_the_pixel_are_located_as_well(board_drawer, optical_
     assert np.sqrt(np.mean((view.points - truth(board, R, t)) ** 2)) < 0.005  # the light's limit is 0.002 px
 
 
+def spoiled(image, how):
+    """An image as consumers' cameras and compression leave it."""
+    if how == "sharpened":
+        image = cv2.addWeighted(image, 3.0, cv2.GaussianBlur(image, (0, 0), 1.0), -2.0, 0)
+    elif how == "jpeg":
+        image = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], cv2.IMREAD_UNCHANGED)
+    elif how == "small":
+        image = cv2.resize(image, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
+    elif how == "half-tone":
+        y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+        image = np.clip(image + 40.0 * ((x + y) % 2) * (image > 100) - 20, 0, 255).astype(np.uint8)
+    return image
+
+
+@pytest.mark.parametrize("how", ["sharpened", "jpeg", "small", "half-tone"])
+def test_spoiled_images_lose_no_corner_and_state_their_error(board_drawer, how):
+    board = Board((9, 6), 8e-3)
+    squares, rms = [], []
+    for seed, tilt in enumerate([(3, 4, 7), (20, 15, 10), (-35, 10, 33)]):
+        R, t = pose(board, tilt)
+        image = board_drawer(CAMERA, R, t, board, sigma=0.4, rng=np.random.default_rng(seed))
+        image = spoiled(spoiled(image, how), "jpeg")
+        true = truth(board, R, t)
+        true = (true + 0.5) * 0.6 - 0.5 if how == "small" else true
+        view = find_corners(image, (9, 6))
+        assert isinstance(view, CornerView), view
+        assert view.accepted.all()
+        error = view.points - true
+        squares.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(view.covariance), error)) / 2)
+        half = max(int(0.35 * view.spacing), 2)
+        usual = cv2.cornerSubPix(image, np.float32(true).reshape(-1, 1, 2), (half, half), (-1, -1), (3, 60, 1e-4))
+        rms.append([np.sqrt(np.mean(e**2)) for e in (error, usual.reshape(-1, 2) - true)])
+    ours, theirs = np.mean(rms, axis=0)
+    assert ours < theirs
+    assert 0.3 < np.mean(squares) < 3  # compression is no white noise
+
+
 @pytest.mark.parametrize("turn", [0, 37, 90, 145, 180, 222, 270, 301])
 def test_order_follows_the_dark_side_however_the_board_lies(board_drawer, turn):
     board = Board((9, 6), 6e-3)
