@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.brief import Brief
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import euler_jacobian
@@ -69,8 +70,8 @@ class MarkerStatus(IntEnum):
     NOT_LOOKED_FOR = 7
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Brief):
     """Pose of the disc in every frame of a recording; always as long as the recording.
 
     n frames, m markers. NaN where there is no answer; `frame_status` tells why.
@@ -100,6 +101,25 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time)
 
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        told = {"frames": f"{len(self)} at {self.frame_rate:g} Hz", "measured": f"{int(self.measured.sum())}"}
+        good = self.measured
+        if good.any():
+            theta = np.degrees(self.q[good, 4])
+            sigma = np.nanmedian(self.coordinate_sigma[good], axis=0)
+            told |= {
+                "theta": f"{theta[0]:.3g} to {theta[-1]:.3g} deg",
+                "sigma": f"{1e6 * sigma[:3].max():.2g} µm, theta {np.degrees(sigma[4]) * 1e3:.2g} mdeg",
+            }
+        return told | {"disc": f"{2e3 * self.disc.radius:g} mm, {self.disc.n_markers} dots"}
+
+    def to_xarray(self) -> Any:
+        """The trajectory as an `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
+        from disctrack.files.exchange.xarray import to_xarray
+
+        return to_xarray(self)
+
     @property
     def looked_for(self) -> NDArray[np.bool_]:
         """(n,) True where a pose was looked for, found or not."""
@@ -119,17 +139,17 @@ class Trajectory:
     @property
     def coordinate_sigma(self) -> Array:
         """(n, 6) standard deviation of q from this frame's noise alone [m, rad]; psi and phi grow as 1/sin theta."""
-        return _coordinate_sigma(self.q, self.pose_covariance)
+        return coordinate_sigma(self.q, self.pose_covariance)
 
     @property
     def calibration_sigma(self) -> Array:
         """(n, 6) standard deviation of q that frames share [m, rad]: from the rig, and systematic."""
-        return _coordinate_sigma(self.q, self.calibration_covariance)
+        return coordinate_sigma(self.q, self.calibration_covariance)
 
     @property
     def systematic_sigma(self) -> Array:
         """(n, 6) standard deviation of q from `systematic_covariance` alone [m, rad]."""
-        return _coordinate_sigma(self.q, self.systematic_covariance)
+        return coordinate_sigma(self.q, self.systematic_covariance)
 
 
 def part(trajectory: Trajectory, rows: slice) -> Trajectory:
@@ -142,8 +162,11 @@ def part(trajectory: Trajectory, rows: slice) -> Trajectory:
     return replace(trajectory, **per_frame)
 
 
-def _coordinate_sigma(q: Array, pose_covariance: Array) -> Array:
-    """Square roots of the diagonal, rotation vector converted to Euler angles; NaN where q is or an angle is free."""
+def coordinate_sigma(q: Array, pose_covariance: Array) -> Array:
+    """(n, 6) standard deviations of q (n, 6) from the covariance (n, 6, 6) of POSE_COMPONENTS, in the units of q.
+
+    NaN where q is, or where an angle is free.
+    """
     J = euler_jacobian(q[:, 3], q[:, 4])
     rotation = np.einsum("nij,njk,nik->ni", J, pose_covariance[:, 3:, 3:], J)
     position = np.einsum("nii->ni", pose_covariance[:, :3, :3])

@@ -126,7 +126,7 @@ def _frames(seen: Check, recording: Recording) -> ImagePairs | None:
         f"{len(pairs)} pairs of {width} x {height} px, {pairs.left.bit_depth} bit, "
         f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz",
     )  # fmt: skip
-    for text in (*pairs.notes, *pairs.warnings):
+    for text in (*pairs.notes, *pairs.warnings, *pairs.doubts):
         seen.say("look", "frames", text)
     return pairs
 

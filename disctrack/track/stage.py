@@ -24,7 +24,7 @@ from disctrack.readers.file_numbers import check_same_numbers
 from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording.declaration import Recording
 from disctrack.track.motion_span import MotionSpan, find_motion
-from disctrack.track.tracking import TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -159,10 +159,27 @@ def measure(
     unreadable.sort(key=lambda image: (image.frame, image.camera))
     seconds = time.perf_counter() - began
     findings = {
+        **findings_of(tracking),
         "notes": list(pairs.notes),
         "warnings": [*pairs.warnings, *pairs.doubts, *tracking.warnings],
         "doubts": [*pairs.doubts],
         "unreadable": [image.reason for image in unreadable],
+        "first_pass": dataclasses.asdict(span),
+        **pairs.camera_headers(),
+    }
+    trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
+    for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
+        trajectory.frame_status[still] = FrameStatus.STILL
+    return Measurement(trajectory, tuple(unreadable), findings, seconds)
+
+
+def findings_of(tracking: Tracking) -> dict[str, Any]:
+    """What tracking found out on the way, of JSON's types."""
+    return {
+        "notes": [],
+        "warnings": list(tracking.warnings),
+        "doubts": [],
+        "unreadable": [],
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,
@@ -171,13 +188,7 @@ def measure(
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
-        "first_pass": dataclasses.asdict(span),
-        **pairs.camera_headers(),
     }
-    trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
-    for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
-        trajectory.frame_status[still] = FrameStatus.STILL
-    return Measurement(trajectory, tuple(unreadable), findings, seconds)
 
 
 def _workers(pairs: ImagePairs, stretches: int, threads: int | None) -> int:

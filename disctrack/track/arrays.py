@@ -1,0 +1,99 @@
+"""The measurement on frames in memory: arrays in, trajectory out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.camera import StereoRig
+from disctrack.disc import Disc
+from disctrack.errors import TrackingError
+from disctrack.track.stage import Measurement, Progress, findings_of
+from disctrack.track.tracking import PairBlock, TrackingSettings, prepare, stretch_edges, track
+
+Images = NDArray[np.uint8] | NDArray[np.uint16]
+
+BLOCK = 256  # pairs
+
+
+@dataclass(frozen=True)
+class _Block:
+    frames: NDArray[np.int64]
+    images: Images
+    readable: NDArray[np.bool_]
+
+
+def measure_pairs(
+    images: Images | tuple[Images, Images],
+    rig: StereoRig,
+    disc: Disc,
+    frame_rate: float,
+    *,
+    gravity: float = 9.81,
+    settings: TrackingSettings | None = None,
+    timestamps: ArrayLike | None = None,
+    threads: int = 1,
+    progress: Progress = lambda n: None,
+) -> Measurement:
+    """Measure the disc's pose in every pair; every frame is measured (no rest is left out).
+
+    images     : (n, 2, height, width) uint8 or uint16, left and right; or the pair of arrays (n, height, width)
+    frame_rate : [Hz]; timestamps (n,) [s], increasing, where the camera wrote them
+    gravity    : [m/s^2], kept with the trajectory for the physics
+    Raises TrackingError if the arrays are not such images, do not belong to the rig, or show the disc in no pair.
+    """
+    left, right = _sides(images)
+    n = len(left)
+    if not (np.isfinite(frame_rate) and frame_rate > 0):
+        raise TrackingError(f"frame_rate is {frame_rate}; expected frames per second, above 0")
+    times = None if timestamps is None else np.asarray(timestamps, float)
+    if times is not None and (times.shape != (n,) or not np.all(np.diff(times) > 0)):
+        raise TrackingError(f"timestamps of shape {times.shape} for {n} pairs; expected ({n},), increasing, in seconds")
+    edges = stretch_edges(range(n), disc)
+    prepare(left.dtype)
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        cuts = sorted({start, stop, *(edge for edge in edges if start < edge < stop)})
+        for a, b in pairwise(cuts):
+            for first in range(a, b, BLOCK):
+                rows = slice(first, min(first + BLOCK, b))
+                pair = np.stack([left[rows], right[rows]], axis=1)
+                yield _Block(np.arange(rows.start, rows.stop), pair, np.ones(pair.shape[:2], bool))
+
+    began = time.perf_counter()
+    tracking = track(
+        read_blocks,
+        range(n),
+        rig,
+        disc,
+        float(frame_rate),
+        gravity=gravity,
+        settings=settings,
+        timestamps=times,
+        workers=threads,
+        progress=progress,
+    )
+    return Measurement(tracking.trajectory, (), findings_of(tracking), time.perf_counter() - began)
+
+
+def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
+    expected = "expected (n, 2, height, width), or two arrays (n, height, width), of uint8 or uint16"
+    if isinstance(images, tuple | list) and len(images) == 2:
+        left, right = (np.asarray(side) for side in images)
+    else:
+        whole = np.asarray(images)
+        if whole.ndim != 4 or whole.shape[1] != 2:
+            raise TrackingError(f"images of shape {whole.shape}; {expected}")
+        left, right = whole[:, 0], whole[:, 1]
+    if left.shape != right.shape or left.ndim != 3 or left.dtype != right.dtype:
+        raise TrackingError(f"images of shape {left.shape} {left.dtype} and {right.shape} {right.dtype}; {expected}")
+    if left.dtype not in (np.uint8, np.uint16):
+        raise TrackingError(f"images of type {left.dtype}; {expected}")
+    if not len(left):
+        raise TrackingError("no image in the arrays")
+    return left, right

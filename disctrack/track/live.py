@@ -1,0 +1,195 @@
+"""Poses while the camera runs: one pair in, one pose out, with the state that links them.
+
+The same compiled loop as for recordings, a pair at a time; what `track` learns from the whole recording (the dots as
+printed, their scatter) is not known yet, so the disc should be one that was measured before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import StereoRig
+from disctrack import frames
+from disctrack.disc import Disc
+from disctrack.frames import POSE_COMPONENTS
+from disctrack.track import tracking as tracker
+from disctrack.track.dots import dot_centres
+from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
+from disctrack.trajectory import FrameStatus, coordinate_sigma
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True, repr=False)
+class LivePose:
+    """Pose of the disc in one pair, with what is needed to judge it; NaN where `status` has no pose."""
+
+    frame: int  # pairs since the tracker was made
+    q: Array  # (6,) x, y, z [m], psi, theta, phi [rad]; angles unwrapped since the disc was last found
+    R_world_body: Array  # (3, 3)
+    covariance: Array  # (6, 6) noise of this pair, in POSE_COMPONENTS (frames.py); calibration not included
+    status: FrameStatus
+    markers_px: Array  # (2, m, 2) centres of the dots; NaN where a dot was not measured
+    residuals_px: Array  # (2, m, 2) observed - projected
+    reduced_chi_square: float
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of q by this pair's noise [m, rad]; psi and phi grow as 1 / sin(theta)."""
+        return np.asarray(coordinate_sigma(self.q[None], self.covariance[None])[0])
+
+    def __repr__(self) -> str:
+        if not self.status.has_pose:
+            return f"LivePose(frame {self.frame}: {self.status.sentence})"
+        x, y, z = 1e3 * self.q[:3]
+        psi, theta, phi = np.degrees(self.q[3:])
+        return (
+            f"LivePose(frame {self.frame}: x {x:.4f} y {y:.4f} z {z:.4f} mm, psi {psi:.3f} theta {theta:.4f} "
+            f"phi {phi:.3f} deg, {self.status.name.lower()})"
+        )
+
+
+class Tracker:
+    """Follows the disc through pairs as they come.
+
+    rig, disc : of the set-up, from `read_rig` and a trajectory or recording
+    settings  : limits and rejection as for recordings; nothing is refined over the sequence
+    The first pairs compile (once per installation) and search the disc; after that a pair of 512 x 512 px takes under
+    a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
+    """
+
+    def __init__(self, rig: StereoRig, disc: Disc, settings: tracker.TrackingSettings | None = None) -> None:
+        self.rig, self.disc = rig, disc
+        self.frame = -1
+        self._settings = settings or tracker.TrackingSettings()
+        maps = [tracker.normalised_maps(camera) for camera in rig.cameras]
+        maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
+        here = (np.eye(3), np.zeros(3))
+        self._follower = tracker._Follower(
+            rig, disc, self._settings.limits, maps_x, maps_y,
+            [tracker.NoiseModel(1.0, 0.02)] * 2, [tracker.TYPICAL_BLUR_PX] * 2, here, here,
+        )  # fmt: skip
+        self._readable = np.ones((1, 2), bool)
+        self._angles: Array | None = None  # of the last pose
+        self._found: tuple[Array, Array] | None = None  # in the pair before, by a search
+        self._pair: NDArray = np.empty((1, 2, 0, 0), np.uint8)
+
+    def __repr__(self) -> str:
+        state = "following the disc" if self._follower.tracking else "searching"
+        return f"Tracker({self.disc.n_markers} dots, {self.frame + 1} pairs seen, {state})"
+
+    def next(self, left: Image, right: Image) -> LivePose:
+        """Pose in the next pair; images (height, width) uint8 or uint16.
+
+        Raises TrackingError if the images do not have the size that the rig was calibrated at.
+        """
+        self.frame += 1
+        images = self._as_block(left, right)
+        follower, m = self._follower, self.disc.n_markers
+        rows = tracker._empty_rows(1, m)
+        done = follower.run(images, self._readable, rows) if follower.tracking else 0
+        if not done:
+            done = self._search(images, rows)
+        follower.tracking = bool(done)
+        if not done:
+            self._angles = None
+            return self._without_pose(FrameStatus.MARKERS_NOT_FOUND)
+        return self._pose(rows)
+
+    def _as_block(self, left: Image, right: Image) -> NDArray:
+        left, right = np.asarray(left), np.asarray(right)
+        if self._pair.shape[2:] != left.shape or self._pair.dtype != left.dtype:
+            self._pair = np.empty((1, 2, *left.shape), left.dtype)
+            tracker._check_images(self._pair, self.rig)
+        self._pair[0, 0], self._pair[0, 1] = left, right
+        return self._pair
+
+    def _search(self, images: NDArray, rows: tracker._Rows) -> int:
+        """Search without a prior; the velocity comes from the pair before, if that was searched too."""
+        follower, before = self._follower, self._found
+        self._found = None
+        if not tracker._acquire(follower, images, self._readable):
+            return 0
+        if before is not None:
+            follower.before = before
+        done = follower.run(images, self._readable, rows)
+        if done:
+            self._found = (rows.R[0].copy(), rows.t[0].copy())
+        return done
+
+    def _pose(self, rows: tracker._Rows) -> LivePose:
+        dots = dot_centres(rows.results, rows.status)
+        pixels, covariances = dots.pixels, dots.covariance_px2
+        R, t, covariance, residuals, chi_square, used = _refined(
+            pixels, covariances, self.rig, self.disc, rows.R, rows.t, self._settings.reject_outliers
+        )
+        if not np.isfinite(t).all():
+            return self._without_pose(FrameStatus.NOT_CONVERGED)
+        angles = frames.euler_from_rotation(R)
+        if self._angles is not None:
+            angles = frames.unwrap_euler(np.stack([self._angles, angles]))[1]
+        self._angles = angles
+        per_camera = used.sum(axis=1)
+        status = FrameStatus.MEASURED
+        if (per_camera == 0).any():
+            status = FrameStatus.ONE_CAMERA
+        elif per_camera.sum() < tracker.MIN_GOOD_DOT_IMAGES:
+            status = FrameStatus.FEW_MARKERS
+        q = np.concatenate([t, angles])
+        return LivePose(self.frame, q, R, covariance, status, pixels[0], residuals, chi_square)
+
+    def _without_pose(self, status: FrameStatus) -> LivePose:
+        m, nan = self.disc.n_markers, np.nan
+        return LivePose(
+            self.frame, np.full(6, nan), np.full((3, 3), nan), np.full((6, 6), nan), status,
+            np.full((2, m, 2), nan), np.full((2, m, 2), nan), nan,
+        )  # fmt: skip
+
+    def with_disc(self, disc: Disc) -> Tracker:
+        """A new tracker for the disc as a recording has refined it."""
+        return Tracker(self.rig, replace(self.disc, marker_centres_body=disc.marker_centres_body), self._settings)
+
+
+def _refined(
+    pixels: Array, covariances: Array, rig: StereoRig, disc: Disc, R: Array, t: Array, reject: bool
+) -> tuple[Array, Array, Array, Array, float, NDArray[np.bool_]]:
+    """One weighted Gauss-Newton step from the loop's pose, which is good to a hundredth of a pixel: then it is exact.
+
+    pixels (1, 2, m, 2), covariances (1, 2, m, 2, 2), R (1, 3, 3), t (1, 3); where a dot stands out, `fit_poses` judges.
+    returns : R (3, 3), t (3,), covariance (6, 6), residuals (2, m, 2), reduced chi-square, used (2, m)
+    """
+    used = np.isfinite(pixels).all(-1)
+    projected, J = marker_pixels(R, t, rig, disc.marker_centres_body)
+    W = whitening(np.where(used[..., None, None], covariances, np.eye(2)))
+    residual = np.where(used[..., None], pixels - projected, 0.0)
+    r = (W @ residual[..., None])[..., 0].reshape(-1)
+    A = np.where(used[..., None, None], W @ J, 0.0).reshape(-1, len(POSE_COMPONENTS))
+    count = int(used.sum())
+    if count < MIN_DOTS:
+        return (*_nothing(), np.full(pixels.shape[1:], np.nan), np.nan, used[0])
+    covariance = np.linalg.inv(A.T @ A)
+    step = covariance @ (A.T @ r)
+    left_over = r - A @ step
+    chi_square = float(left_over @ left_over)
+    freedom = max(2 * count - 6, 1)
+    worst = float((left_over.reshape(-1, 2) ** 2).sum(axis=1).max())
+    usual = max(1.0, chi_square / freedom)
+    if worst > 2 * OUTLIER_CHI_SQUARE * usual or worst > 2 * OUTLIER_CHI_SQUARE:
+        fit = fit_poses(pixels, covariances, rig, disc.marker_centres_body, R, t, reject_outliers=reject,
+                        with_sensitivity=False)  # fmt: skip
+        return (
+            fit.R_world_body[0], fit.t_world_body[0], fit.covariance[0], fit.residuals_px[0],
+            float(fit.reduced_chi_square[0]), fit.used[0],
+        )  # fmt: skip
+    residuals = np.where(used[0, ..., None], residual[0] - (J[0] @ step), np.nan)
+    turned = frames.rotation_from_vector(step[3:]) @ R[0]
+    return turned, t[0] + step[:3], covariance, residuals, chi_square / freedom, used[0]
+
+
+def _nothing() -> tuple[Array, Array, Array]:
+    return np.full((3, 3), np.nan), np.full(3, np.nan), np.full((6, 6), np.nan)
+
