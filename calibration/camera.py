@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.brief import Brief
+
 Array = NDArray[np.float64]
 
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -130,8 +132,8 @@ def normalise(pixels: Array, camera: Camera, iterations: int = 20) -> Array:
     return np.where(good[..., None], np.stack([a, b], axis=-1), np.nan)
 
 
-@dataclass(frozen=True)
-class StereoRig:
+@dataclass(frozen=True, repr=False)
+class StereoRig(Brief):
     """Two calibrated cameras and the world (lab) frame they look at.
 
     points_left = R_left_world @ points_world + t_left_world;  points_right = R_right_left @ points_left + t_right_left.
@@ -148,6 +150,16 @@ class StereoRig:
     t_left_world: Array = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
     covariance: Array = field(default_factory=lambda: np.zeros((N_RIG, N_RIG)))  # (30, 30)
     world_is_table: bool = False
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        sizes = [" x ".join(str(n) for n in camera.image_size) for camera in self.cameras]
+        return {
+            "images": f"{sizes[0]} px" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} px",
+            "focal length": " and ".join(f"{camera.fx:.1f}" for camera in self.cameras) + " px",
+            "baseline": f"{1e3 * self.baseline:.3f} mm",
+            "world": "the table" if self.world_is_table else "the left camera's axes",
+        }
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:

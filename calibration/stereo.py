@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.assessment import Assessment, assess, consistency_factor, half_set_differences
 from calibration.board import Board
+from calibration.brief import Brief
 from calibration.camera import Array, StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
 from calibration.errors import CalibrationError
@@ -42,8 +43,8 @@ class CalibrationSettings:
             raise CalibrationError(f"board model {self.board!r}: choose auto, {', '.join(BOARD_MODELS)}")
 
 
-@dataclass(frozen=True)
-class StereoCalibration:
+@dataclass(frozen=True, repr=False)
+class StereoCalibration(Brief):
     """A calibrated rig and everything needed to judge it, or to do it again without the images."""
 
     rig: StereoRig  # with covariance (30, 30)
@@ -59,6 +60,16 @@ class StereoCalibration:
     candidates: tuple[Candidate, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        used = len(self.view_names) - len(self.rejected_views)
+        return {
+            "views": f"{used} of {len(self.view_names)}",
+            "rms": f"{self.rms_px:.4f} px",
+            **self.rig.facts(),
+            "verdict": self.assessment.verdict,
+        }
 
     @property
     def rms_px(self) -> float:

@@ -32,6 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "batch": ("disctrack.commands.batch", "many recordings side by side: a report of each, and one summary"),
     "simulate": ("disctrack.commands.simulate", "rolling model: scene -> motion, energies, contact forces"),
     "render": ("disctrack.commands.render", "scene -> recording as the cameras would write it, and its truth"),
+    "convert": ("disctrack.commands.convert", "trajectory or rig from and to the formats of other programs"),
     "validate": ("disctrack.commands.validate", "render -> measure -> compare: the verdict on 0.005 mm / 0.05 deg"),
 }
 

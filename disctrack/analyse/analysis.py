@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.brief import Brief
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.derivatives import GROUP_NAMES, Motion, differentiate
 from disctrack.analyse.energy import Energy, analyse_energy
@@ -41,8 +42,8 @@ class Scaling:
     count: NutationCount
 
 
-@dataclass(frozen=True)
-class Analysis:
+@dataclass(frozen=True, repr=False)
+class Analysis(Brief):
     """Everything that the analysis of one trajectory gives."""
 
     trajectory: Trajectory
@@ -52,6 +53,18 @@ class Analysis:
     energy: Energy
     scaling: Scaling
     warnings: tuple[str, ...]
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        told = {
+            "frames": f"{int(self.motion.known.sum())} of {len(self.motion)}",
+            "contact": self.contact.onset.verdict,
+            "energy lost": f"{1e3 * self.energy.loss:.4g} mJ",
+        }
+        laws = self.scaling.laws
+        if laws.determined:
+            told |= {"t_f": f"{laws.t_f:.4f} s", "n_theta": f"{laws.n_theta.value:.4f} ± {laws.n_theta.sigma:.4f}"}
+        return told
 
     def series(self, name: str) -> Series:
         """The derived quantity of this name."""

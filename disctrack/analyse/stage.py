@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.brief import Brief
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
 from disctrack.analyse.derivatives import GROUP_NAMES, STATE
 from disctrack.analyse.power_laws import (
@@ -24,14 +25,18 @@ from disctrack.frames import euler_jacobian
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class AnalyseOutcome:
+@dataclass(frozen=True, repr=False)
+class AnalyseOutcome(Brief):
     """What `run_analyse` did."""
 
     analysis: Analysis
     file: Path  # the trajectory, with the new groups
     report: Path  # report.html
     figures: tuple[Path, ...]
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        return {**self.analysis.facts(), "report": str(self.report)}
 
     def lines(self) -> list[str]:
         """What was found, for the command line."""

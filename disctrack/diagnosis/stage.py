@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.brief import Brief
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
@@ -30,13 +31,17 @@ from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
 
 
-@dataclass(frozen=True)
-class DiagnoseOutcome:
+@dataclass(frozen=True, repr=False)
+class DiagnoseOutcome(Brief):
     """What `run_diagnose` did."""
 
     result: DiscDiagnosis
     files: tuple[Path, ...]
     summary: tuple[str, ...]
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        return {**self.result.facts(), "files": ", ".join(file.name for file in self.files)}
 
 
 def diagnose_trajectory(

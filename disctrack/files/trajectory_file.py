@@ -183,15 +183,27 @@ def read_setup(path: Path) -> Setup:
 
 
 def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> None:
-    """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown."""
+    """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown.
+
+    Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
+    calibration.
+    """
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists. Choose another name with -o, or replace it with --overwrite.")
     scale = np.array([1e3, 1e3, 1e3, *np.degrees([1.0, 1.0, 1.0])])
     units = ["mm"] * 3 + ["deg"] * 3
     names = [f"{name}_{unit}" for name, unit in zip(COORDINATES, units, strict=True)]
     header = ["frame", "time_s", *names, *(n.replace("_", "_sigma_") for n in names)]
+    header += [n.replace("_", "_sigma_calibration_") for n in names]
     header += [*(f"reprojection_rms_{camera}_px" for camera in CAMERAS), "status"]
-    table = np.column_stack([trajectory.q * scale, trajectory.coordinate_sigma * scale, trajectory.reprojection_rms_px])
+    table = np.column_stack(
+        [
+            trajectory.q * scale,
+            trajectory.coordinate_sigma * scale,
+            trajectory.calibration_sigma * scale,
+            trajectory.reprojection_rms_px,
+        ]
+    )
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(header)
@@ -201,6 +213,11 @@ def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> No
         cells = ["" if np.isnan(value) else f"{value:.7g}" for value in values]
         writer.writerow([frame, f"{time:.9g}", *cells, FrameStatus(status).name.lower()])
     write_whole(path, text.getvalue().encode())
+
+
+def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, Variable]]:
+    """Variables of the file's root, of its group `markers`, and the axes of both."""
+    return _root_variables(trajectory), _markers(trajectory), _axes(trajectory)
 
 
 def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str, Any]:

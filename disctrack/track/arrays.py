@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +17,7 @@ from disctrack.errors import TrackingError
 from disctrack.track.stage import Measurement, Progress, findings_of
 from disctrack.track.tracking import PairBlock, TrackingSettings, prepare, stretch_edges, track
 
-Images = NDArray[np.uint8] | NDArray[np.uint16]
+Images = NDArray[Any]  # uint8 or uint16
 
 BLOCK = 256  # pairs
 

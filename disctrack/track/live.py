@@ -101,7 +101,6 @@ class Tracker:
         return self._pose(rows)
 
     def _as_block(self, left: Image, right: Image) -> NDArray:
-        left, right = np.asarray(left), np.asarray(right)
         if self._pair.shape[2:] != left.shape or self._pair.dtype != left.dtype:
             self._pair = np.empty((1, 2, *left.shape), left.dtype)
             tracker._check_images(self._pair, self.rig)
@@ -162,7 +161,7 @@ def _refined(
     pixels (1, 2, m, 2), covariances (1, 2, m, 2, 2), R (1, 3, 3), t (1, 3); where a dot stands out, `fit_poses` judges.
     returns : R (3, 3), t (3,), covariance (6, 6), residuals (2, m, 2), reduced chi-square, used (2, m)
     """
-    used = np.isfinite(pixels).all(-1)
+    used: NDArray[np.bool_] = np.asarray(np.isfinite(pixels).all(-1))
     projected, J = marker_pixels(R, t, rig, disc.marker_centres_body)
     W = whitening(np.where(used[..., None, None], covariances, np.eye(2)))
     residual = np.where(used[..., None], pixels - projected, 0.0)
@@ -192,4 +191,3 @@ def _refined(
 
 def _nothing() -> tuple[Array, Array, Array]:
     return np.full((3, 3), np.nan), np.full(3, np.nan), np.full((6, 6), np.nan)
-

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.brief import Brief
 from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
 from disctrack.files.trajectory_file import Provenance
@@ -65,14 +66,19 @@ class ImagePairs:
             return {f"{name} frames": digest for name, digest in zip(CAMERAS, digests, strict=True)}
 
 
-@dataclass(frozen=True)
-class Measurement:
+@dataclass(frozen=True, repr=False)
+class Measurement(Brief):
     """A tracked recording and what the run found out on the way."""
 
     trajectory: Trajectory
     unreadable: tuple[Unreadable, ...]
     findings: dict[str, Any]  # blur, noise, warnings, ...: of JSON's types, stored with the result
     seconds: float  # spent on reading and tracking
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        told = {**self.trajectory.facts(), "warnings": f"{len(self.findings['warnings'])}"}
+        return told | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else told
 
 
 def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from calibration.brief import Brief
 from disctrack.diagnosis.disc.errors import Errors
 from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment
 from disctrack.diagnosis.disc.separation import Separation
@@ -25,8 +26,8 @@ class Learned:
     power: float  # mean over the recording [W]; negative where it takes energy from the disc
 
 
-@dataclass(frozen=True)
-class DiscDiagnosis:
+@dataclass(frozen=True, repr=False)
+class DiscDiagnosis(Brief):
     """Diagnosis of one trajectory of the disc."""
 
     system: DiscSystem
@@ -40,6 +41,12 @@ class DiscDiagnosis:
     learned: Learned | None = None
     separated_by: dict[str, dict[str, Separation | None]] = field(default_factory=dict)  # effect -> rival -> recording
     notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        told = {"verdict": self.diagnosis.verdict, "says": self.sentence}
+        chi = [fit.reduced_chi_square for fit in (self.diagnosis.before, self.after_fit)]
+        return told | {"reduced chi-square": f"{chi[0]:.4g} before, {chi[1]:.4g} after"}
 
     @property
     def after_fit(self) -> Fit:

@@ -1,0 +1,184 @@
+"""Rigs from and to Caliscope's (Anipose's) TOML and mrcal's .cameramodel, where the lens model is Brown's.
+
+Both store each camera's pose as x_camera = R x_reference + t with R as a rotation vector, metres, and pixels that count
+from the centre of the top-left one: as here. Their lens terms k1 k2 p1 p2 k3 are OpenCV's, and so are ours. None of the
+formats has a place for the covariance: a rig that comes back has none, and poses measured with it lack the
+calibration's part of the sigma.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calibration.camera import Array, Camera, StereoRig
+from calibration.errors import RigFileError
+
+MRCAL_MODELS = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5}
+MAX_BYTES = 50_000_000  # mrcal keeps the whole calibration in a camera's file
+
+
+def export_caliscope(path: str | os.PathLike[str], rig: StereoRig) -> None:
+    """Write camera_array.toml as Caliscope reads it; cameras 0 (left) and 1 (right). Raises RigFileError."""
+    lines = []
+    for number, (camera, pose) in enumerate(zip(rig.cameras, rig.camera_poses(), strict=True)):
+        r, t = _rotation_vector(pose[0]), pose[1]
+        lines += [
+            f"[cameras.{number}]",
+            f"cam_id = {number}",
+            f"size = {_listed(camera.image_size)}",
+            "rotation_count = 0",
+            f"matrix = [{', '.join(_listed(row) for row in camera.camera_matrix)}]",
+            f"distortions = {_listed(camera.distortion)}",
+            f"translation = {_listed(t)}",
+            f"rotation = {_listed(r)}",
+            "fisheye = false",
+            "",
+        ]
+    _write(Path(path), "\n".join(lines))
+
+
+def import_caliscope(
+    path: str | os.PathLike[str], cameras: tuple[str, str] | None = None, *, world_is_table: bool = False
+) -> StereoRig:
+    """Two cameras of Caliscope's camera_array.toml or of Anipose's calibration.toml.
+
+    cameras : their names ("0", "1"; "cam_0", ...) where the file has more than two; left first
+    world_is_table : True if the file's reference is the table, k up; otherwise the heights mean nothing
+    Raises RigFileError that names what the file holds.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(_content(path))
+    except ValueError as error:
+        raise RigFileError(f"{path}: not TOML: {error}") from error
+    tables = content.get("cameras", content)
+    found = {name: table for name, table in tables.items() if isinstance(table, dict) and "matrix" in table}
+    names = cameras or tuple(found)
+    if len(names) != 2 or not all(name in found for name in names):
+        raise RigFileError(f"{path}: holds the cameras {', '.join(found) or 'none'}; name two of them, left first")
+    parts = []
+    for name in names:
+        table, where = found[name], f"{path}, camera {name}"
+        if table.get("fisheye"):
+            raise RigFileError(f"{where}: a fisheye lens; only Brown's distortion can be read")
+        K = _array(table, "matrix", (3, 3), where)
+        D = np.asarray(table.get("distortions", []), float).ravel()
+        size = _array(table, "size", (2,), where).astype(int)
+        rotation = np.asarray(table.get("rotation", []), float)
+        if rotation.size not in (3, 9):
+            raise RigFileError(f"{where}: has no rotation: its place was not calibrated")
+        parts.append((_camera(K, D, size, where), _matrix(rotation, where), _array(table, "translation", (3,), where)))
+    return _rig(parts, world_is_table)
+
+
+def export_mrcal(paths: tuple[str | os.PathLike[str], str | os.PathLike[str]], rig: StereoRig) -> None:
+    """Write left and right .cameramodel; the reference is the rig's world. Raises RigFileError."""
+    for path, camera, (R, t) in zip(paths, rig.cameras, rig.camera_poses(), strict=True):
+        text = (
+            "{\n"
+            "    'lensmodel':  'LENSMODEL_OPENCV5',\n"
+            "    # fx, fy, cx, cy, k1, k2, p1, p2, k3\n"
+            f"    'intrinsics': {_listed(camera.parameters)},\n"
+            "    # rotation vector and translation [m]: reference to camera\n"
+            f"    'extrinsics': {_listed(np.concatenate([_rotation_vector(R), t]))},\n"
+            f"    'imagersize': {_listed(camera.image_size)}\n"
+            "}\n"
+        )
+        _write(Path(path), text)
+
+
+def import_mrcal(
+    left: str | os.PathLike[str], right: str | os.PathLike[str], *, world_is_table: bool = False
+) -> StereoRig:
+    """A rig from two .cameramodel files with one reference. Raises RigFileError, also for richer lens models.
+
+    world_is_table : True if their reference is the table, k up
+    """
+    parts = []
+    for path in map(Path, (left, right)):
+        try:
+            model = ast.literal_eval(_content(path).strip())
+        except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+            raise RigFileError(f"{path}: not a .cameramodel of mrcal ({type(error).__name__})") from error
+        if not isinstance(model, dict):
+            raise RigFileError(f"{path}: not a .cameramodel of mrcal: no dictionary")
+        name = str(model.get("lensmodel", model.get("lens_model", "none")))
+        if name not in MRCAL_MODELS:
+            raise RigFileError(
+                f"{path}: lens model {name}; {', '.join(MRCAL_MODELS)} can be read. mrcal-convert-lensmodel fits one"
+            )
+        values = _array(model, "intrinsics", (4 + MRCAL_MODELS[name],), str(path))
+        fx, fy, cx, cy, *distortion = (float(value) for value in values)
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        size = _array(model, "imagersize", (2,), str(path)).astype(int)
+        key = next((k for k in ("extrinsics", "rt_cam_ref") if k in model), "extrinsics")
+        rt = _array(model, key, (6,), str(path))
+        parts.append((_camera(K, np.array(distortion), size, str(path)), _matrix(rt[:3], str(path)), rt[3:]))
+    return _rig(parts, world_is_table)
+
+
+def _rig(parts: list[tuple[Camera, Array, Array]], world_is_table: bool) -> StereoRig:
+    (left, R_left, t_left), (right, R_right, t_right) = parts
+    R = R_right @ R_left.T
+    return StereoRig(left, right, R, t_right - R @ t_left, R_left, t_left, world_is_table=world_is_table)
+
+
+def _camera(K: Array, D: Array, size: Array, where: str) -> Camera:
+    if not (K[0, 0] > 0 and K[1, 1] > 0) or abs(K[0, 1]) > 1e-9 or size.min() < 1:
+        raise RigFileError(f"{where}: no camera matrix without skew, or no image size")
+    if len(D) > 14 or not np.isfinite(D).all() or np.any(D[5:] != 0):
+        raise RigFileError(f"{where}: {len(D)} lens terms; only k1 k2 p1 p2 k3 can be read")
+    terms = np.zeros(5)
+    terms[: len(D[:5])] = D[:5]
+    return Camera.from_parameters(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *terms]), (int(size[0]), int(size[1])))
+
+
+def _array(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
+    try:
+        value = np.asarray(table[key], float).reshape(shape)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RigFileError(f"{where}: '{key}' is missing, or not numbers of shape {shape}") from error
+    if not np.isfinite(value).all():
+        raise RigFileError(f"{where}: '{key}' holds numbers that are not finite")
+    return value
+
+
+def _matrix(rotation: Array, where: str) -> Array:
+    R = np.asarray(cv2.Rodrigues(rotation.reshape(3))[0], float) if rotation.size == 3 else rotation.reshape(3, 3)
+    if not np.abs(R @ R.T - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
+        raise RigFileError(f"{where}: its rotation is none")
+    return R
+
+
+def _rotation_vector(R: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(R)[0], float).ravel()
+
+
+def _listed(values: Any) -> str:
+    return "[" + ", ".join(repr(v.item() if hasattr(v, "item") else v) for v in values) + "]"
+
+
+def _content(path: Path) -> str:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise RigFileError(f"{path}: {path.stat().st_size} bytes are too many for a rig")
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RigFileError(f"{path}: cannot be read ({error})") from error
+
+
+def _write(path: Path, text: str) -> None:
+    part = path.with_name(f"{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        raise RigFileError(f"{path}: the rig cannot be written ({error.strerror})") from error

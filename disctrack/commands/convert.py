@@ -1,0 +1,134 @@
+"""`disctrack convert`: trajectories and rigs from and to the formats of other programs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+TRAJECTORY = (".csv", ".mat", ".c3d")
+OPENCV = (".yml", ".yaml", ".xml")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack convert`."""
+    parser.add_argument(
+        "source",
+        type=Path,
+        nargs="+",
+        help="trajectory.h5, rig.h5, or a rig of another program; two files where it keeps one per camera, left first",
+    )
+    parser.add_argument(
+        "target",
+        type=Path,
+        help="by its suffix: a trajectory to .csv, .mat (MATLAB), .c3d; a rig to .yml (OpenCV), .toml "
+        "(Caliscope), .cameramodel (mrcal; -left and -right are added), or from these to .h5",
+    )
+    parser.add_argument(
+        "--table",
+        action="store_true",
+        help="the foreign rig's reference is the table, z up (else heights mean nothing)",
+    )
+    parser.add_argument(
+        "--cameras", nargs=2, metavar=("LEFT", "RIGHT"), help="which two cameras of a Caliscope or Anipose file"
+    )
+    parser.add_argument(
+        "--image-size",
+        type=int,
+        nargs=2,
+        metavar=("WIDTH", "HEIGHT"),
+        help="[px] where an OpenCV file does not tell it",
+    )
+    parser.add_argument("--unit-mm", type=float, help="length of an OpenCV file's unit, where it does not tell it")
+    parser.add_argument("--overwrite", action="store_true", help="replace the target")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Convert; returns the exit code."""
+    from disctrack.cli import DONE
+    from disctrack.errors import OutputError
+
+    target: Path = arguments.target
+    if target.exists() and not arguments.overwrite:
+        raise OutputError(f"{target}: exists. Choose another name, or replace it with --overwrite.")
+    if target.suffix in TRAJECTORY:
+        written = [_trajectory(arguments)]
+    elif target.suffix == ".h5":
+        written = [_foreign_rig(arguments)]
+    else:
+        written = _own_rig(arguments)
+    print(f"{'written':<13} {', '.join(str(path) for path in written)}")
+    return DONE
+
+
+def _trajectory(arguments: argparse.Namespace) -> Path:
+    from disctrack.files.trajectory_file import read_trajectory, write_csv
+
+    trajectory = read_trajectory(_single(arguments.source))
+    target: Path = arguments.target
+    if target.suffix == ".csv":
+        write_csv(target, trajectory, overwrite=True)
+        return target
+    if target.suffix == ".mat":
+        from disctrack.files.exchange.matlab import write_mat
+
+        return write_mat(target, trajectory, overwrite=True)
+    from disctrack.files.exchange.c3d import write_c3d
+
+    return write_c3d(target, trajectory, overwrite=True)
+
+
+def _foreign_rig(arguments: argparse.Namespace) -> Path:
+    from calibration.foreign_rigs import import_caliscope, import_mrcal
+    from calibration.opencv_yaml import import_opencv
+    from calibration.rig_file import write_rig
+    from disctrack.errors import RigFileError
+
+    source, first = arguments.source, arguments.source[0]
+    if first.suffix == ".cameramodel":
+        if len(source) != 2:
+            raise RigFileError(f"{first}: mrcal keeps one camera per file; give two, left first")
+        rig = import_mrcal(*source, world_is_table=arguments.table)
+    elif first.suffix == ".toml":
+        cameras = None if arguments.cameras is None else tuple(arguments.cameras)
+        rig = import_caliscope(_single(source), cameras, world_is_table=arguments.table)
+    elif first.suffix in OPENCV:
+        size = None if arguments.image_size is None else tuple(arguments.image_size)
+        unit = None if arguments.unit_mm is None else 1e-3 * arguments.unit_mm
+        rig = import_opencv(*source, image_size=size, unit=unit)
+    else:
+        raise RigFileError(f"{first}: rigs are read from .yml (OpenCV), .toml (Caliscope) and .cameramodel (mrcal)")
+    write_rig(arguments.target, rig)
+    return arguments.target
+
+
+def _own_rig(arguments: argparse.Namespace) -> list[Path]:
+    from calibration.foreign_rigs import export_caliscope, export_mrcal
+    from calibration.opencv_yaml import export_opencv
+    from calibration.rig_file import read_rig
+    from disctrack.errors import OutputError
+
+    target: Path = arguments.target
+    if target.suffix not in (*OPENCV, ".toml", ".cameramodel"):
+        known = ", ".join((*TRAJECTORY, *OPENCV, ".toml", ".cameramodel", ".h5"))
+        raise OutputError(f"{target}: no format of this name; known are {known}")
+    rig = read_rig(_single(arguments.source))
+    if target.suffix == ".toml":
+        export_caliscope(target, rig)
+    elif target.suffix == ".cameramodel":
+        sides = [target.with_name(f"{target.stem}-{side}.cameramodel") for side in ("left", "right")]
+        for side in sides:
+            if side.exists() and not arguments.overwrite:
+                raise OutputError(f"{side}: exists. Choose another name, or replace it with --overwrite.")
+        export_mrcal((sides[0], sides[1]), rig)
+        return sides
+    else:
+        export_opencv(target, rig)
+    return [target]
+
+
+def _single(source: list[Path]) -> Path:
+    from disctrack.errors import OutputError
+
+    if len(source) != 1:
+        raise OutputError(f"{len(source)} files given; one is converted at a time")
+    return source[0]

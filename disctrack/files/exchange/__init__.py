@@ -1,0 +1,1 @@
+"""Trajectories and rigs in the formats of other programs."""

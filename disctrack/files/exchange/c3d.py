@@ -1,0 +1,67 @@
+"""A trajectory for programs of motion capture: points and the rigid body in a C3D file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.errors import OutputError
+from disctrack.files.whole import whole_file
+from disctrack.frames import rotation_from_quaternion
+from disctrack.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+def write_c3d(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Path:
+    """Dots, centre and the tips of the body axes as points in mm, world axes, z up; times at the frame rate.
+
+    The body axes are points one radius from the centre (AXIS_1, AXIS_2 in the face, AXIS_3 out of it), from which any
+    program builds the rigid body; a point's residual is its one-sigma in mm, -1 in frames without a pose. C3D keeps
+    single precision: 1e-4 mm at 1 m. Raises OutputError, also where ezc3d is not installed.
+    """
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists. Choose another name, or replace it with --overwrite.")
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise OutputError(f"{path}: C3D needs ezc3d: pip install ezc3d") from error
+    points, labels = _points(trajectory)
+    sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
+    file = ezc3d.c3d()
+    parameters = file["parameters"]
+    parameters["POINT"]["UNITS"]["value"] = ["mm"]
+    parameters["POINT"]["RATE"]["value"] = [float(trajectory.frame_rate)]
+    parameters["POINT"]["LABELS"]["value"] = labels
+    parameters["POINT"]["DESCRIPTIONS"]["value"] = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
+    known = trajectory.measured
+    data = np.ones((4, len(labels), len(trajectory)))
+    data[:3] = np.where(known, 1e3 * np.moveaxis(points, 0, -1).swapaxes(0, 1), np.nan)
+    residuals = np.where(known, 1e3 * sigma, -1.0)
+    file["data"]["points"] = data
+    file["data"]["meta_points"]["residuals"] = np.broadcast_to(residuals, (1, len(labels), len(known))).copy()
+    file.add_parameter("DISC", "RADIUS", 1e3 * trajectory.disc.radius)
+    file.add_parameter("DISC", "THICKNESS", 2e3 * trajectory.disc.half_thickness)
+    file.add_parameter("DISC", "MASS", 1e3 * trajectory.disc.mass)
+    with whole_file(path, suffix=".c3d") as part:
+        file.write(str(part))
+    return path
+
+
+_DESCRIPTIONS = {
+    "CENTRE": "centre of mass",
+    "AXIS_1": "centre + radius * first body axis",
+    "AXIS_2": "centre + radius * second body axis",
+    "AXIS_3": "centre + radius * normal of the upper face",
+}
+
+
+def _points(trajectory: Trajectory) -> tuple[Array, list[str]]:
+    """World places (n, k, 3) [m] and their labels."""
+    disc = trajectory.disc
+    body = np.concatenate([np.zeros((1, 3)), disc.radius * np.eye(3), disc.marker_centres_body])
+    R = rotation_from_quaternion(trajectory.quaternion)
+    labels = ["CENTRE", "AXIS_1", "AXIS_2", "AXIS_3", *(f"DOT_{i}" for i in range(disc.n_markers))]
+    return body @ np.swapaxes(R, 1, 2) + trajectory.q[:, None, :3], labels

@@ -1,0 +1,115 @@
+"""The way in for frames in memory and for a live loop, and how results show themselves."""
+
+import numpy as np
+import pytest
+
+import disctrack
+from disctrack.errors import TrackingError
+from disctrack.trajectory import FrameStatus
+
+
+@pytest.fixture(scope="module")
+def taken(short_recording, rig_file):
+    """Recording, rig, its images (n, 2, h, w), and the measurement by way of the files."""
+    declared = disctrack.read_recording(short_recording)
+    rig = disctrack.read_rig(rig_file)
+    pairs = disctrack.open_pairs(declared)
+    images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(len(pairs))])
+    return declared, rig, images, disctrack.measure(declared, rig, pairs)
+
+
+def test_arrays_give_to_the_last_bit_what_files_give(taken):
+    declared, rig, images, by_files = taken
+    for given in (images, (images[:, 0], images[:, 1])):
+        found = disctrack.measure_pairs(given, rig, declared.disc, declared.frame_rate)
+        for name in ("q", "pose_covariance", "markers_px", "time", "frame_status"):
+            assert np.array_equal(getattr(found.trajectory, name), getattr(by_files.trajectory, name)), name
+    assert found.findings["noise"] == by_files.findings["noise"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda i: i[:, 0], "expected"),
+        (lambda i: i.astype(float), "type float64"),
+        (lambda i: (i[:, 0], i[:-1, 1]), "expected"),
+        (lambda i: i[:0], "no image"),
+        (lambda i: i[..., :-8], "calibrated at"),
+        (lambda i: np.zeros_like(i), "found in none"),
+    ],
+)
+def test_arrays_that_are_no_pairs_are_refused_with_what_is_expected(taken, change, words):
+    declared, rig, images, _ = taken
+    with pytest.raises(TrackingError, match=words):
+        disctrack.measure_pairs(change(images), rig, declared.disc, declared.frame_rate)
+    with pytest.raises(TrackingError, match="timestamps"):
+        disctrack.measure_pairs(images, rig, declared.disc, 1000.0, timestamps=np.zeros(len(images)))
+
+
+def test_the_live_loop_gives_the_poses_of_the_recording(taken):
+    _declared, rig, images, by_files = taken
+    tracker = disctrack.Tracker(rig, by_files.trajectory.disc)
+    poses = [tracker.next(*pair) for pair in images]
+    assert all(pose.status == FrameStatus.MEASURED for pose in poses)
+    q, expected = np.array([pose.q for pose in poses]), by_files.trajectory.q
+    miss = (q - expected) / by_files.trajectory.coordinate_sigma
+    # noise and blur come from one pair instead of twelve: weights differ by a tenth, poses by far less than their sigma
+    assert np.sqrt(np.mean(miss**2)) < 0.3
+    sigma = np.array([pose.sigma for pose in poses])
+    # the recording's sigma also counts the scatter that only a sequence tells
+    assert np.median(sigma / by_files.trajectory.coordinate_sigma) == pytest.approx(1.0, abs=0.3)
+    assert not np.array_equal(poses[3].markers_px, poses[4].markers_px)
+
+
+def test_the_live_loop_loses_a_hidden_disc_and_finds_it_again(taken):
+    _declared, rig, images, by_files = taken
+    tracker = disctrack.Tracker(rig, by_files.trajectory.disc)
+    dark = np.zeros_like(images[0])
+    statuses = [tracker.next(*(dark if 8 <= i < 11 else images[i])).status for i in range(20)]
+    assert [status.has_pose for status in statuses] == [not 8 <= i < 11 for i in range(20)]
+    again = tracker.next(*images[20])
+    assert again.q[:3] == pytest.approx(
+        by_files.trajectory.q[20, :3], abs=5 * by_files.trajectory.coordinate_sigma.max()
+    )
+    turn = (again.q[3:] - by_files.trajectory.q[20, 3:]) / (2 * np.pi)
+    assert turn == pytest.approx(np.rint(turn), abs=1e-3)  # turns while it was hidden are not known
+    with pytest.raises(TrackingError, match="calibrated at"):
+        tracker.next(images[0, 0, :-8], images[0, 1, :-8])
+
+
+def test_one_covered_camera_is_said(taken):
+    _declared, rig, images, by_files = taken
+    tracker = disctrack.Tracker(rig, by_files.trajectory.disc)
+    for pair in images[:5]:
+        tracker.next(*pair)
+    pose = tracker.next(images[5, 0], np.zeros_like(images[5, 1]))
+    assert pose.status == FrameStatus.ONE_CAMERA
+    assert pose.sigma[:3].max() > 3 * by_files.trajectory.coordinate_sigma[5, :3].max()
+
+
+def test_results_show_a_few_facts_and_not_their_arrays(taken):
+    declared, rig, images, by_files = taken
+    tracker = disctrack.Tracker(rig, declared.disc)
+    for thing in (by_files, by_files.trajectory, rig, tracker.next(*images[0]), tracker):
+        assert len(repr(thing)) < 400, type(thing)
+        assert "array(" not in repr(thing)
+    shown = by_files.trajectory._repr_html_()
+    assert shown.startswith("<table>")
+    assert f"{len(images)} at 1000 Hz" in shown
+
+
+def test_xarray_holds_time_units_and_both_sigmas(taken):
+    xarray = pytest.importorskip("xarray")
+    *_, by_files = taken
+    dataset = by_files.trajectory.to_xarray()
+    assert isinstance(dataset, xarray.Dataset)
+    assert np.array_equal(dataset.time, by_files.trajectory.time)
+    assert np.array_equal(dataset.theta.sel(time=dataset.time[3]), by_files.trajectory.q[3, 4])
+    assert dataset.x.attrs["units"] == "m"
+    assert np.array_equal(dataset.x_sigma_calibration, by_files.trajectory.calibration_sigma[:, 0])
+    assert dataset.marker_centre_px.sel(camera="right").shape == (len(dataset.time), 6, 2)
+
+
+def test_every_name_at_the_top_is_there():
+    for name in disctrack.__all__:
+        assert getattr(disctrack, name) is not None
