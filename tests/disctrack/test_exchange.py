@@ -52,6 +52,7 @@ def trajectory(rig, rng) -> Trajectory:
         q=q,
         pose_covariance=np.where(lost[:, None, None], np.nan, halves @ np.swapaxes(halves, 1, 2)),
         calibration_sensitivity=np.where(lost[:, None, None], np.nan, rng.normal(size=(n, 6, N_RIG))),
+        systematic_covariance=np.zeros((n, 6, 6)),
         quaternion=continuous_quaternions(quaternion_from_rotation(R)),
         frame_status=np.where(lost, FrameStatus.UNREADABLE, FrameStatus.MEASURED).astype(np.uint8),
         reprojection_rms_px=rng.uniform(0, 0.05, (n, 2)),
