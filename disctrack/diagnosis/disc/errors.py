@@ -122,9 +122,7 @@ def free_run(system: DiscSystem, held: HeldOut, horizons: tuple[float, ...] = HO
 
 def simulated(system: DiscSystem, values: Values) -> Motion:
     """The fitted motion with forces, moments and energies, at the instants of the frames."""
-    rate = 1.0 + values.get("frame_rate.change", 0.0)
-    times = system.start_time + (system.time - system.start_time) / rate
-    return simulate(system.model_with(values), state_of(values), times=times)
+    return simulate(system.model_with(values), state_of(values), times=system.instants(values))
 
 
 def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:

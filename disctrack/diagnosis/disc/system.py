@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
+from disctrack.diagnosis.disc.faults import Sight, faults_of, measurement_candidates, predict, setup_of
 from disctrack.diagnosis.disc.motion import (
     SLIP,
     model_quantities,
@@ -18,7 +19,6 @@ from disctrack.diagnosis.disc.motion import (
     state_of,
     state_quantities,
 )
-from disctrack.diagnosis.disc.optics import ellipse_centre_shift, measurement_candidates, predict
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.engine.fit import triangle
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
@@ -36,8 +36,6 @@ MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots to
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
-_CLOCK = ("time_offset.delay", "frame_rate.change")
-_IMAGE = ("exposure_blur.T2", "ellipse_centre.share")
 
 
 @dataclass(frozen=True)
@@ -75,6 +73,7 @@ class DiscSystem:
         self.model = model
         self.trajectory = trajectory
         self.rig, self.disc = trajectory.rig, trajectory.disc
+        self.faults = faults_of(self.disc)
         self.rows = rows
         self.time = np.asarray(trajectory.time[rows], float)
         self.start_time = float(self.time[0])
@@ -160,28 +159,32 @@ class DiscSystem:
 
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
         """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time."""
-        rate = 1.0 + values.get("frame_rate.change", 0.0)
-        state = state_of(values)
-        motion = simulate(self.model_with(values), state, times=self.start_time + (self.time - self.start_time) / rate)
+        motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
         needed = float(np.max(motion.friction_needed))
         return [(1.0 / (share * needed),) for share in SLIP_STARTS]
+
+    def instants(self, values: Values) -> Array:
+        """(n,) true times of the frames [s], by the left camera."""
+        return self.start_time + (self.time - self.start_time) / setup_of(self.disc, values).rate
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
         path = self._path(values, names)
-        pixels, by_pose = self._pixels(path, values)
-        residual = self._residual(pixels, values)
+        sight = self._sight(path, values)
+        residual = self._residual(sight.images.pixels, values)
         derivative = np.zeros((*residual.shape, len(names)))
         column = {name: i for i, name in enumerate(names)}
         if path.names:
-            whitened = (self._whiten @ by_pose).reshape(*residual.shape, 6)
+            whitened = (self._whiten @ sight.images.by_pose).reshape(*residual.shape, 6)
             derivative[..., [column[n] for n in path.names]] = whitened @ path.by_motion
         common = [n for n in names if n in self._nuisance_column]
         if common:
             mine = self._nuisance_columns[..., [self._nuisance_column[n] for n in common]]
             derivative[..., [column[n] for n in common]] = mine
-        for name, moved in self._measurement_columns(path, values, names, pixels, by_pose).items():
-            derivative[..., column[name]] = self._rows_of(moved)
+        for fault in self.faults:
+            for name, part in zip(fault.names(), fault.parts, strict=True):
+                if name in column:
+                    derivative[..., column[name]] = self._rows_of(fault.column(part, sight))
         return residual, derivative
 
     @property
@@ -191,7 +194,7 @@ class DiscSystem:
 
     def pixels(self, values: Values, with_nuisances: bool = False) -> Array:
         """Predicted images of the dots (n, 2, m, 2) [px], with the biases that nuisances stand for if wanted."""
-        pixels = self._pixels(self._path(values, ()), values)[0]
+        pixels = self._sight(self._path(values, ()), values).images.pixels
         if not with_nuisances:
             return pixels
         whitened = (self._nuisance_columns @ self._nuisance_values(values)).reshape(pixels.shape)
@@ -221,9 +224,9 @@ class DiscSystem:
 
     def _pose_equations(self, values: Values) -> tuple[Array, Array]:
         """Gradient (n, 6) and normal matrix (n, 6, 6) of a free pose per frame, at the predicted poses."""
-        pixels, by_pose = self._pixels(self._path(values, ()), values)
-        r = self._residual(pixels, values)
-        J = (self._whiten @ by_pose).reshape(len(r), -1, 6)
+        images = self._sight(self._path(values, ()), values).images
+        r = self._residual(images.pixels, values)
+        J = (self._whiten @ images.by_pose).reshape(len(r), -1, 6)
         normal = np.swapaxes(J, 1, 2) @ J
         normal[self.weights < 6] = np.eye(6)
         return (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0], normal
@@ -242,8 +245,7 @@ class DiscSystem:
 
     def _path(self, values: Values, names: Sequence[str]) -> _Path:
         """Motion at the true instants of both cameras, and the derivatives that belong to it."""
-        rate = 1.0 + values.get("frame_rate.change", 0.0)
-        times = self.start_time + (self.time - self.start_time) / rate
+        times, delay = self.instants(values), setup_of(self.disc, values).delay
         model = self.model_with({k: v for k, v in values.items() if np.isfinite(v)})
         components = [n.partition(".")[2] for n in names if n.startswith("state.")]
         present = set(model.values)
@@ -266,69 +268,25 @@ class DiscSystem:
         if slips:
             by_motion[..., -1] *= -1.0 / values[SLIP] ** 2
             all_names = (*all_names[:-1], SLIP)
-        if "frame_rate.change" in names:
-            speed = found.qdot.copy()
-            speed[:, 3:] = (axes @ speed[:, 3:, None])[..., 0]
-            column = -speed * ((self.time - self.start_time) / rate**2)[:, None]
-            by_motion = np.concatenate([by_motion, column[..., None]], axis=-1)
-            all_names = (*all_names, "frame_rate.change")
-        delay = values.get("time_offset.delay", 0.0)
         q, qdot = np.stack([found.q] * 2), np.stack([found.qdot] * 2)
         if delay and np.isfinite(found.q).all():
             spline = CubicHermiteSpline(times, found.q, found.qdot)
             q[1], qdot[1] = spline(times + delay), spline(times + delay, 1)
         return _Path(q, qdot, all_names, by_motion)
 
-    def _pixels(self, path: _Path, values: Values) -> tuple[Array, Array]:
-        R = rotation_from_euler(path.q[..., 3], path.q[..., 4], path.q[..., 5])
-        t = path.q[..., :3]
+    def _sight(self, path: _Path, values: Values) -> Sight:
+        """The dots as both cameras meet them on this path."""
+        q, speed = path.q, path.qdot.copy()
+        axes = euler_rate_axes_world(q[..., 3], q[..., 4])
+        speed[..., 3:] = (axes @ speed[..., 3:, None])[..., 0]
+        R, t = rotation_from_euler(q[..., 3], q[..., 4], q[..., 5]), q[..., :3]
         images = predict(R, t, self.rig, self.disc, values)
-        pixels = images.pixels
-        if values.get("ellipse_centre.share", 0.0):
-            pixels = pixels + values["ellipse_centre.share"] * ellipse_centre_shift(R[0], t[0], self.rig, self.disc)
-        if values.get("exposure_blur.T2", 0.0):
-            pixels = pixels + values["exposure_blur.T2"] / 24 * self._acceleration(pixels)
-        return pixels, images.by_pose
-
-    def _acceleration(self, pixels: Array) -> Array:
-        """Second derivative of the dots' images [px/s^2] by differences over neighbouring frames."""
-        return np.asarray(np.gradient(np.gradient(pixels, self.time, axis=0), self.time, axis=0), float)
-
-    def _measurement_columns(
-        self, path: _Path, values: Values, names: Sequence[str], pixels: Array, by_pose: Array
-    ) -> dict[str, Array]:
-        """Derivatives (n, 2, m, 2) by the quantities of the measurement among `names`."""
-        R = rotation_from_euler(path.q[..., 3], path.q[..., 4], path.q[..., 5])
-        t = path.q[..., :3]
-        columns: dict[str, Array] = {}
-        if "time_offset.delay" in names:
-            axes = euler_rate_axes_world(path.q[1, :, 3], path.q[1, :, 4])
-            speed = np.concatenate([path.qdot[1, :, :3], (axes @ path.qdot[1, :, 3:, None])[..., 0]], axis=1)
-            columns["time_offset.delay"] = np.zeros_like(pixels)
-            columns["time_offset.delay"][:, 1] = np.einsum("nmap,np->nma", by_pose[:, 1], speed)
-        if "ellipse_centre.share" in names:
-            columns["ellipse_centre.share"] = ellipse_centre_shift(R[0], t[0], self.rig, self.disc)
-        if "exposure_blur.T2" in names:
-            columns["exposure_blur.T2"] = self._acceleration(pixels) / 24
-        steps = {q.name: q.scale for c in self.candidates if c.kind == "measurement" for q in c.quantities}
-        for name in names:
-            kind, _, axis = name.partition(".")
-            if kind.startswith("misprint_"):
-                i = int(kind.partition("_")[2])
-                columns[name] = np.zeros_like(pixels)
-                along = R[:, :, :, "xy".index(axis)]  # (2, n, 3) body axis in the world
-                columns[name][:, :, i] = np.einsum("ncap,cnp->nca", by_pose[:, :, i, :, :3], along)
-            elif name in steps and name not in (*_CLOCK, *_IMAGE):
-                columns[name] = self._central_difference(R, t, values, name, steps[name])
-        return columns
-
-    def _central_difference(self, R: Array, t: Array, values: Values, name: str, step: float) -> Array:
-        """By a quantity of `optics.predict`: smooth and nearly linear, so that this holds to 1e-8 of its size."""
-        sides = []
-        for sign in (1.0, -1.0):
-            changed = dict(values) | {name: values.get(name, 0.0) + sign * step}
-            sides.append(predict(R, t, self.rig, self.disc, changed).pixels)
-        return (sides[0] - sides[1]) / (2 * step)
+        sight = Sight(self.time, R, t, speed, self.rig, self.disc, values, images)
+        for fault in self.faults:
+            if fault.in_images and (v := fault.numbers(values)).any():
+                shift = sum(x * fault.column(part, sight) for x, part in zip(v, fault.parts, strict=True))
+                sight = replace(sight, images=replace(sight.images, pixels=sight.images.pixels + shift))
+        return sight
 
 
 def _nowhere(n: int) -> _Path:
