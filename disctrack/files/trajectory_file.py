@@ -347,6 +347,8 @@ def _disc_attributes(disc: Disc) -> dict[str, float]:
         "half_thickness_m": disc.half_thickness,
         "mass_kg": disc.mass,
         "marker_diameter_m": disc.marker_diameter,
+        "radius_tolerance_m": disc.radius_tolerance,
+        "thickness_tolerance_m": disc.thickness_tolerance,
     }
 
 
@@ -472,6 +474,7 @@ def _read_disc(group: h5py.Group) -> Disc:
         sizes["mass_kg"],
         read_variables(group)["marker_centres_body"],
         sizes["marker_diameter_m"],
+        **{key: sizes[f"{key}_m"] for key in ("radius_tolerance", "thickness_tolerance") if f"{key}_m" in sizes},
     )
 
 

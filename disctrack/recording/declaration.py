@@ -20,11 +20,19 @@ FILE_NAME = RECORDING_FILE
 KEYS: dict[str, tuple[str, ...]] = {
     "": ("name", "case", "surface"),
     "cameras": ("frame_rate_hz", "left", "right"),
-    "disc": ("radius_mm", "thickness_mm", "mass_g"),
+    "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm"),
     "markers": ("diameter_mm", "centres_mm"),
     "calibration": ("left", "right", "inner_corners", "square_mm", "rig"),
-    "table": ("view", "board_thickness_mm"),
+    "table": ("view", "board_thickness_mm", "from"),
     "gravity": ("g_m_s2",),
+}
+
+# Keys that have a default; a calibration is either views or a rig.
+OPTIONAL = {
+    ("disc", "radius_tolerance_mm"),
+    ("disc", "thickness_tolerance_mm"),
+    ("calibration", "rig"),
+    ("table", "from"),
 }
 
 
@@ -44,6 +52,7 @@ class TableView:
 
     view: int  # index among the calibration views
     board_thickness: float  # [m] the printed face lies at this height
+    source: str = "both"  # what tells where the table is: "board", "disc" (where its rim rolls) or "both"
 
 
 @dataclass(frozen=True)
@@ -230,6 +239,12 @@ def _pattern(value: Any) -> str:
     return value
 
 
+def _table_source(value: Any) -> str:
+    if value not in ("board", "disc", "both"):
+        raise _Unfit('"board", "disc" or "both"')
+    return str(value)
+
+
 def _corner_counts(value: Any) -> tuple[int, int]:
     if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int and 2 <= n <= 1000 for n in value):
         raise _Unfit("two whole numbers, inner corners along the long and the short side, e.g. [9, 6]")
@@ -264,9 +279,11 @@ def _disc(disc: _Section, markers: _Section) -> Disc:
                     f"centres_mm: dots {other} and {number} overlap: {math.hypot(x - u, y - v):g} mm apart with "
                     f"diameter {diameter_mm:g}. Give each dot once."
                 )
-    return disc_from_mm(
-        radius_mm, disc.get("thickness_mm", _positive), disc.get("mass_g", _positive), centres_mm, diameter_mm
-    )
+    sizes = radius_mm, disc.get("thickness_mm", _positive), disc.get("mass_g", _positive)
+    tolerances = {
+        key: disc.get(key, _not_negative) for key in ("radius_tolerance_mm", "thickness_tolerance_mm") if key in disc
+    }
+    return disc_from_mm(*sizes, centres_mm, diameter_mm, **tolerances)
 
 
 def _calibration_source(section: _Section) -> tuple[ChessboardViews | None, Path | None]:
@@ -284,4 +301,5 @@ def _table(file: Path, declared: Mapping[str, Any], required: bool) -> TableView
     if "table" not in declared and not required:
         return None
     table = _Section(file, declared, "table")
-    return TableView(table.get("view", _index), table.get("board_thickness_mm", _not_negative) * 1e-3)
+    source = table.get("from", _table_source) if "from" in table else "both"
+    return TableView(table.get("view", _index), table.get("board_thickness_mm", _not_negative) * 1e-3, source)

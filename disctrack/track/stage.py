@@ -132,6 +132,8 @@ def measure(
     Raises TrackingError if the disc is found in no frame.
     """
     settings = settings or TrackingSettings()
+    if recording.table is not None:
+        settings = dataclasses.replace(settings, table=recording.table.source)
     unreadable: list[Unreadable] = []
     rate = recording.frame_rate
 
@@ -191,6 +193,11 @@ def findings_of(tracking: Tracking) -> dict[str, Any]:
         "variance_factor": tracking.variance_factor,
         "noise_factor": tracking.noise_factor,
         "systematic_px": list(tracking.systematic_px),
+        **(
+            {}
+            if tracking.table is None
+            else {"table": {**_json_fields(tracking.table), "told": tracking.table.sentence}}
+        ),
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
         "acquisitions": tracking.acquisitions,

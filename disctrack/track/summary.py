@@ -47,9 +47,15 @@ def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> lis
     if trajectory.measured.any():
         lines += [
             _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
-            _sigma_line("", trajectory.calibration_sigma, "from the calibration, common to all frames"),
+            _sigma_line("", trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats"),
             _fit_line(trajectory),
         ]
+        if any(repeats := findings.get("systematic_px", ())):
+            left, right = repeats
+            what = "lens beyond its model, printed dots, light"
+            lines.append(_line("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
+        if table := findings.get("table"):
+            lines.append(_line("table", table["told"]))
     lines += [_line("image", reason) for reason in list(findings.get("unreadable", []))[:_SHOWN_RANGES]]
     lines += [_line("note", note) for note in findings.get("notes", [])]
     lines += [_line("warning", warning) for warning in findings.get("warnings", [])]

@@ -39,6 +39,7 @@ from disctrack.track.dots import (
 from disctrack.track.motion_span import StillScene
 from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses
+from disctrack.track.table_contact import BOARD_HEIGHT, BOARD_SLOPE, TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -67,6 +68,7 @@ NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every th
 MIN_GOOD_DOT_IMAGES = 6
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
+DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
@@ -86,6 +88,7 @@ class TrackingSettings:
         False  # the rig within its own calibration covariance; hides a camera that moved, so not by default
     )
     reject_outliers: bool = True
+    table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (first_pass.py)
 
 
@@ -101,6 +104,7 @@ class Tracking:
     noise_factor: float  # the part of it that changes from frame to frame (`own_scatter`), by which the covariances of
     # dots and poses are multiplied; what is left of the other makes `Trajectory.systematic_covariance`
     systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
+    table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     warnings: tuple[str, ...]
 
@@ -599,6 +603,8 @@ def _assemble(
     systematic = fits.covariance * scatter.systematic
     fits.covariance[...] *= noise_factor
     fits = replace(fits, chi_square=fits.chi_square / factor)
+    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
+    as_built = replace(as_built, rig=rig)
     trajectory = _trajectory(fits, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     return Tracking(
         trajectory=trajectory,
@@ -608,8 +614,9 @@ def _assemble(
         variance_factor=factor,
         noise_factor=noise_factor,
         systematic_px=scatter.systematic_px,
+        table=table,
         acquisitions=sum(f.acquisitions for f in followers),
-        warnings=_warnings(first, factor, faults, scatter, trajectory),
+        warnings=_warnings(first, factor, faults, scatter, table, trajectory),
     )
 
 
@@ -703,7 +710,12 @@ def _table_gap(trajectory: Trajectory) -> Array:
 
 
 def _warnings(
-    follower: _Follower, variance_factor: float, faults: SharedFaults | None, scatter: Scatter, trajectory: Trajectory
+    follower: _Follower,
+    variance_factor: float,
+    faults: SharedFaults | None,
+    scatter: Scatter,
+    table: TableFromDisc | None,
+    trajectory: Trajectory,
 ) -> tuple[str, ...]:
     warnings = []
     own = variance_factor if faults is None else max(1.0, faults.reduced_chi_square)
@@ -736,6 +748,13 @@ def _warnings(
         warnings.append(
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
             "round, or their edges are not sharp, or the images were processed"
+        )
+    if table is not None and table.probability < DISAGREE:
+        warnings.append(
+            f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
+            f"a board's usual {BOARD_HEIGHT * 1e6:.0f} um and {np.degrees(BOARD_SLOPE) * 1e3:.0f} mdeg: the board is "
+            "bowed or its thickness is another, the disc's radius or thickness is, or the cameras moved together since "
+            "the table view"
         )
     gap = _table_gap(trajectory)
     if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.recording.declaration import KEYS, read_recording
+from disctrack.recording.declaration import KEYS, OPTIONAL, read_recording
 
 REFERENCE = """
 name = "clip"
@@ -66,7 +66,7 @@ def test_every_key_of_the_reference_recording_is_known(shared_data):
     recording = read_recording(shared_data / "rec_a")
     assert recording.frame_rate == 1000.0
     assert recording.disc.n_markers == 6
-    named = {(section, key) for section in KEYS for key in KEYS[section] if section and key != "rig"}
+    named = {(section, key) for section in KEYS for key in KEYS[section] if section} - OPTIONAL
     assert named == {(s, k) for s, values in recording.declared.items() if isinstance(values, dict) for k in values}
 
 
@@ -79,7 +79,7 @@ def test_a_shared_rig_replaces_views_and_table(tmp_path):
     assert recording.table is None
 
 
-@pytest.mark.parametrize(("section", "key"), [(s, k) for s in KEYS if s for k in KEYS[s] if k != "rig"])
+@pytest.mark.parametrize(("section", "key"), [(s, k) for s in KEYS if s for k in KEYS[s] if (s, k) not in OPTIONAL])
 def test_each_missing_key_is_named_with_its_section(tmp_path, section, key):
     lines = REFERENCE.splitlines()
     start = lines.index(f"[{section}]")
@@ -186,3 +186,15 @@ def _read_or_refuse(folder: Path) -> None:
         return
     assert recording.frame_rate > 0
     assert np.isfinite(recording.disc.marker_centres_body).all()
+
+
+def test_tolerances_and_source_of_the_table_may_be_declared(tmp_path):
+    plain = read_recording(write(tmp_path, REFERENCE))
+    assert plain.table.source == "both"
+    assert 0 < plain.disc.thickness_tolerance < 1e-5
+    text = REFERENCE.replace("mass_g", "thickness_tolerance_mm = 0.02\nradius_tolerance_mm = 0\nmass_g", 1)
+    text = text.replace("[table]", '[table]\nfrom = "disc"')
+    read = read_recording(write(tmp_path, text))
+    assert (read.disc.thickness_tolerance, read.disc.radius_tolerance) == (pytest.approx(2e-5), 0.0)
+    assert read.table.source == "disc"
+    assert '"board", "disc" or "both"' in message(tmp_path, text.replace('"disc"', '"rim"'))

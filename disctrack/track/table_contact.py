@@ -1,0 +1,197 @@
+"""The table from the disc: a rolling rim touches it along a circle, and a circle spans a plane.
+
+With the plane z = c + a (x - x0) + b (y - y0) in world axes, (x0, y0) the middle of the contacts, and its normal
+n = (-a, -b, 1) / |...|, the disc's lowest point A lies above it by n . (A - (x0, y0, c)), where
+
+    A = t - r e2 - h e3 (e2 up the disc's slope against n); to first order gap = z_A - c - a (x_A - x0) - b (y_A - y0).
+
+Height and slopes follow from the gaps of all frames, better than from a board: that lies on the table with its
+thickness and its bow. Both have a covariance (the cameras' errors are in both, and count once: the poses' sensitivity
+to the rig), and they are combined as those say. Only the world frame is moved; the cameras stay as calibrated relative
+to each other.
+
+This is geometry alone. A table that is not level leans in the world and against gravity; here the world leans with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from calibration.camera import N_RIG, StereoRig
+from disctrack import frames
+from disctrack.disc import Disc
+from disctrack.track.pose import PoseFits
+
+Array = NDArray[np.float64]
+
+SOURCES = ("both", "board", "disc")
+MIN_FRAMES = 30
+# Below, the direction of the contact is noise; above, a disc stands on its rim and may well slide or fall.
+THETA_RANGE = np.radians(0.7), np.radians(85.0)
+MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
+NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that is more
+PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
+# Of a board on a table, where the rig's covariance does not tell; for the weights of board and disc alone.
+BOARD_HEIGHT, BOARD_SLOPE = 20e-6, 5e-4  # [m], [rad]: thickness and flatness of 20 um, over 40 mm
+_WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
+_CAMERAS = slice(24, 30)  # of RIG_PARAMETERS: the world as the left camera sees it
+
+
+@dataclass(frozen=True)
+class TableFromDisc:
+    """The plane that the rim touched, in the axes of the board's table, and what was made of it."""
+
+    source: str  # one of SOURCES: what the world's table is
+    plane: Array  # (3,) height in the middle of the contacts [m], slopes along x and y, against the table by the board
+    middle: Array  # (2,) [m] of the contacts, x and y
+    sigma: Array  # (3,) of the plane by the disc: noise, what repeats, tolerances of the disc
+    board_sigma: Array  # (3,) of the table by the board, the rig's covariance
+    applied: Array  # (3,) by which the world was moved
+    probability: float  # that board and disc differ by as much, with BOARD_HEIGHT and BOARD_SLOPE in the board's sigma
+    scatter: float  # [m] of the gaps about the plane
+    n_frames: int
+
+    @property
+    def sentence(self) -> str:
+        """What a summary says."""
+        z, *slopes = self.plane
+        sigma = np.hypot(self.sigma, self.board_sigma)
+        told = (
+            f"by the disc's rim the table lies {1e6 * z:+.1f} +- {1e6 * sigma[0]:.1f} um from the board's, turned by "
+            f"{np.degrees(np.hypot(*slopes)) * 1e3:.0f} +- {np.degrees(sigma[1:].max()) * 1e3:.0f} mdeg"
+        )
+        used = {"both": "the two are combined", "board": "the board counts", "disc": "the disc counts"}[self.source]
+        return f"{told}; {used} ([table] from)"
+
+
+def table_from_disc(
+    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc, source: str = "both"
+) -> tuple[PoseFits, Array, StereoRig, TableFromDisc | None]:
+    """Poses, their systematic covariance and rig with the world's table where board and disc have it.
+
+    fits : with the covariances of the frames' noise; systematic (n, 6, 6)
+    source : one of SOURCES; with "board" nothing is moved, and the difference is told
+    None, and nothing changed, where the rig has no table or the disc did not touch one.
+    """
+    found = _contacts(fits, systematic, rig, disc) if rig.world_is_table else None
+    if found is None:
+        return fits, systematic, rig, None
+    plane, middle, H, noise, by_radius, by_thickness, scatter, n = found
+    turn = rig.R_left_world
+    M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
+    M[24:27] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    M[27:30] = turn[:, 2:] * np.array([1.0, *-middle])
+    back = np.linalg.pinv(M)
+
+    # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
+    V = noise + np.outer(by_radius, by_radius) + 4.0 * np.outer(by_thickness, by_thickness)
+    stated = V - 3.0 * np.outer(by_thickness, by_thickness)
+    board = H @ rig.covariance @ H.T
+    usual = np.array([BOARD_HEIGHT, BOARD_SLOPE, BOARD_SLOPE])
+    difference = np.linalg.solve(board + V + np.diag(usual**2), plane) @ plane
+    # where they differ by more, it is by what they do that the board lies off
+    weigh = rig.covariance + M @ np.diag(np.maximum(usual, np.abs(plane)) ** 2) @ M.T
+    gains = {"board": np.zeros((3, 3)), "disc": np.eye(3)}
+    gain = gains[source] if source in gains else back @ weigh @ H.T @ np.linalg.inv(H @ weigh @ H.T + V)
+    applied = gain @ plane
+    kept = np.eye(N_RIG) - M @ gain @ H
+    covariance = kept @ rig.covariance @ kept.T + M @ gain @ stated @ gain.T @ M.T
+    told = TableFromDisc(
+        source,
+        plane,
+        middle,
+        np.sqrt(np.diag(stated)),
+        np.sqrt(np.diag(board)),
+        applied,
+        float(chi2.sf(difference, 3)),
+        scatter,
+        n,
+    )
+    # of the disc's thickness, what the board's share of the height leaves
+    left = (1.0 - gain[0, 0]) ** 2 * disc.thickness_tolerance**2 / 4.0
+    e3 = np.nan_to_num(fits.R_world_body[..., 2])
+    systematic = systematic.copy()
+    systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
+    if source == "board":
+        return fits, systematic, rig, told
+    moved, systematic, rig = _on_plane(fits, systematic, rig, applied, middle)
+    return moved, systematic, replace(rig, covariance=0.5 * (covariance + covariance.T)), told
+
+
+def _contacts(
+    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc
+) -> tuple[Array, Array, Array, Array, Array, Array, float, int] | None:
+    """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane, its departure
+    for one tolerance of radius and of thickness, scatter, number of frames.
+    """
+    with np.errstate(invalid="ignore"):
+        theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
+        rows = np.flatnonzero(fits.converged & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1]))
+    if len(rows) < MIN_FRAMES:
+        return None
+    R, t = fits.R_world_body[rows], fits.t_world_body[rows]
+    plane, kept = np.zeros(3), np.ones(len(rows), bool)
+    middle = np.median(_contact(R, t, disc, np.array([0.0, 0.0, 1.0]))[0], axis=0)[:2]
+    for _ in range(6):
+        normal = np.array([-plane[1], -plane[2], 1.0])
+        normal /= np.linalg.norm(normal)
+        contact, arm = _contact(R, t, disc, normal)
+        gap = (contact - [*middle, plane[0]]) @ normal
+        A = np.column_stack([np.ones(len(rows)), contact[:, :2] - middle])
+        information = A[kept].T @ A[kept] + np.diag((1e-6 / _WIDE) ** 2)  # beside gaps that scatter by a micrometre
+        step = np.linalg.solve(information, A[kept].T @ gap[kept])
+        plane = plane + step
+        left = gap - A @ step
+        spread = 1.4826 * float(np.median(np.abs(left - np.median(left))))
+        kept = np.abs(left) < 4.0 * spread + 1e-9
+    by_pose = np.concatenate([np.broadcast_to(normal, t.shape), np.cross(arm, normal)], axis=1)
+    noise, repeats = (
+        float(np.median(np.einsum("ni,nij,nj->n", by_pose, C[rows], by_pose))) for C in (fits.covariance, systematic)
+    )
+    if spread > max(MAX_SCATTER, NOISY * np.sqrt(noise + repeats)) or kept.sum() < max(MIN_FRAMES, 0.5 * len(rows)):
+        return None
+    repeats = max(repeats, spread**2 - noise, 0.0)
+    inverse = np.linalg.inv(information)
+    gain = inverse @ A.T * kept
+    azimuth = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0])[kept])
+    independent = np.clip(PLACES * np.ptp(azimuth) / (2 * np.pi), 1.0, PLACES)
+    covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
+    by_rig = -gain @ np.einsum("ni,nij->nj", by_pose, fits.sensitivity[rows])
+    sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
+    by_radius = gain @ sine * disc.radius_tolerance
+    by_thickness = gain @ R[:, 2, 2] * 0.5 * disc.thickness_tolerance
+    return plane, middle, by_rig, covariance, by_radius, by_thickness, spread, int(kept.sum())
+
+
+def _contact(R: Array, t: Array, disc: Disc, normal: Array) -> tuple[Array, Array]:
+    """The disc's lowest points (n, 3) against a normal, and the same from the centre."""
+    e3 = R[:, :, 2]
+    cosine = e3 @ normal
+    down = cosine[:, None] * e3 - normal  # in the disc's plane
+    arm = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
+    arm = arm - disc.half_thickness * np.sign(cosine)[:, None] * e3
+    return t + arm, arm
+
+
+def _on_plane(
+    fits: PoseFits, systematic: Array, rig: StereoRig, plane: Array, middle: Array
+) -> tuple[PoseFits, Array, StereoRig]:
+    """Everything in the axes of a world whose table is the plane; the origin moves along k alone."""
+    height, a, b = plane
+    Q = frames.rotation_from_vector(np.array([b, -a, 0.0]))  # R_old_new
+    shift = np.array([0.0, 0.0, height - plane[1:] @ middle])
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = Q.T
+    moved = replace(
+        fits,
+        R_world_body=Q.T @ fits.R_world_body,
+        t_world_body=(fits.t_world_body - shift) @ Q,
+        covariance=both @ fits.covariance @ both.T,
+        sensitivity=both @ fits.sensitivity,
+    )
+    rig = replace(rig, R_left_world=rig.R_left_world @ Q, t_left_world=rig.t_left_world + rig.R_left_world @ shift)
+    return moved, both @ systematic @ both.T, rig

@@ -1,0 +1,104 @@
+"""The table from a rolling disc, in recordings whose table is not where the board says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration.camera import N_RIG
+from disctrack.diagnosis.trials.recordings import Unseen
+from disctrack.frames import rotation_from_quaternion
+from disctrack.track import table_contact
+from disctrack.track.pose import fit_poses
+from disctrack.track.table_contact import table_from_disc
+from tests.oracles.measured_disc import measured
+
+TURN, HEIGHT = (6e-4, -4e-4), 60e-6
+
+
+@pytest.fixture(scope="module")
+def leaning():
+    return measured(unseen=Unseen(table_turn=TURN, table_height=HEIGHT), n=200)
+
+
+def poses_of(trajectory, lift=0.0):
+    R = rotation_from_quaternion(trajectory.quaternion)
+    fits = fit_poses(
+        trajectory.markers_px,
+        trajectory.markers_covariance_px2,
+        trajectory.rig,
+        trajectory.disc.marker_centres_body,
+        R,
+        trajectory.q[:, :3],
+    )
+    return replace(fits, t_world_body=fits.t_world_body + np.multiply.outer(lift, [0.0, 0.0, 1.0])), np.zeros(
+        (len(R), 6, 6)
+    )
+
+
+def heights(fits, disc):
+    theta = np.arccos(fits.R_world_body[:, 2, 2])
+    return fits.t_world_body[:, 2] - disc.radius * np.sin(theta) - disc.half_thickness * np.cos(theta)
+
+
+def test_table_is_found_where_the_rim_rolls(leaning):
+    fits, _, rig, table = table_from_disc(*poses_of(leaning), leaning.rig, leaning.disc, "disc")
+    a, b = -TURN[1], TURN[0]  # z of the true table over x and y, seen from the believed axes
+    sigma = np.hypot(table.sigma, table.board_sigma)
+    assert np.all(np.abs(table.plane - [HEIGHT + np.dot([a, b], table.middle), a, b]) < 4 * sigma)
+    assert sigma[0] < 3e-6
+    assert sigma[1:].max() < np.radians(5e-3)
+    # what is left is the noise of single frames
+    theta = np.arccos(fits.R_world_body[:, 2, 2])
+    e1 = np.cross(leaning.disc.radius * np.array([0.0, 0.0, 1.0]), fits.R_world_body[:, :, 2]) / np.sin(theta)[:, None]
+    J = np.column_stack([np.tile([0.0, 0.0, 1.0], (len(e1), 1)), -e1 * np.cos(theta)[:, None]])
+    noise = np.sqrt(np.einsum("ni,nij,nj->n", J, fits.covariance, J))
+    assert abs(np.median(heights(fits, leaning.disc) / noise)) < 4 * 1.25 / np.sqrt(len(noise))
+    assert_allclose(np.std(heights(fits, leaning.disc) / noise), 1.0, atol=4 / np.sqrt(2 * len(noise)))
+    # poses, moved, and rig, moved, still tell of the same pixels
+    points = leaning.disc.marker_centres_body @ np.swapaxes(fits.R_world_body, 1, 2) + fits.t_world_body[:, None]
+    seen = np.moveaxis(rig.project(points), -3, 1)
+    assert_allclose(seen, leaning.markers_px - fits.residuals_px, atol=1e-6)
+
+
+def test_board_and_disc_count_as_their_sigmas_say(leaning):
+    poses = poses_of(leaning)
+    told = {source: table_from_disc(*poses, leaning.rig, leaning.disc, source)[3] for source in ("board", "both")}
+    assert_allclose(told["board"].applied, 0.0, atol=0)
+    assert_allclose(told["both"].applied, told["both"].plane, rtol=0.1)  # it differs by more than a board may
+    assert told["both"].probability < 1e-2
+    sure = replace(leaning.disc, thickness_tolerance=1e-3)  # a disc that nobody measured: the board tells
+    assert abs(table_from_disc(*poses, leaning.rig, sure)[3].applied[0]) < 0.1 * HEIGHT
+
+
+def test_true_table_is_left_where_it_is():
+    trajectory = measured(n=200)
+    table = table_from_disc(*poses_of(trajectory), trajectory.rig, trajectory.disc)[3]
+    assert table.probability > 1e-3
+    assert np.all(np.abs(table.plane) < 4 * np.hypot(table.sigma, table.board_sigma))
+
+
+def test_derivative_by_the_rig_agrees_with_differences(leaning):
+    """A rig that is off by a little moves the plane by as much as the gain counts with."""
+    fits, none = poses_of(leaning)
+    plane, _, by_rig, *_ = table_contact._contacts(fits, none, leaning.rig, leaning.disc)
+    step = np.zeros(N_RIG)
+    step[[2, 12, 18, 22, 25, 29]] = [0.3, -0.2, 1e-4, 1e-5, 2e-4, 3e-5]
+    off = replace(leaning, rig=leaning.rig.perturbed(step))
+    other, *_ = table_contact._contacts(poses_of(off)[0], none, off.rig, off.disc)
+    # the estimated rig is ahead of the true one by the step
+    assert_allclose(other - plane, -by_rig @ step, rtol=0.02, atol=2e-7)
+
+
+def test_disc_in_the_air_tells_of_no_table(leaning):
+    time = np.linspace(0, 1, len(leaning))
+    fits, none = poses_of(leaning, lift=2e-3 * time * (1 - time))
+    assert table_from_disc(fits, none, leaning.rig, leaning.disc)[3] is None
+
+
+def test_few_frames_or_a_flat_disc_tell_of_no_table(leaning):
+    fits, none = poses_of(leaning)
+    lost = replace(fits, converged=np.arange(len(leaning)) < 20)
+    assert table_from_disc(lost, none, leaning.rig, leaning.disc)[3] is None
+    assert table_from_disc(fits, none, replace(leaning.rig, world_is_table=False), leaning.disc)[3] is None
