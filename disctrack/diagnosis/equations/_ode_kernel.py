@@ -1,0 +1,234 @@
+"""Motion and its sensitivities from one set of equations: Dormand and Prince's method of order 8, dense output of 7.
+
+Steps follow the motion, not the sampling; between them the solution is a polynomial. Coefficients and error estimate:
+Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II.5 and II.6, as SciPy's DOP853 has them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+from scipy.integrate import DOP853
+
+_f, _v, _m = types.float64, types.float64[::1], types.float64[:, ::1]
+# rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in
+RHS = types.void(_f, _v, _v, _v, _v, _v, _m, _m)
+# observe(t, y, p, u, u_rate, h, H_y, H_p): what the sensors see (w,), and its derivatives (w, n), (w, n_p)
+OBSERVE = RHS
+RHS_TYPE = types.FunctionType(RHS)
+
+DONE, NOT_FINITE, TOO_MANY_STEPS = 0, 1, 2
+
+_A = np.ascontiguousarray(DOP853.A)  # (12, 12)
+_B, _C = np.ascontiguousarray(DOP853.B), np.ascontiguousarray(DOP853.C)
+_E3, _E5 = np.ascontiguousarray(DOP853.E3), np.ascontiguousarray(DOP853.E5)  # (13,)
+_D = np.ascontiguousarray(DOP853.D)  # (4, 16)
+_A_EXTRA, _C_EXTRA = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(DOP853.C_EXTRA)  # (3, 16), (3,)
+_SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
+
+
+@njit(types.void(_f, _v, types.float64[:, :, ::1], _v, _v), cache=True, error_model="numpy", nogil=True)
+def inputs_at(t, knots, pieces, u, u_rate):
+    """Piecewise cubics (channels, 4, knots - 1), highest power first, at t; beyond the ends the last piece goes on."""
+    if len(u) == 0:
+        return
+    i = min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
+    x = t - knots[i]
+    for c in range(len(u)):
+        a, b, d, e = pieces[c, 0, i], pieces[c, 1, i], pieces[c, 2, i], pieces[c, 3, i]
+        u[c] = ((a * x + b) * x + d) * x + e
+        u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d
+
+
+@njit(
+    types.void(RHS_TYPE, _f, _v, _v, types.int64[::1], _v, types.float64[:, :, ::1], _v, _v, _v, _m, _m, _v),
+    error_model="numpy",
+    cache=True,
+    nogil=True,
+)
+def _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
+    """z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt."""
+    n, k = len(f), len(columns)
+    inputs_at(t, knots, pieces, u, u_rate)
+    rhs(t, z[:n], p, u, u_rate, f, J, P)
+    out[:n] = f
+    for c in range(k):
+        s = n * (c + 1)
+        for i in range(n):
+            total = P[i, columns[c]] if columns[c] >= 0 else 0.0
+            for j in range(n):
+                total += J[i, j] * z[s + j]
+            out[s + i] = total
+
+
+@njit(
+    types.UniTuple(types.int64, 2)(
+        RHS_TYPE, _v, _v, types.int64[::1], _v, types.int64, _v, types.float64[:, :, ::1], types.boolean, _v, _f,
+        types.int64, _m, types.float64[:, :, ::1],
+    ),
+    cache=True, error_model="numpy", nogil=True,
+)  # fmt: skip
+def integrate(rhs, z0, p, columns, span, n, knots, pieces, stop_at_knots, size, tolerance, max_steps, samples, out):
+    """Fill out (groups, m, len(z0)) with the solution at samples (groups, m), each group increasing.
+
+    z0 : (n (1 + k),) states and their derivatives by k quantities at span[0]
+    columns : (k,) index in p of each quantity; -1 for an initial state
+    span : (2,) first and last instant
+    size : (n,) of the states, to which the tolerance is relative
+    returns : DONE, or why not; number of steps
+    """
+    N, n_p = len(z0), len(p)
+    k = len(columns)
+    groups, m = samples.shape
+    K = np.zeros((16, N))
+    F = np.zeros((7, N))
+    f, J, P = np.zeros(n), np.zeros((n, n)), np.zeros((n, n_p))
+    u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
+    z, new, work = z0.copy(), np.zeros(N), np.zeros(N)
+    largest = np.zeros(k)
+    pointer = np.zeros(groups, np.int64)
+    t, end = span[0], span[1]
+    _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
+    speed = 0.0
+    for i in range(n):
+        speed = max(speed, abs(K[0, i]) / size[i])
+    h = min(end - t, 0.01 / speed) if speed > 0 else 0.01 * (end - t)
+    steps, rejected, attempts = 0, False, 0
+    while True:
+        remaining = end - t
+        last = remaining <= h * (1.0 + 1e-9)
+        step = remaining if last else h
+        if stop_at_knots:
+            i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
+            if i < len(knots) and t + step > knots[i]:
+                step, last = knots[i] - t, False
+        attempts += 1
+        if attempts > max_steps or step < 1e-15 * max(abs(t), 1e-3):
+            if last and remaining <= 0:
+                break
+            return TOO_MANY_STEPS, steps
+        for s in range(1, 12):
+            for i in range(N):
+                total = 0.0
+                for j in range(s):
+                    total += _A[s, j] * K[j, i]
+                work[i] = z[i] + step * total
+            _slope(rhs, t + _C[s] * step, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
+        for i in range(N):
+            total = 0.0
+            for j in range(12):
+                total += _B[j] * K[j, i]
+            new[i] = z[i] + step * total
+        # at the end of a step that stops at a knot the inputs of the piece before it hold
+        at = t + step * (1.0 - 1e-13) if stop_at_knots else t + step
+        _slope(rhs, at, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
+        worst = 0.0
+        for c in range(k + 1):
+            e5, e3, top = 0.0, 0.0, 0.0
+            if c > 0:
+                top = largest[c - 1]
+                for i in range(n * c, n * (c + 1)):
+                    scale = abs(new[i]) / (size[i - n * c] + 1e-300)
+                    top = max(top, scale)
+            for i in range(n * c, n * (c + 1)):
+                a5, a3 = 0.0, 0.0
+                for j in range(13):
+                    a5 += _E5[j] * K[j, i]
+                    a3 += _E3[j] * K[j, i]
+                if c == 0:
+                    scale = tolerance * max(size[i], abs(new[i]))
+                else:
+                    scale = _SENSITIVITY_TOLERANCE * (top * size[i - n * c] + 1e-300)
+                e5 += (a5 / scale) ** 2
+                e3 += (a3 / scale) ** 2
+            if e5 > 0 or e3 > 0:
+                worst = max(worst, step * e5 / np.sqrt((e5 + 0.01 * e3) * n))
+            if not (np.isfinite(e5) and np.isfinite(e3)):
+                worst = np.inf
+        if not np.isfinite(worst):
+            h = 0.1 * step
+            rejected = True
+            if h < 1e-10 * (end - span[0]):
+                return NOT_FINITE, steps
+            continue
+        if worst > 1.0:
+            h = step * max(0.2, 0.9 * worst**-0.125)
+            rejected = True
+            continue
+        inside = False
+        for g in range(groups):
+            if pointer[g] < m and (samples[g, pointer[g]] <= t + step or last):
+                inside = True
+        if inside:
+            for e in range(3):
+                for i in range(N):
+                    total = 0.0
+                    for j in range(13 + e):
+                        total += _A_EXTRA[e, j] * K[j, i]
+                    work[i] = z[i] + step * total
+                _slope(rhs, t + _C_EXTRA[e] * step, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[13 + e])
+            for i in range(N):
+                delta = new[i] - z[i]
+                F[0, i] = delta
+                F[1, i] = step * K[0, i] - delta
+                F[2, i] = 2.0 * delta - step * (K[12, i] + K[0, i])
+                for d in range(4):
+                    total = 0.0
+                    for j in range(16):
+                        total += _D[d, j] * K[j, i]
+                    F[3 + d, i] = step * total
+            for g in range(groups):
+                while pointer[g] < m and (samples[g, pointer[g]] <= t + step or last):
+                    x = (samples[g, pointer[g]] - t) / step
+                    for i in range(N):
+                        total = 0.0
+                        for d in range(6, -1, -1):
+                            total += F[d, i]
+                            total *= x if d % 2 == 0 else 1.0 - x
+                        out[g, pointer[g], i] = total + z[i]
+                    pointer[g] += 1
+        for c in range(k):
+            for i in range(n):
+                largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
+        steps += 1
+        t += step
+        z[:] = new
+        if stop_at_knots:
+            _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
+        else:
+            K[0] = K[12]
+        grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**-0.125))
+        if rejected:
+            grow = min(1.0, grow)
+        rejected = False
+        h = max(h, step) if step < h else h  # a step cut short at a knot says nothing against the next
+        h = h * grow if step >= h * 0.999 else max(h, step * grow)
+        if last:
+            break
+    return DONE, steps
+
+
+@njit(
+    types.void(RHS_TYPE, _v, _m, _v, _v, types.float64[:, :, ::1], _m, types.float64[:, :, ::1],
+               types.float64[:, :, ::1]),
+    cache=True, error_model="numpy", nogil=True,
+)  # fmt: skip
+def observe_all(observe, times, states, p, knots, pieces, seen, by_state, by_parameter):
+    """What the sensors see at instants (m,) in states (m, n): seen (m, w) and derivatives (m, w, n), (m, w, n_p)."""
+    u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
+    for i in range(len(times)):
+        inputs_at(times[i], knots, pieces, u, u_rate)
+        observe(times[i], states[i], p, u, u_rate, seen[i], by_state[i], by_parameter[i])
+
+
+@njit(
+    types.void(RHS_TYPE, _v, _m, _v, _v, types.float64[:, :, ::1], _m, types.float64[:, :, ::1]),
+    cache=True, error_model="numpy", nogil=True,
+)  # fmt: skip
+def rates_all(rhs, times, states, p, knots, pieces, rates, by_parameter):
+    """Rates (m, n) and their derivatives by parameters (m, n, n_p) at instants (m,) in states (m, n)."""
+    n = states.shape[1]
+    u, u_rate, J = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0]), np.zeros((n, n))
+    for i in range(len(times)):
+        inputs_at(times[i], knots, pieces, u, u_rate)
+        rhs(times[i], states[i], p, u, u_rate, rates[i], J, by_parameter[i])

@@ -1,0 +1,225 @@
+"""The answer of a diagnosis of equations: in words, in numbers, as JSON and as a page."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from disctrack.diagnosis.engine.fit import Fit
+from disctrack.diagnosis.engine.search import Diagnosis, Settings
+from disctrack.diagnosis.engine.system import System
+from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box
+from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term
+from disctrack.diagnosis.equations.loop import Answered, ask
+from disctrack.diagnosis.equations.system import EquationSystem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ChannelErrors:
+    """What a model leaves of one channel, in its own unit."""
+
+    rms: float  # over all that was fitted
+    held_out: float  # free run over the last part of every stretch, from a fit to the first
+    noise: float  # as stated or found in the data
+
+
+def diagnose(
+    equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
+    settings: Settings | None = None, stretch: float | None = None,
+) -> Answer:  # fmt: skip
+    """Fit the equations to the runs and look for what they lack.
+
+    runs : they share all parameters, but for those that are declared `per_run`; initial states are each one's own
+    terms : what may be missing; the usual terms (`terms.usual`), if none are given
+    settings : how hard to look, and how sure to be
+    stretch : [s] after which a run begins anew with a state of its own; if not given, as far as the model follows it
+    Raises AnalysisError, which says what was found and what to do.
+    """
+    return Answer(equations, ask(equations, [runs] if isinstance(runs, Run) else runs, terms, settings, stretch))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is missing, how much of it, and how sure that is."""
+
+    equations: Equations
+    asked: Answered
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """The engine's answer."""
+        return self.asked.diagnosis
+
+    @property
+    def system(self) -> EquationSystem:
+        """Data and model in the stretches that were judged."""
+        return self.asked.system
+
+    @property
+    def verdict(self) -> str:
+        """`nothing missing`, `found` or `unexplained`."""
+        return self.diagnosis.verdict
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks on the data and on what they do not tell."""
+        return self.asked.notes
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """Names of the terms that are missing."""
+        return tuple(f.candidate.name for f in self.diagnosis.found)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All fitted numbers of the enlarged model."""
+        return {name: self.diagnosis.after.values[name] for name in self.diagnosis.after.names}
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Their standard deviations; nought for one that stands at a bound."""
+        return {name: self.diagnosis.after.sigma(name) for name in self.diagnosis.after.names}
+
+    @cached_property
+    def before(self) -> dict[str, ChannelErrors]:
+        """Errors by channel of the equations as declared."""
+        return self._errors(self.diagnosis.before, self.diagnosis.held_out_before)
+
+    @cached_property
+    def after(self) -> dict[str, ChannelErrors]:
+        """Errors by channel with what was found."""
+        return self._errors(self.diagnosis.after, self.diagnosis.held_out_after)
+
+    def predicted(self, fit: Fit) -> list[tuple[Samples, Array]]:
+        """Every stretch with what its sensors should show (n, w); NaN where the motion cannot be followed."""
+        stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
+        return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
+
+    def _errors(self, fit: Fit, held: Any) -> dict[str, ChannelErrors]:
+        names = self.system.formulas.channels
+        left = np.concatenate([s.data - seen for s, seen in self.predicted(fit)])
+        rms = np.sqrt(np.nanmean(left**2, axis=0))
+        ahead = np.full(len(names), np.nan)
+        if held is not None:
+            free = []
+            for s, seen in self.predicted(held.train):
+                tested = s.time - s.time[0] > 0.65 * (s.time[-1] - s.time[0])
+                free.append((s.data - seen)[tested])
+            ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
+        noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
+        both = zip(names, rms, ahead, noise, strict=True)
+        return {name: ChannelErrors(float(r), float(a), float(n)) for name, r, a, n in both}
+
+    @cached_property
+    def whiteness(self) -> float:
+        """Probability that white noise has as much memory as what is left (Ljung and Box, all channels and stretches)."""
+        return _whiteness(self.asked.judged, self.system, self.diagnosis.after)
+
+    @property
+    def sentence(self) -> str:
+        """The answer in plain words."""
+        from disctrack.diagnosis.pages.words import effect_text
+
+        d = self.diagnosis
+        level = ", ".join(
+            f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")
+            for c, e in self.after.items()
+        )
+        if d.verdict == "nothing missing":
+            return f"Nothing is missing: the equations leave {level}."
+        effects = "; and ".join(effect_text(f, d) for f in d.found)
+        if d.verdict == "found":
+            return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
+        if effects:
+            return f"Something is missing that no term describes; nearest comes {effects}, which leaves {level}."
+        return f"Something is missing that no term describes: the equations leave {level}."
+
+    def _unit(self, name: str) -> str:
+        return self.equations.units.get(name, "1")
+
+    def __str__(self) -> str:
+        """The answer, before and after, and remarks."""
+        d = self.diagnosis
+        lines = [self.sentence, *(f"Note: {note}." for note in self.notes), ""]
+        lines.append(f"{'':<30}{'before':>12}{'after':>12}{'noise':>12}")
+        for c in self.system.formulas.channels:
+            b, a = self.before[c], self.after[c]
+            lines.append(f"{f'rms of {c} [{self._unit(c)}]':<30}{b.rms:12.4g}{a.rms:12.4g}{a.noise:12.4g}")
+            lines.append(f"{f'  free run, held out':<30}{b.held_out:12.4g}{a.held_out:12.4g}")
+        chi = [f.reduced_chi_square / d.noise for f in (d.before, d.after)]
+        lines.append(f"{'chi-square per degree':<30}{chi[0]:12.4g}{chi[1]:12.4g}{1:12}")
+        lines += ["", f"{'fitted':<30}{'value':>14}{'sigma':>12}"]
+        for name in d.after.names:
+            if not name.startswith("state."):
+                lines.append(f"{name:<30}{d.after.values[name]:14.6g}{d.after.sigma(name):12.2g}")
+        lines += ["", f"{'tried':<30}{'gain':>12}  outcome"]
+        for t in d.tried:
+            lines.append(f"{t.candidate.name:<30}{t.score if t.gain is None else t.gain:12.4g}  {t.reason}")
+        return "\n".join(lines)
+
+    def document(self) -> dict[str, Any]:
+        """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
+        from disctrack.diagnosis.pages.general import document, fit_errors
+
+        d = self.diagnosis
+        sides = []
+        for fit, held, errors in (
+            (d.before, d.held_out_before, self.before),
+            (d.after, d.held_out_after, self.after),
+        ):
+            sides.append(fit_errors(fit, held, d.noise) | {"channels": {c: vars(e) for c, e in errors.items()}})
+        found = document(d, self.equations.name, self.sentence, sides[0], sides[1])
+        found |= {
+            "notes": list(self.notes),
+            "equations": {k: str(v) for k, v in self.equations.rates.items()},
+            "runs": [{"name": s.name, "samples": len(s.time)} for s in self.system.stretches],
+            "whiteness_p_value": self.whiteness,
+        }
+        clean: dict[str, Any] = _finite(found)
+        return clean
+
+    def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
+        """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
+        from disctrack.diagnosis.equations.page import page
+        from disctrack.errors import OutputError
+        from disctrack.files.whole import write_whole
+
+        paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
+        for path in paths:
+            if path.exists() and not overwrite:
+                raise OutputError(f"{path}: exists. Choose another folder, or say overwrite=True.")
+        write_whole(paths[0], (json.dumps(self.document(), indent=1) + "\n").encode())
+        write_whole(paths[1], page(self).encode())
+        return paths
+
+
+def _whiteness(judged: System, system: EquationSystem, fit: Fit) -> float:
+    residual, _ = judged.linearise(fit.values, [])
+    p_values = []
+    for rows, s in zip(system.rows, system.stretches, strict=True):
+        for c in range(residual.shape[1]):
+            x = residual[rows, c][np.isfinite(s.data[:, c])]
+            if len(x) > 4 * LAGS:
+                p_values.append(float(stats.chi2.sf(ljung_box(x[:, None])[0], LAGS)))
+    return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
+
+
+def _finite(x: Any) -> Any:
+    if isinstance(x, dict):
+        return {k: _finite(v) for k, v in x.items()}
+    if isinstance(x, list | tuple):
+        return [_finite(v) for v in x]
+    if isinstance(x, np.generic):
+        x = x.item()
+    return None if isinstance(x, float) and not math.isfinite(x) else x

@@ -1,0 +1,291 @@
+"""From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+from disctrack.diagnosis.engine.fit import Fit, compress, fit
+from disctrack.diagnosis.engine.score import Linearisation
+from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.engine.shape import refine_shapes
+from disctrack.diagnosis.engine.system import System
+from disctrack.diagnosis.equations import terms as library
+from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.diagnosis.equations.formulas import Formulas, formulas
+from disctrack.diagnosis.equations.noise import (
+    Remembering,
+    autoregression,
+    fast_part,
+    persistence,
+    step_of,
+    with_noise,
+)
+from disctrack.diagnosis.equations.start import LOST, guessed, led, misfit, turn
+from disctrack.diagnosis.equations.system import EquationSystem, cut
+from disctrack.errors import AnalysisError
+
+Array = NDArray[np.float64]
+
+JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
+REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
+MOST_STATES = 80  # initial states that are fitted along
+SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
+USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
+
+
+@dataclass(frozen=True)
+class Answered:
+    """The search's answer with all that it was asked of."""
+
+    diagnosis: Diagnosis
+    system: EquationSystem  # in the stretches that were judged
+    judged: System  # the same with its noise as judged
+    samples: tuple[Samples, ...]  # whole runs
+    notes: tuple[str, ...]
+    memory: Array | None  # (w, order) autoregression of the noise, where it remembers
+
+
+def ask(
+    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None,
+    stretch: float | None = None,
+) -> Answered:  # fmt: skip
+    """Fit the equations to the runs and look for what they lack.
+
+    terms : None: the usual ones (`terms.usual`)
+    stretch : [s] after which every run begins anew with a state of its own; None: as far as the model follows
+    """
+    runs = [runs] if isinstance(runs, Run) else list(runs)
+    given = checked(equations, runs)
+    channels = equations.channels(runs[0])
+    offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
+    compiled = formulas(equations, offered, channels)
+    samples = with_noise(given)
+    notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
+    system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
+    system, values = _prepared(system)
+    start = led(system, values) if stretch is None else None
+    if start is not None and start.followed == 0.0:
+        raise AnalysisError(_not_followed(system, values))
+    if start is None or not start.whole:
+        length = stretch or (start.followed if start else np.inf)
+        system, values, note = _in_stretches(system, values if start is None else start.values, length)
+        notes.append(note)
+    else:
+        values = start.values
+    system = _sized(system, values)
+    system, held = _without_redundant(system, values)
+    notes += held
+    diagnosis = _searched(system, values, settings)
+    if start is not None and not start.whole and diagnosis.found:
+        system, diagnosis, more = _joined(system, samples, diagnosis, settings)
+        notes += more
+    judged: System = diagnosis.judged or system
+    memory = None
+    if settings is None or settings.noise is None:
+        again, memory, remark = _with_memory(system, diagnosis, settings)
+        if again is not None:
+            diagnosis, judged = again, again.judged or judged
+            notes.append(remark)
+    if diagnosis.found:
+        diagnosis, shapes = refine_shapes(judged, diagnosis)
+        notes += list(shapes)
+    return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory)
+
+
+def _searched(system: EquationSystem, values: Mapping[str, float], settings: Settings | None) -> Diagnosis:
+    """The engine's answer; where the channels' noise turns out otherwise than their data said, once more."""
+    diagnosis = diagnose(system, values, settings, system.training)
+    return diagnosis
+
+
+def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
+    """With sizes of states and widths of jumps read off the data, and initial states."""
+    values, sizes = guessed(system)
+    system = system.with_(sizes=sizes)
+    return system.with_(widths=_widths(system, _along_guess(system, values, sizes))), values
+
+
+def _along_guess(system: EquationSystem, values: Mapping[str, float], sizes: Array) -> list[tuple[Samples, Array]]:
+    """States of the size that the data show, in place of a motion that is not known yet."""
+    s = system.stretches[0]
+    phase = 2 * np.pi * np.arange(64) / 64
+    return [(s, np.sqrt(2) * sizes * np.cos(phase[:, None] + np.arange(len(sizes))))]
+
+
+def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> dict[str, float]:
+    """Of every jump, from the rms of what jumps along these motions."""
+    f = system.formulas
+    square, count = np.zeros(len(f.widths)), 0
+    for s, states in along:
+        t, p = np.linspace(s.time[0], s.time[-1], len(states)), system.numbers({}, s)
+        u = [np.zeros(len(states)) for _ in f.inputs]
+        with np.errstate(all="ignore"):
+            arguments = f.jump_arguments(t, list(states.T), p, u)
+        square += [float(np.nansum(np.broadcast_to(a, t.shape) ** 2)) for a in arguments]
+        count += len(states)
+    size = np.sqrt(square / max(count, 1))
+    return {w.name: JUMP * (x or 1.0) for w, x in zip(f.widths.values(), size, strict=True)}
+
+
+def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
+    """With sizes and widths of the motion as fitted, and what each term's numbers would typically be."""
+    found = [(s, m) for s, m in zip(system.stretches, system.predictions(values), strict=True) if m is not None]
+    if not found:
+        return system
+    sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
+    system = system.with_(sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
+    return system.with_(typical=_typical(system, values))
+
+
+def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, float]:
+    f = system.formulas
+    n_fitted = len(f.fitted)
+    own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
+    shown, seen = np.zeros(len(f.channels)), np.zeros((len(f.channels), n_fitted))
+    for s in system.stretches:
+        rates, by_number, h, H_p = system.along(values, s)
+        own += np.sum(rates**2, axis=0)
+        acting += np.sum(by_number[..., :n_fitted] ** 2, axis=0)
+        shown += np.sum((h - h.mean(axis=0)) ** 2, axis=0)
+        seen += np.sum(H_p[..., :n_fitted] ** 2, axis=0)
+    found = {}
+    for i, name in enumerate(f.fitted):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sizes = np.concatenate([np.sqrt(own / acting[:, i]), 0.1 * np.sqrt(shown / seen[:, i])])
+        sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+        if "." in name and sizes.size:
+            found[name] = USUAL_SHARE * float(sizes.min())
+    return found
+
+
+def _without_redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[EquationSystem, list[str]]:
+    """Parameters that the data cannot part from others are held as declared, and that is said."""
+    free = [q for q in system.base if not q.name.startswith("state.") and np.isinf(q.prior_sigma)]
+    if len(free) < 2:
+        return system, []
+    here = fit(system, tuple(q for q in system.base if q.name.startswith("state.")), values, max_iterations=0)
+    linear = Linearisation(system, here, [])
+    residual, derivative = system.linearise(values, [*here.names, *(q.name for q in free)])
+    _, matrix = compress(residual, derivative)
+    k = len(here.names)
+    basis = np.linalg.qr(matrix[:, :k] / np.maximum(np.linalg.norm(matrix[:, :k], axis=0), 1e-300))[0]
+    del linear
+    columns = matrix[:, k:] * np.array([max(abs(values.get(q.name, q.null)), q.scale) for q in free])
+    before = np.linalg.norm(columns, axis=0)
+    cleared = columns - basis @ (basis.T @ columns)
+    _, R, order = qr(cleared / np.where(before > 0, before, 1.0), mode="economic", pivoting=True)
+    weak = [free[j] for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
+    if not weak:
+        return system, []
+    names = sorted({q.name.partition("[")[0] for q in weak})
+    others = sorted({q.name.partition("[")[0] for q in free} - set(names))
+    note = (
+        f"{', '.join(names)} cannot be told from {', '.join(others) or 'the initial states'} with these data and "
+        f"{'is' if len(names) == 1 else 'are'} held as declared; values of the others hold for that"
+    )
+    return system.with_(held=(*system.held, *names)), [note]
+
+
+def _in_stretches(
+    system: EquationSystem, values: Mapping[str, float], length: float
+) -> tuple[EquationSystem, dict[str, float], str]:
+    """The runs cut where the model loses them, each stretch with a start of its own."""
+    total = sum(float(s.time[-1] - s.time[0]) for s in system.stretches)
+    n = len(system.formulas.states)
+    shortest = total * n / MOST_STATES
+    pieces = cut(system.stretches, max(length, min(shortest, length)))
+    most = max(len(system.stretches), MOST_STATES // n)
+    chosen = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, min(most, len(pieces))).astype(int))]
+    system = system.with_(stretches=chosen)
+    shared = {k: v for k, v in values.items() if not k.startswith("state.")}
+    guesses, _ = guessed(system)
+    start = led(system, shared | guesses)
+    text = f"runs are taken in {len(pieces)} stretches of {length:.3g} s with an initial state each"
+    if len(chosen) < len(pieces):
+        text += f", of which {len(chosen)} spread over the runs are used"
+    return system, start.values, text
+
+
+def _joined(
+    system: EquationSystem, samples: Sequence[Samples], diagnosis: Diagnosis, settings: Settings | None
+) -> tuple[EquationSystem, Diagnosis, list[str]]:
+    """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
+    names = tuple(f.candidate.name for f in diagnosis.found)
+    whole = system.with_(stretches=samples, promoted=names)
+    first = {k: v for k, v in diagnosis.after.values.items() if not k.startswith("state.") or not k.endswith("#")}
+    guesses, _ = guessed(whole)
+    start = led(whole, guesses | first)
+    if not start.whole:
+        return system, diagnosis, [f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"]
+    rest = diagnose(whole, start.values, settings, whole.training)
+    plain = whole.with_(promoted=())
+    before = fit(plain, plain.base, led(plain, guesses | first).values)
+    found = []
+    for f in diagnosis.found:
+        others = tuple(n for n in names if n != f.candidate.name)
+        smaller = whole.with_(promoted=others)
+        without = fit(smaller, smaller.base, rest.before.values)
+        gain = (without.cost - rest.before.cost) / rest.noise
+        found.append(replace(f, gain=float(gain)))
+    merged = replace(rest, verdict="found" if rest.verdict == "nothing missing" else rest.verdict,
+                     found=(*found, *rest.found), before=before, tried=diagnosis.tried)  # fmt: skip
+    return plain, merged, []
+
+
+def _with_memory(
+    system: EquationSystem, diagnosis: Diagnosis, settings: Settings | None
+) -> tuple[Diagnosis | None, Array | None, str]:
+    """Search again with noise that remembers, where what is left of the best model does."""
+    if diagnosis.held_out_before is None:
+        return None, None, ""
+    residual, _ = system.linearise(diagnosis.after.values, [])
+    present = np.zeros(residual.shape, bool)
+    for rows, s in zip(system.rows, system.stretches, strict=True):
+        present[rows] = np.isfinite(s.data)
+    coefficients, share = autoregression(residual, present, system.rows)
+    if not coefficients.any():
+        return None, None, ""
+    size = np.sqrt(np.sum(residual**2) / max(present.sum(), 1))
+    remembering = Remembering(system, system.rows, coefficients, present)
+    base = fit(remembering, system.base, diagnosis.before.values)
+    if not base.converged:
+        return None, None, ""
+    noise = share * size**2
+    again = diagnose(remembering, base.values, replace(settings or Settings(), noise=float(noise)), system.training)
+    order = int(np.max(np.nonzero(coefficients)[1])) + 1
+    text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
+    lasting = persistence(residual, system.rows)
+    spacing = float(np.median(np.diff(system.stretches[0].time)))
+    again = replace(again, judged=again.judged or remembering)
+    if diagnosis.verdict == "unexplained" and lasting * spacing > SLOW * min(turn(s) for s in system.stretches):
+        # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
+        reason = (
+            f"what is left is {np.sqrt(residual.var() * residual.size / max(present.sum(), 1)):.3g} times the noise and "
+            f"keeps its sign for {lasting * spacing:.2g} s: no sensor's noise"
+        )
+        again = replace(again, verdict="unexplained", reason=reason)
+    return again, coefficients, text
+
+
+def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
+    lost = misfit(system, dict(values))
+    what = "cannot be integrated from the guessed start" if not np.isfinite(lost) else "is nothing like the data"
+    guess = ", ".join(f"{k.partition('.')[2]} = {v:.4g}" for k, v in list(values.items())[:4] if k.startswith("state."))
+    return (
+        f"the model does not follow the data even over its first half turn (residual over {LOST:.0%} of the signal): "
+        f"as declared it {what}. Guessed start: {guess}. Check signs and units of the equations, declare parameters "
+        "nearer to the truth, or give Run(start={...})."
+    )
+
+
+def _step_note(samples: Sequence[Samples], channel: int, name: str) -> str:
+    values = [s.data[:, channel] for s in samples if np.isnan(s.sigma[:, channel]).any()]
+    if not values or not (step := step_of(values)):
+        return ""
+    text = f"{name} stands on steps of {step:.4g}, which alone scatter by {step / np.sqrt(12):.3g}"
+    return text if fast_part(values) < 3 * step else ""

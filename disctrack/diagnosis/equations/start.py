@@ -1,0 +1,176 @@
+"""Where a fit begins: states read off the data, then windows that grow as far as the model follows the motion.
+
+Over many turns of an oscillation chi-square has many minima; over half a turn it has one. A fit that begins there and
+is led to longer and longer windows stays in it, for as long as the model can follow at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+from scipy.optimize import least_squares
+
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.engine.system import Quantity
+from disctrack.diagnosis.equations import _ode_kernel as kernel
+from disctrack.diagnosis.equations.declared import Samples
+from disctrack.diagnosis.equations.formulas import Formulas
+from disctrack.diagnosis.equations.system import EquationSystem, first_part
+
+Array = NDArray[np.float64]
+
+GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
+LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
+_LEASH = 0.3  # relative change of a parameter from window to window, of which none is surprised
+_WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
+_INSTANTS = 24  # at which the sizes of the states are looked at
+
+
+def local_polynomial(s: Samples, channel: int, first: int) -> tuple[float, float] | None:
+    """Value and slope of a channel at sample `first`, from a cubic over as many samples as it fits."""
+    rows = first + np.flatnonzero(np.isfinite(s.data[first:, channel]))
+    best = None
+    for m in _WINDOWS:
+        if m > len(rows):
+            break
+        some = rows[:m]
+        x, y, sigma = s.time[some] - s.time[first], s.data[some, channel], s.sigma[some, channel]
+        scale = x[-1] or 1.0
+        basis = (x[:, None] / scale) ** np.arange(4)
+        coefficients = np.linalg.lstsq(basis / sigma[:, None], y / sigma, rcond=None)[0]
+        if best is not None and np.sum(((y - basis @ coefficients) / sigma) ** 2) > 2.0 * (m - 4) + 6:
+            break
+        best = (float(coefficients[0]), float(coefficients[1] / scale))
+    return best
+
+
+def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin: Array) -> Array:
+    """States (n,) in which the sensors show what the data show at sample `first`, and change as they do.
+
+    What neither tells stays near `begin`.
+    """
+    n, w = len(formulas.states), len(formulas.channels)
+    local = [local_polynomial(s, c, first) for c in range(w)]
+    value_size = np.array([np.nanstd(s.data[:, c]) or 1.0 for c in range(w)])
+    slope_size = value_size / max(turn(s), 1e-300) * 2 * np.pi
+    knots, pieces = s.knots, s.pieces
+
+    def misfit(y: Array) -> Array:
+        t, y = np.array([s.time[first]]), np.ascontiguousarray(y[None])
+        h, H_y, H_p = np.zeros((1, w)), np.zeros((1, w, n)), np.zeros((1, w, len(p)))
+        f, F_p = np.zeros((1, n)), np.zeros((1, n, len(p)))
+        kernel.observe_all(formulas.observe, t, y, p, knots, pieces, h, H_y, H_p)
+        kernel.rates_all(formulas.rhs, t, y, p, knots, pieces, f, F_p)
+        slope = H_y[0] @ f[0]
+        parts = [1e-4 * (y[0] - begin) / np.maximum(np.abs(begin), 1.0)]
+        for c, known in enumerate(local):
+            if known is not None:
+                parts.append(np.array([h[0, c] - known[0]]) / value_size[c])
+                parts.append(np.array([slope[c] - known[1]]) / slope_size[c])
+        return np.nan_to_num(np.concatenate(parts), nan=1e6, posinf=1e6, neginf=-1e6)
+
+    return np.asarray(least_squares(misfit, begin, max_nfev=60, x_scale=np.maximum(np.abs(begin), 1e-3)).x, float)
+
+
+def turn(s: Samples) -> float:
+    """Time [s] of one turn of the strongest oscillation in the data, at most half the run."""
+    duration = float(s.time[-1] - s.time[0])
+    grid = np.linspace(s.time[0], s.time[-1], int(min(len(s.time), 20_000)))
+    best, found = 0.0, duration / 2
+    for c in range(s.data.shape[1]):
+        present = np.isfinite(s.data[:, c])
+        if present.sum() < 8:
+            continue
+        x = np.interp(grid, s.time[present], s.data[present, c])
+        frequency, power = signal.periodogram(x, (len(grid) - 1) / duration, detrend="linear", scaling="spectrum")
+        share = power / max(float(np.nanmean(s.sigma[:, c]) ** 2), 1e-300)
+        i = int(np.argmax(share[1:])) + 1
+        if share[i] > best:
+            best, found = float(share[i]), min(duration / 2, 1.0 / float(frequency[i]))
+    return found
+
+
+def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
+    """Initial states of every stretch by the names of their quantities, and the sizes (n,) of the states."""
+    f = system.formulas
+    names = f.equations.states
+    values: dict[str, float] = {}
+    seen = []
+    for s in system.stretches:
+        p = system.numbers({}, s)
+        begin = system.start_of({}, s)
+        usable = np.flatnonzero(np.isfinite(s.data).any(axis=1))
+        first = np.asarray(begin, float)
+        if not all(name in s.start or name in s.known for name in names):
+            first = states_from_data(f, s, p, int(usable[0]), begin)
+            for i, name in enumerate(names):
+                if name in s.start or name in s.known:
+                    first[i] = begin[i]
+        seen.append(first)
+        values |= {f"state.{name}[{s.name}]": float(v) for name, v in zip(names, first, strict=True)}
+        count = max(2, _INSTANTS // len(system.stretches))
+        for row in usable[np.linspace(0, len(usable) - 9, count).astype(int)]:
+            seen.append(states_from_data(f, s, p, int(row), first))
+    sizes = np.quantile(np.abs(seen), 0.9, axis=0)
+    floor = 1e-6 * max(float(sizes.max()), 1e-12)
+    return values, np.asarray(np.maximum(sizes, floor), float)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Values from which Gauss-Newton converges, as far as the model follows the motion."""
+
+    values: dict[str, float]
+    followed: float  # [s] from the start of a stretch
+    duration: float  # [s] of the longest stretch
+
+    @property
+    def whole(self) -> bool:
+        """True where the model follows all stretches to their end."""
+        return self.followed >= self.duration * (1 - 1e-9)
+
+
+def misfit(system: EquationSystem, values: dict[str, float]) -> float:
+    """Largest over the channels: rms of the residual over that of the signal, all stretches together."""
+    square, size = np.zeros(len(system.formulas.channels)), np.zeros(len(system.formulas.channels))
+    for s, found in zip(system.stretches, system.predictions(values), strict=True):
+        if found is None:
+            return np.inf
+        square += np.nansum((s.data - found.seen) ** 2, axis=0)
+        size += np.nansum((s.data - np.nanmean(s.data, axis=0)) ** 2 + s.sigma**2 * np.isfinite(s.data), axis=0)
+    return float(np.sqrt(np.max(square / np.maximum(size, 1e-300))))
+
+
+def led(system: EquationSystem, values: dict[str, float], begin: float | None = None) -> Start:
+    """Fit over windows that grow from `begin` [s] (half a turn) to the whole, or until the model loses the motion."""
+    duration = max(float(s.time[-1] - s.time[0]) for s in system.stretches)
+    window = begin or max(0.5 * min(turn(s) for s in system.stretches), duration / 4000)
+    values, followed, last = dict(values), 0.0, False
+    parameters = [q for q in system.base if not q.name.startswith("state.")]
+    leash = {q.name: _LEASH * max(abs(q.null), q.scale) for q in parameters}
+    states = tuple(q for q in system.base if q.name.startswith("state."))
+    while not last:
+        last = window >= duration
+        part = system.with_(stretches=first_part(system.stretches, duration if last else window))
+        if followed == 0.0:
+            values |= fit(part, states, values, max_iterations=15).values
+        tied = tuple(_tied(q, values, leash) for q in parameters)
+        trial = values | fit(part, (*states, *tied), values, max_iterations=15).values
+        lost = misfit(part, trial)
+        if lost > LOST and followed > 0.0:
+            break
+        values = trial
+        if lost <= LOST:
+            followed = min(window, duration)
+        window *= GROWTH
+    return Start(values, followed, duration)
+
+
+def _tied(q: Quantity, values: dict[str, float], leash: dict[str, float]) -> Quantity:
+    """The quantity with a prior about where the last window left it: one that a short window does not tell stays."""
+    value = values.get(q.name, q.null)
+    return replace(q, null=value, prior_sigma=min(q.prior_sigma, max(leash[q.name], _LEASH * abs(value))))

@@ -1,0 +1,249 @@
+"""Equations and runs as a system that `diagnosis.engine` can diagnose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.diagnosis.equations import _ode_kernel as kernel
+from disctrack.diagnosis.equations.declared import Parameter, Samples, Term
+from disctrack.diagnosis.equations.formulas import Formulas
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-10  # of a step, relative to the size of a state
+MAX_STEPS = 400_000
+FIRST_SHARE = 0.65  # of every stretch: what is fitted to it is judged on the rest
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Motion and sensors over one stretch."""
+
+    states: Array  # (n, n_states) at the true instants of the first channel
+    seen: Array  # (n, w)
+    derivative: Array  # (n, w, k)
+
+
+class EquationSystem:
+    """Samples of all stretches, one after the other, with a row without data between two of them."""
+
+    def __init__(
+        self, formulas: Formulas, stretches: Sequence[Samples], sizes: Array, widths: Mapping[str, float],
+        promoted: Sequence[str] = (), held: Sequence[str] = (), typical: Mapping[str, float] | None = None,
+    ) -> None:  # fmt: skip
+        """Make a system of stretches whose noise is known.
+
+        sizes : (n,) of the states
+        widths : of jumps
+        promoted : terms that every fit has
+        held : parameters that no fit moves
+        typical : sizes of the terms' numbers that would surprise nobody
+        """
+        self.formulas, self.stretches = formulas, tuple(stretches)
+        self.sizes, self.widths = np.asarray(sizes, float), dict(widths)
+        self.promoted, self.held = tuple(promoted), tuple(held)
+        self.typical = dict(typical or {})
+        lengths = [len(s.time) for s in self.stretches]
+        first = np.cumsum([0] + [n + 1 for n in lengths])
+        self.rows = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
+        n, w = int(first[-1]), len(formulas.channels)
+        self.time, self.weights, self.training = np.zeros(n), np.zeros(n), np.zeros(n, bool)
+        for rows, s in zip(self.rows, self.stretches, strict=True):
+            elapsed = s.time - s.time[0]
+            self.time[rows], self.time[rows.stop] = elapsed, elapsed[-1]
+            self.weights[rows] = np.isfinite(s.data).sum(axis=1)
+            self.training[rows] = elapsed <= FIRST_SHARE * elapsed[-1]
+        self._w = w
+        self._defaults = formulas.defaults() | self.widths
+        self.runs = tuple(dict.fromkeys(s.run for s in self.stretches))
+        self.base = tuple(self._base())
+        self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
+
+    def with_(self, **changes: object) -> EquationSystem:
+        """The same with other stretches, promoted terms, ..."""
+        given = {
+            "stretches": self.stretches, "sizes": self.sizes, "widths": self.widths, "promoted": self.promoted,
+            "held": self.held, "typical": self.typical,
+        } | changes  # fmt: skip
+        return EquationSystem(self.formulas, **given)  # type: ignore[arg-type]
+
+    def _base(self) -> list[Quantity]:
+        found = []
+        for s in self.stretches:
+            for name, size in zip(self.formulas.equations.states, self.sizes, strict=True):
+                value, sigma = s.known.get(name, (s.start.get(name, 0.0), np.inf))
+                if sigma > 0:
+                    unit = self.formulas.equations.units.get(name, "1")
+                    q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
+                                 meaning="at the first sample")  # fmt: skip
+                    found.append(q)
+        for name, (_, p) in self.formulas.fitted.items():
+            term = name.partition(".")[0] if "." in name else ""
+            if name in self.held or p.shape or (term and term not in self.promoted):
+                continue
+            found += self._quantities(name, p)
+        return found
+
+    def _quantities(self, name: str, p: Parameter) -> list[Quantity]:
+        scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
+        typical = p.typical or self.typical.get(name, np.inf)
+        names = [f"{name}[{run}]" for run in self.runs] if p.per_run else [name]
+        return [Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical) for n in names]
+
+    def _candidate(self, term: Term) -> Candidate:
+        own = {n: p for n, (_, p) in self.formulas.fitted.items() if n.startswith(f"{term.name}.")}
+        amounts = tuple(q for n, p in own.items() if not p.shape for q in self._quantities(n, p))
+        shape = tuple(q for n, p in own.items() if p.shape for q in self._quantities(n, p))
+        kind = "measurement" if term.is_measurement else "motion"
+        return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, shape=shape)
+
+    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+        """No term has a threshold."""
+        return ()
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """Whitened residual (n, w), data minus prediction, and the prediction's derivative (n, w, k)."""
+        residual = np.zeros((len(self.time), self._w))
+        derivative = np.zeros((len(self.time), self._w, len(names)))
+        for rows, s in zip(self.rows, self.stretches, strict=True):
+            mine = [(i, own) for i, name in enumerate(names) if (own := self._own(name, s)) is not None]
+            found = self._predict(values, s, [own for _, own in mine])
+            if found is None:
+                return np.full_like(residual, np.nan), np.full_like(derivative, np.nan)
+            present = np.isfinite(s.data)
+            residual[rows] = np.where(present, (s.data - found.seen) / s.sigma, 0.0)
+            weight = np.where(present, 1.0 / s.sigma, 0.0)[..., None]
+            columns = [i for i, _ in mine]
+            derivative[rows.start : rows.stop, :, columns] = found.derivative * weight
+        return residual, derivative
+
+    def predictions(self, values: Values) -> list[Prediction | None]:
+        """What every stretch should show; None where the motion cannot be followed to its end."""
+        return [self._predict(values, s, []) for s in self.stretches]
+
+    def _own(self, name: str, s: Samples) -> int | None:
+        """Which number of a stretch a quantity is: its place in p, or -1 - i for the i-th state at the start."""
+        stem, bracket, rest = name.partition("[")
+        where = rest.rstrip("]")
+        if stem.startswith("state."):
+            if where != s.name:
+                return None
+            return -1 - self.formulas.equations.states.index(stem.removeprefix("state."))
+        if bracket and where != s.run:
+            return None
+        return self.formulas.names.index(stem)
+
+    def numbers(self, values: Values, s: Samples) -> Array:
+        """(n_p,) all numbers of a stretch."""
+        known = self._defaults | dict(s.constants)
+        return np.array([values.get(f"{n}[{s.run}]", values.get(n, v)) for n, v in known.items()], float)
+
+    def start_of(self, values: Values, s: Samples) -> Array:
+        """(n,) states at the first sample."""
+        fallback = {k: v for k, (v, _) in s.known.items()}
+        return np.array(
+            [
+                values.get(f"state.{n}[{s.name}]", fallback.get(n, s.start.get(n, 0.0)))
+                for n in self.formulas.equations.states
+            ],
+            float,
+        )
+
+    def _predict(self, values: Values, s: Samples, own: Sequence[int]) -> Prediction | None:
+        f = self.formulas
+        n, k, m = len(f.states), len(own), len(s.time)
+        p = self.numbers(values, s)
+        z0 = np.zeros(n * (1 + k))
+        z0[:n] = self.start_of(values, s)
+        for c, which in enumerate(own):
+            if which < 0:
+                z0[n * (1 + c) + (-1 - which)] = 1.0
+        columns = np.array([max(which, -1) for which in own], np.int64)
+        by_number, group_of, times = self._instants(s, p)
+        span = np.array([s.time[0], max(float(times.max()), s.time[0] + 1e-9)])
+        out = np.empty((len(times), m, n * (1 + k)))
+        with np.errstate(all="ignore"):
+            done, _ = kernel.integrate(
+                f.rhs, z0, p, columns, span, n, s.knots, s.pieces, s.stop_at_knots, self.sizes, TOLERANCE, MAX_STEPS,
+                times, out,
+            )  # fmt: skip
+        if done != kernel.DONE:
+            return None
+        seen, derivative = np.zeros((m, self._w)), np.zeros((m, self._w, k))
+        h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, n)), np.zeros((m, self._w, len(p)))
+        for g in range(len(times)):
+            states = np.ascontiguousarray(out[g, :, :n])
+            kernel.observe_all(f.observe, times[g], states, p, s.knots, s.pieces, h, H_y, H_p)
+            channels = [c for c in range(self._w) if group_of[c] == g]
+            seen[:, channels] = h[:, channels]
+            if k == 0:
+                continue
+            moved = out[g, :, n:].reshape(m, k, n)
+            for c in channels:
+                derivative[:, c] = np.einsum("mn,mkn->mk", H_y[:, c], moved)
+                for j, which in enumerate(own):
+                    if which >= 0:
+                        derivative[:, c, j] += H_p[:, c, which]
+            if f.is_late:
+                slope = np.einsum("mwn,mn->mw", H_y, self._rates(s, p, times[g], states)[0])
+                for j, which in enumerate(own):
+                    if 0 <= which < by_number.shape[1]:
+                        derivative[:, channels, j] += slope[:, channels] * by_number[channels, which].T
+        return Prediction(out[0, :, :n], seen, derivative)
+
+    def _instants(self, s: Samples, p: Array) -> tuple[Array, list[int], Array]:
+        """Derivatives (w, n_fitted, m) of the lateness, which group of instants each channel has, and the groups (g, m)."""
+        if not self.formulas.is_late:
+            return np.zeros((self._w, 0, 0)), [0] * self._w, s.time[None].copy()
+        late, by_number = self.formulas.lateness(s.time, p)
+        groups: list[int] = []
+        group_of = []
+        for c in range(self._w):
+            same = next((g for g, first in enumerate(groups) if np.array_equal(late[c], late[first])), None)
+            if same is None:
+                groups.append(c)
+                same = len(groups) - 1
+            group_of.append(same)
+        return by_number, group_of, np.ascontiguousarray(s.time + late[groups])
+
+    def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
+        """Rates (m, n), their derivatives (m, n, n_p), sensors (m, w), theirs (m, w, n_p) along a stretch's motion."""
+        p, m = self.numbers(values, s), len(s.time)
+        found = self._predict(values, s, [])
+        states = np.zeros((m, len(self.formulas.states))) if found is None else found.states
+        rates, by_number = self._rates(s, p, s.time, states)
+        h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, states.shape[1])), np.zeros((m, self._w, len(p)))
+        states = np.ascontiguousarray(states)
+        kernel.observe_all(self.formulas.observe, s.time, states, p, s.knots, s.pieces, h, H_y, H_p)
+        return rates, by_number, h, H_p
+
+    def _rates(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array]:
+        """Rates (m, n) and their derivatives (m, n, n_p) along a motion."""
+        rates, by_number = np.zeros(states.shape), np.zeros((*states.shape, len(p)))
+        kernel.rates_all(self.formulas.rhs, times, np.ascontiguousarray(states), p, s.knots, s.pieces, rates, by_number)
+        return rates, by_number
+
+
+def cut(samples: Sequence[Samples], duration: float) -> list[Samples]:
+    """Every run in stretches no longer than `duration` [s], of equal lengths."""
+    found = []
+    for s in samples:
+        count = max(1, int(np.ceil((s.time[-1] - s.time[0]) / duration * (1 - 1e-9))))
+        edges = np.searchsorted(s.time, s.time[0] + (s.time[-1] - s.time[0]) * np.arange(count + 1) / count)
+        edges[-1] = len(s.time)
+        found += [s.part(int(a), int(b), i) for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False)) if b - a >= 4]
+    return found
+
+
+def first_part(samples: Sequence[Samples], duration: float) -> list[Samples]:
+    """Every stretch, no further than `duration` [s] from its start, but 8 samples at least."""
+    found = []
+    for s in samples:
+        n = max(8, int(np.searchsorted(s.time, s.time[0] + duration, side="right")))
+        found.append(replace(s, time=s.time[:n], data=s.data[:n], sigma=s.sigma[:n]))
+    return found

@@ -1,0 +1,156 @@
+"""Terms that equations often lack, ready to be offered; any other is a `Term` of the user's own.
+
+Amounts are accelerations (or generalised forces, where a mass matrix is declared) in the units of the equation to which
+a term is added. `v` is a velocity, `x` its coordinate; both may be formulas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from disctrack.diagnosis.equations.declared import Equations, Parameter, Term
+
+
+def coulomb(v: str, name: str = "") -> Term:
+    """Dry friction: constant size, against the motion."""
+    return Term(name or f"coulomb_{v}", {v: f"-c*sign({v})"}, parameters={"c": Parameter(0.0, lower=0.0)},
+                title=f"dry friction on {v}", source="Coulomb 1785")  # fmt: skip
+
+
+def viscous(v: str, name: str = "") -> Term:
+    """Friction in proportion to the velocity."""
+    return Term(name or f"viscous_{v}", {v: f"-c*{v}"}, parameters={"c": Parameter(0.0)},
+                title=f"viscous friction on {v}", source="Stokes 1851")  # fmt: skip
+
+
+def quadratic(v: str, name: str = "") -> Term:
+    """Drag in proportion to the square of the velocity."""
+    return Term(name or f"quadratic_{v}", {v: f"-c*abs({v})*{v}"}, parameters={"c": Parameter(0.0, lower=0.0)},
+                title=f"quadratic drag on {v}", source="Newton 1687")  # fmt: skip
+
+
+def power_law(v: str, exponent: float = 1.5, name: str = "") -> Term:
+    """Drag in proportion to a power of the speed; the exponent is fitted once the drag is found."""
+    return Term(name or f"power_{v}", {v: f"-c*sign({v})*abs({v})**p"},
+                parameters={"c": Parameter(0.0, lower=0.0), "p": Parameter(exponent, lower=0.3, upper=3.0, shape=True)},
+                title=f"drag on {v} with a power of its own", source="")  # fmt: skip
+
+
+def constant(v: str, name: str = "") -> Term:
+    """A force that is always there: a tilt, a spring's rest length, gravity."""
+    return Term(name or f"constant_{v}", {v: "a"}, parameters={"a": Parameter(0.0)}, title=f"constant force on {v}")
+
+
+def spring(v: str, x: str, name: str = "") -> Term:
+    """Linear spring on a coordinate."""
+    return Term(name or f"spring_{x}", {v: f"-k*({x})"}, parameters={"k": Parameter(0.0)}, title=f"linear spring on {x}")
+
+
+def asymmetric_spring(v: str, x: str, name: str = "") -> Term:
+    """Spring that is stiffer on one side: force in proportion to x^2."""
+    return Term(name or f"asymmetric_spring_{x}", {v: f"-k*({x})**2"}, parameters={"k": Parameter(0.0)},
+                title=f"spring on {x} stiffer on one side")  # fmt: skip
+
+
+def cubic_spring(v: str, x: str, name: str = "") -> Term:
+    """Spring that stiffens (or softens) with the deflection: force in proportion to x^3."""
+    return Term(name or f"cubic_spring_{x}", {v: f"-k*({x})**3"}, parameters={"k": Parameter(0.0)},
+                title=f"cubic spring on {x}", source="Duffing 1918")  # fmt: skip
+
+
+def force(v: str, formula: str, name: str, title: str = "") -> Term:
+    """Any formula of states, inputs and t, with an amount of its own."""
+    return Term(name, {v: f"amount*({formula})"}, parameters={"amount": Parameter(0.0)}, title=title or f"{formula} on {v}")
+
+
+def periodic_force(v: str, frequency_hz: float, name: str = "") -> Term:
+    """A force that oscillates at a known frequency: a motor, the mains, a shaking table."""
+    w = 2 * np.pi * frequency_hz
+    return Term(name or f"periodic_{v}", {v: f"a*cos({w!r}*t) + b*sin({w!r}*t)"},
+                parameters={"a": Parameter(0.0), "b": Parameter(0.0)},
+                title=f"force on {v} at {frequency_hz:g} Hz")  # fmt: skip
+
+
+def products(v: str, of: Sequence[str], degree: int = 3) -> tuple[Term, ...]:
+    """Every product of these states (inputs, formulas) up to a degree, each as a term of its own on the equation of v."""
+    found = []
+    for d in range(1, degree + 1):
+        for factors in combinations_with_replacement(of, d):
+            label = "_".join("".join(c if c.isalnum() else "" for c in f) for f in factors)
+            found.append(force(v, "*".join(f"({f})" for f in factors), f"{v}_gets_{label}",
+                               f"{' '.join(factors)} in the equation of {v}"))  # fmt: skip
+    return tuple(found)
+
+
+def sensor_scale(channel: str, shown: str = "", name: str = "") -> Term:
+    """The sensor shows too much or too little by a constant factor. `shown`: its formula, if not the state's name."""
+    return Term(name or f"scale_{channel}", observed={channel: f"s*({shown or channel})"},
+                parameters={"s": Parameter(0.0, typical=0.01)}, title=f"scale of {channel} wrong")  # fmt: skip
+
+
+def sensor_offset(channel: str, name: str = "") -> Term:
+    """The sensor's zero is wrong."""
+    return Term(name or f"offset_{channel}", observed={channel: "b"}, parameters={"b": Parameter(0.0)},
+                title=f"zero of {channel} wrong")  # fmt: skip
+
+
+def sensor_drift(channel: str, name: str = "") -> Term:
+    """The sensor's zero moves in proportion to time."""
+    return Term(name or f"drift_{channel}", observed={channel: "b*t"}, parameters={"b": Parameter(0.0)},
+                title=f"zero of {channel} drifts")  # fmt: skip
+
+
+def sensor_curvature(channel: str, shown: str = "", name: str = "") -> Term:
+    """The sensor's scale changes over its range: an error in proportion to the square."""
+    return Term(name or f"curvature_{channel}", observed={channel: f"q*({shown or channel})**2"},
+                parameters={"q": Parameter(0.0)}, title=f"{channel} shown on a bent scale")  # fmt: skip
+
+
+def sensor_lag(channel: str, name: str = "") -> Term:
+    """The sensor shows what was a little earlier; seen only beside another sensor or a measured input."""
+    return Term(name or f"lag_{channel}", lag={channel: "tau"}, parameters={"tau": Parameter(0.0, unit="s")},
+                title=f"{channel} late")  # fmt: skip
+
+
+def clock_rate(name: str = "clock_rate") -> Term:
+    """The time written beside the samples runs slow or fast."""
+    return Term(name, clock="r*t", parameters={"r": Parameter(0.0, typical=1e-3)}, title="rate of the clock wrong")
+
+
+def input_scale(v: str, u: str, gain: str, name: str = "") -> Term:
+    """The measured input acts more or less than declared; `gain` is its factor in the equation of v."""
+    return Term(name or f"gain_{u}", {v: f"s*({gain})*{u}"}, parameters={"s": Parameter(0.0, typical=0.01)},
+                title=f"gain of the input {u} wrong")  # fmt: skip
+
+
+def input_delay(v: str, u: str, gain: str, name: str = "") -> Term:
+    """The measured input acts late (to first order in the delay); `gain` is its factor in the equation of v."""
+    return Term(name or f"delay_{u}", {v: f"-tau*({gain})*{u}_rate"}, parameters={"tau": Parameter(0.0, unit="s")},
+                title=f"input {u} acts late")  # fmt: skip
+
+
+def usual(equations: Equations) -> tuple[Term, ...]:
+    """What is offered where the user offers nothing: friction and springs on every pair (x, v), and the sensors.
+
+    A pair is a state whose declared rate is another state: rates={"x": "v", "v": ...}.
+    """
+    found: list[Term] = []
+    for x, formula in equations.rates.items():
+        v = str(formula).strip()
+        if v in equations.rates and v != x:
+            found += [coulomb(v), viscous(v), quadratic(v), constant(v), spring(v, x), asymmetric_spring(v, x),
+                      cubic_spring(v, x)]  # fmt: skip
+    if not found:  # first-order systems
+        for y in equations.rates:
+            found += [constant(y), viscous(y, f"leak_{y}"), asymmetric_spring(y, y, f"square_{y}"),
+                      cubic_spring(y, y, f"cube_{y}")]  # fmt: skip
+    observed = equations.observed if equations.observed is not None else {}
+    for channel, formula in observed.items():
+        found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]
+        if equations.inputs or len(observed) > 1:
+            found.append(sensor_lag(channel))
+    found.append(clock_rate())
+    return tuple(found)
