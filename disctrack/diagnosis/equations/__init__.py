@@ -7,7 +7,8 @@
     print(answer)
     answer.write("results")                     # diagnosis.json, diagnosis.html
 
-`Equations` and `Term` take text or SymPy expressions; `Run` holds the samples of one motion. Docs: disctrack/docs/systems.md.
+`Equations` and `Term` take text or SymPy expressions; `Run` holds the samples of one motion. The guide with all of it
+is disctrack/docs/systems.md.
 """
 
 from disctrack.diagnosis.equations import terms

@@ -47,7 +47,7 @@ def inputs_at(t, knots, pieces, u, u_rate):
     nogil=True,
 )
 def _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
-    """z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt."""
+    """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt."""
     n, k = len(f), len(columns)
     inputs_at(t, knots, pieces, u, u_rate)
     rhs(t, z[:n], p, u, u_rate, f, J, P)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -123,7 +121,7 @@ class Answer:
 
     @cached_property
     def whiteness(self) -> float:
-        """Probability that white noise has as much memory as what is left (Ljung and Box, all channels and stretches)."""
+        """Probability that white noise remembers as much as what is left (Ljung and Box, every channel and stretch)."""
         return _whiteness(self.asked.judged, self.system, self.diagnosis.after)
 
     @property
@@ -156,7 +154,7 @@ class Answer:
         for c in self.system.formulas.channels:
             b, a = self.before[c], self.after[c]
             lines.append(f"{f'rms of {c} [{self._unit(c)}]':<30}{b.rms:12.4g}{a.rms:12.4g}{a.noise:12.4g}")
-            lines.append(f"{f'  free run, held out':<30}{b.held_out:12.4g}{a.held_out:12.4g}")
+            lines.append(f"{'  free run, held out':<30}{b.held_out:12.4g}{a.held_out:12.4g}")
         chi = [f.reduced_chi_square / d.noise for f in (d.before, d.after)]
         lines.append(f"{'chi-square per degree':<30}{chi[0]:12.4g}{chi[1]:12.4g}{1:12}")
         lines += ["", f"{'fitted':<30}{'value':>14}{'sigma':>12}"]
@@ -171,6 +169,7 @@ class Answer:
     def document(self) -> dict[str, Any]:
         """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
         from disctrack.diagnosis.pages.general import document, fit_errors
+        from disctrack.files.json_text import plain
 
         d = self.diagnosis
         sides = []
@@ -186,21 +185,21 @@ class Answer:
             "runs": [{"name": s.name, "samples": len(s.time)} for s in self.system.stretches],
             "whiteness_p_value": self.whiteness,
         }
-        clean: dict[str, Any] = _finite(found)
-        return clean
+        return dict(plain(found))
 
     def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
         """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
-        from disctrack.diagnosis.equations.page import page
+        from disctrack.diagnosis.equations.page import written_page
         from disctrack.errors import OutputError
+        from disctrack.files.json_text import json_file
         from disctrack.files.whole import write_whole
 
         paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
         for path in paths:
             if path.exists() and not overwrite:
                 raise OutputError(f"{path}: exists. Choose another folder, or say overwrite=True.")
-        write_whole(paths[0], (json.dumps(self.document(), indent=1) + "\n").encode())
-        write_whole(paths[1], page(self).encode())
+        write_whole(paths[0], json_file(self.document()))
+        write_whole(paths[1], written_page(self, Path(folder))[0].encode())
         return paths
 
 
@@ -213,13 +212,3 @@ def _whiteness(judged: System, system: EquationSystem, fit: Fit) -> float:
             if len(x) > 4 * LAGS:
                 p_values.append(float(stats.chi2.sf(ljung_box(x[:, None])[0], LAGS)))
     return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
-
-
-def _finite(x: Any) -> Any:
-    if isinstance(x, dict):
-        return {k: _finite(v) for k, v in x.items()}
-    if isinstance(x, list | tuple):
-        return [_finite(v) for v in x]
-    if isinstance(x, np.generic):
-        x = x.item()
-    return None if isinstance(x, float) and not math.isfinite(x) else x

@@ -224,7 +224,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
         for key in names:
             if key not in known:
                 raise AnalysisError(f"run {name}, {what}: {unknown_name(key, known)}")
-    known_states = {k: tuple(v) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
+    known_states = {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
     knots, pieces = _inputs(equations, run, name, time - time[0])
     return Samples(
         name, 0, time - time[0], data, sigma, knots, pieces, run.hold != "smooth", dict(run.constants),

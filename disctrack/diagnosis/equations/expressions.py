@@ -5,18 +5,19 @@ from __future__ import annotations
 import difflib
 import keyword
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import sympy
 from sympy.parsing.sympy_parser import parse_expr
 
 from disctrack.errors import AnalysisError
 
-Formula = str | float | sympy.Expr
+Formula: TypeAlias = str | float | sympy.Expr
 
 FUNCTIONS = (
-    "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt sign Abs Min Max Piecewise Heaviside pi".split()
-)
+    "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign",
+    "Abs", "Min", "Max", "Piecewise", "Heaviside", "pi",
+)  # fmt: skip
 _KNOWN = {name: getattr(sympy, name) for name in FUNCTIONS} | {"abs": sympy.Abs}
 
 
@@ -35,7 +36,9 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
         try:
             found = parse_expr(formula, local_dict={**_KNOWN, **symbols}, global_dict=_globals())
         except Exception as error:
-            raise AnalysisError(f"{what}: cannot read {formula!r} ({error}). Write it as in '-k*x - c*v**2'.") from error
+            raise AnalysisError(
+                f"{what}: cannot read {formula!r} ({error}). Write it as in '-k*x - c*v**2'."
+            ) from error
         found = sympy.sympify(found)
     else:
         # a user's own symbols are meant by their names

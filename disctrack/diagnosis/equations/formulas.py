@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -64,12 +64,14 @@ class Formulas:
     def _compiled(self, name: str, formulas: Sequence[sympy.Expr], out: tuple[str, str, str]) -> Any:
         value, by_state, by_number = out
         targets = [(f"{value}[{i}]", e) for i, e in enumerate(formulas)]
-        targets += [(f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)]
+        targets += [
+            (f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)
+        ]
         fitted = [s for s, _ in self.fitted.values()]
         targets += [(f"{by_number}[{i}, {j}]", e.diff(s)) for i, e in enumerate(formulas) for j, s in enumerate(fitted)]
         arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
         source = source_of(name, [sympy.Symbol("t"), *arrays], targets, out)
-        return njit(kernel.RHS, error_model="numpy", nogil=True)(_executed(source, name))
+        return _compiled_source(source, name)
 
     @cached_property
     def is_late(self) -> bool:
@@ -104,6 +106,7 @@ class Formulas:
 
 def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str, Formula]) -> Formulas:
     """Read and check every formula. Raises AnalysisError."""
+
     def symbol(name: str) -> sympy.Symbol:
         return sympy.Symbol(name, real=True)
 
@@ -176,7 +179,9 @@ def _known(name: str, known: Mapping[str, Any], where: str) -> None:
         raise AnalysisError(f"{where}: {unknown_name(name, known)}")
 
 
-def _executed(source: str, name: str) -> Any:
+@lru_cache(maxsize=64)
+def _compiled_source(source: str, name: str) -> Any:
+    """The same equations are compiled once, however many runs are asked about."""
     scope = {k: getattr(math, k) for k in dir(math) if not k.startswith("_")}
     exec(source, scope)
-    return scope[name]
+    return njit(kernel.RHS, error_model="numpy", nogil=True)(scope[name])

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from disctrack.diagnosis.engine.fit import Fit, compress, fit
+from disctrack.diagnosis.engine.fit import compress, fit
 from disctrack.diagnosis.engine.score import Linearisation
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import System
 from disctrack.diagnosis.equations import terms as library
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
-from disctrack.diagnosis.equations.formulas import Formulas, formulas
+from disctrack.diagnosis.equations.formulas import formulas
 from disctrack.diagnosis.equations.noise import (
     Remembering,
     autoregression,
@@ -250,7 +250,7 @@ def _with_memory(
     coefficients, share = autoregression(residual, present, system.rows)
     if not coefficients.any():
         return None, None, ""
-    size = np.sqrt(np.sum(residual**2) / max(present.sum(), 1))
+    size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     remembering = Remembering(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values)
     if not base.converged:
@@ -265,8 +265,7 @@ def _with_memory(
     if diagnosis.verdict == "unexplained" and lasting * spacing > SLOW * min(turn(s) for s in system.stretches):
         # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
         reason = (
-            f"what is left is {np.sqrt(residual.var() * residual.size / max(present.sum(), 1)):.3g} times the noise and "
-            f"keeps its sign for {lasting * spacing:.2g} s: no sensor's noise"
+            f"what is left is {size:.3g} times the noise and lasts for {lasting * spacing:.2g} s: no sensor's noise"
         )
         again = replace(again, verdict="unexplained", reason=reason)
     return again, coefficients, text

@@ -121,8 +121,10 @@ def autoregression(residual: Array, present: NDArray[np.bool_], rows: Sequence[s
         a: Array = np.zeros(0)
         for order in range(top + 1):
             if order > 0:
-                k = (covariance[order] - a @ covariance[order - 1 : 0 : -1][: order - 1]) / variance if order > 1 else (
-                    covariance[1] / variance
+                k = (
+                    (covariance[order] - a @ covariance[order - 1 : 0 : -1][: order - 1]) / variance
+                    if order > 1
+                    else (covariance[1] / variance)
                 )
                 a = np.concatenate([a - k * a[::-1], [k]])
                 variance *= 1 - k * k

@@ -6,7 +6,6 @@ is led to longer and longer windows stays in it, for as long as the model can fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,7 +198,7 @@ class EquationSystem:
         return Prediction(out[0, :, :n], seen, derivative)
 
     def _instants(self, s: Samples, p: Array) -> tuple[Array, list[int], Array]:
-        """Derivatives (w, n_fitted, m) of the lateness, which group of instants each channel has, and the groups (g, m)."""
+        """Derivatives (w, n_fitted, m) of the lateness, each channel's group of instants, and the groups (g, m)."""
         if not self.formulas.is_late:
             return np.zeros((self._w, 0, 0)), [0] * self._w, s.time[None].copy()
         late, by_number = self.formulas.lateness(s.time, p)
@@ -236,7 +237,7 @@ def cut(samples: Sequence[Samples], duration: float) -> list[Samples]:
         count = max(1, int(np.ceil((s.time[-1] - s.time[0]) / duration * (1 - 1e-9))))
         edges = np.searchsorted(s.time, s.time[0] + (s.time[-1] - s.time[0]) * np.arange(count + 1) / count)
         edges[-1] = len(s.time)
-        found += [s.part(int(a), int(b), i) for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False)) if b - a >= 4]
+        found += [s.part(int(a), int(b), i) for i, (a, b) in enumerate(pairwise(edges)) if b - a >= 4]
     return found
 
 

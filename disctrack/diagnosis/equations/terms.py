@@ -46,7 +46,9 @@ def constant(v: str, name: str = "") -> Term:
 
 def spring(v: str, x: str, name: str = "") -> Term:
     """Linear spring on a coordinate."""
-    return Term(name or f"spring_{x}", {v: f"-k*({x})"}, parameters={"k": Parameter(0.0)}, title=f"linear spring on {x}")
+    return Term(
+        name or f"spring_{x}", {v: f"-k*({x})"}, parameters={"k": Parameter(0.0)}, title=f"linear spring on {x}"
+    )
 
 
 def asymmetric_spring(v: str, x: str, name: str = "") -> Term:
@@ -63,7 +65,9 @@ def cubic_spring(v: str, x: str, name: str = "") -> Term:
 
 def force(v: str, formula: str, name: str, title: str = "") -> Term:
     """Any formula of states, inputs and t, with an amount of its own."""
-    return Term(name, {v: f"amount*({formula})"}, parameters={"amount": Parameter(0.0)}, title=title or f"{formula} on {v}")
+    return Term(
+        name, {v: f"amount*({formula})"}, parameters={"amount": Parameter(0.0)}, title=title or f"{formula} on {v}"
+    )
 
 
 def periodic_force(v: str, frequency_hz: float, name: str = "") -> Term:
@@ -75,7 +79,7 @@ def periodic_force(v: str, frequency_hz: float, name: str = "") -> Term:
 
 
 def products(v: str, of: Sequence[str], degree: int = 3) -> tuple[Term, ...]:
-    """Every product of these states (inputs, formulas) up to a degree, each as a term of its own on the equation of v."""
+    """Every product of these states (inputs, formulas) up to a degree, each a term of its own on the equation of v."""
     found = []
     for d in range(1, degree + 1):
         for factors in combinations_with_replacement(of, d):

@@ -1,0 +1,264 @@
+"""Differential equations as systems: exact sensitivities, hidden terms named and sized, nothing claimed besides.
+
+Motions come from SciPy's `solve_ivp` with right-hand sides written here a second time.
+"""
+
+import json
+import re
+import time as clock
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+import disctrack
+from disctrack.diagnosis.equations import Equations, Parameter, Run, Term, diagnose, terms
+from disctrack.diagnosis.equations.declared import checked
+from disctrack.diagnosis.equations.formulas import formulas
+from disctrack.diagnosis.equations.noise import fast_part, step_of
+from disctrack.diagnosis.equations.system import EquationSystem
+from disctrack.errors import AnalysisError
+
+TIME = np.arange(870) * 0.01
+OSCILLATOR = Equations({"x": "v", "v": "-omega**2*x - 2*beta*v"}, {"omega": 11.0, "beta": 0.1}, units={"x": "m"})
+FIVE = [
+    terms.coulomb("v"), terms.quadratic("v"), terms.constant("v"), terms.cubic_spring("v", "x"),
+    terms.asymmetric_spring("v", "x"),
+]  # fmt: skip
+SIGMA = 2e-3
+
+
+def motion(rates, start, time, **options):
+    """States (n, m) by another integrator, at tolerances far below any noise here."""
+    span = (time[0], time[-1])
+    return solve_ivp(rates, span, start, t_eval=time, rtol=1e-10, atol=1e-12, method="DOP853", **options).y
+
+
+def swinging(extra, time=TIME):
+    """The oscillator with omega = 12, beta = 0.15 and something more."""
+    return motion(lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1] + extra(*y)], [1.0, 0.0], time)[0]
+
+
+def hidden_friction(x, v):
+    return -0.5 * np.tanh(v / 1e-3)
+
+
+def within(answer, name, truth, sigmas=3.5):
+    assert abs(answer.values[name] - truth) < sigmas * answer.sigmas[name], (name, answer.values[name])
+    return True
+
+
+@pytest.fixture(scope="module")
+def with_friction():
+    noise = SIGMA * np.random.default_rng(1).standard_normal(len(TIME))
+    return diagnose(OSCILLATOR, Run(TIME, {"x": swinging(hidden_friction) + noise}, sigma=SIGMA), FIVE)
+
+
+def test_sensitivities_are_those_of_another_integrator(rng):
+    equations = Equations(
+        {"x": "v", "v": "-k*x - c*v*abs(v) + g*push"}, {"k": 9.0, "c": 0.1, "g": Parameter(2.0, per_run=True)},
+        inputs=["push"], observed={"seen": "s*x + 0.1*v"}, constants={"s": 1.5},
+    )  # fmt: skip
+    offered = [
+        Term("clock", clock="r*t", parameters={"r": 0.0}),
+        Term("late", lag={"seen": "tau"}, parameters={"tau": 0.0}),
+    ]
+    time = np.sort(rng.uniform(0, 4, 60))
+    push = Run(time, {"seen": np.zeros(60)}, sigma=1.0, inputs={"push": np.sin(2 * time)}, name="a")
+    compiled = formulas(equations, offered, {"seen": "s*x + 0.1*v"})
+    (samples,) = checked(equations, [push])
+    system = EquationSystem(compiled, [samples], np.array([1.0, 3.0]), {}, promoted=("clock", "late"))
+    values = {"state.x[a]": 0.7, "state.v[a]": -0.4, "k": 9.3, "c": 0.2, "g[a]": 1.7, "clock.r": 0.01, "late.tau": 0.02}
+    from scipy.interpolate import CubicSpline
+
+    u = CubicSpline(samples.time, np.sin(2 * time))
+
+    def seen(v):
+        """The sensor, with an integrator of SciPy's."""
+        t = samples.time * (1 + v["clock.r"]) - v["late.tau"]
+        rates = lambda s, y: [y[1], -v["k"] * y[0] - v["c"] * y[1] * abs(y[1]) + v["g[a]"] * u(s)]  # noqa: E731
+        start = [v["state.x[a]"], v["state.v[a]"]]
+        ahead = solve_ivp(rates, (0, t[-1]), start, dense_output=True, rtol=1e-12, atol=1e-13, max_step=0.05).sol
+        back = solve_ivp(rates, (0, -0.1), start, dense_output=True, rtol=1e-12, atol=1e-13).sol
+        y = np.where(t < 0, back(np.minimum(t, 0)), ahead(np.maximum(t, 0)))
+        return 1.5 * y[0] + 0.1 * y[1]
+
+    names = list(values)
+    residual, derivative = system.linearise(values, names)
+    # 1e-10 a step; the kinks of |v| and the input's knots cost some digits
+    assert_allclose(-residual[:60, 0], seen(values), atol=2e-7)
+    for i, name in enumerate(names):
+        step = 1e-4
+        high, low = (seen(values | {name: values[name] + sign * step}) for sign in (1, -1))
+        central = (high - low) / (2 * step)
+        assert_allclose(derivative[:60, 0, i], central, atol=3e-4 * np.abs(central).max())
+
+
+def test_hidden_friction_is_named_and_sized(with_friction):
+    assert with_friction.verdict == "found"
+    assert with_friction.found == ("coulomb_v",)
+    assert within(with_friction, "coulomb_v.c", 0.5)
+    assert within(with_friction, "omega", 12.0)
+    assert within(with_friction, "beta", 0.15)
+    errors = with_friction.after["x"]
+    assert errors.rms == pytest.approx(SIGMA, rel=4 / np.sqrt(2 * 870))
+    assert with_friction.before["x"].held_out > 5 * errors.held_out
+
+
+def test_870_samples_and_five_terms_take_seconds():
+    noise = SIGMA * np.random.default_rng(5).standard_normal(len(TIME))
+    begun = clock.process_time()  # the integrator has been compiled; the equations are compiled anew
+    answer = diagnose(OSCILLATOR, Run(TIME, {"x": swinging(lambda x, v: -20 * x**3) + noise}), FIVE)
+    assert clock.process_time() - begun < 5.0
+    assert answer.found == ("cubic_spring_x",)
+    assert within(answer, "cubic_spring_x.k", 20.0)
+
+
+def test_nothing_is_claimed_where_nothing_is():
+    x = swinging(lambda x, v: 0.0)
+    for seed in range(4):
+        noise = SIGMA * np.random.default_rng(seed).standard_normal(len(TIME))
+        answer = diagnose(OSCILLATOR, Run(TIME, {"x": x + noise}), FIVE)
+        assert answer.verdict == "nothing missing"
+        assert within(answer, "omega", 12.0)
+
+
+def test_runs_share_laws_and_have_constants_lengths_and_starts_of_their_own(rng):
+    runs = []
+    for i, (height, per_mass) in enumerate(((20.0, 0.02), (25.0, 0.01), (30.0, 0.04))):
+        time = np.arange(90 + 10 * i) / 60.0
+        h = motion(lambda t, y, k=per_mass: [y[1], -9.81 - k * y[1] * abs(y[1])], [height, -1.0], time)[0]
+        h[10:14] = np.nan
+        runs.append(Run(time, {"h": h + 0.005 * rng.standard_normal(len(h))}, constants={"per_mass": per_mass / 0.02}))
+    fall = Equations({"h": "v", "v": "-9.81"}, constants={"per_mass": 1.0}, units={"h": "m"})
+    drag = Term("drag", {"v": "-c*per_mass*abs(v)*v"}, parameters={"c": Parameter(0.0, lower=0.0)})
+    answer = diagnose(fall, runs, [drag, terms.quadratic("v"), terms.viscous("v"), terms.constant("v")])
+    assert answer.found == ("drag",)  # one law for three balls, not the one that ignores what is declared of them
+    assert within(answer, "drag.c", 0.02)
+
+
+def test_a_mass_matrix_is_solved():
+    """A double pendulum in which the forces are declared, beside its accelerations written out by hand."""
+    equations = Equations(
+        {"a": "p", "b": "q", "p": "-sin(a - b)*q**2 - 2*g*sin(a)", "q": "sin(a - b)*p**2 - g*sin(b)"},
+        {"g": 9.7}, mass={("p", "p"): 2.0, ("p", "q"): "cos(a - b)"},
+    )  # fmt: skip
+
+    def rates(t, y):
+        a, b, p, q = y
+        d, g = a - b, 9.81
+        bottom = 2 - np.cos(d) ** 2
+        dp = (-np.sin(d) * q**2 - 2 * g * np.sin(a) - np.cos(d) * (np.sin(d) * p**2 - g * np.sin(b))) / bottom
+        dq = (2 * (np.sin(d) * p**2 - g * np.sin(b)) + np.cos(d) * (np.sin(d) * q**2 + 2 * g * np.sin(a))) / bottom
+        return [p, q, dp, dq]
+
+    time = np.arange(0, 4, 0.01)
+    y = motion(rates, [0.9, -0.4, 0.0, 0.0], time)
+    noise = 1e-3 * np.random.default_rng(3).standard_normal((2, len(time)))
+    answer = diagnose(
+        equations, Run(time, {"a": y[0] + noise[0], "b": y[1] + noise[1]}, sigma=1e-3), [terms.viscous("p")]
+    )
+    assert answer.verdict == "nothing missing"
+    assert within(answer, "g", 9.81)
+
+
+def test_noise_that_remembers_is_no_effect_and_widens_sigmas():
+    """An autoregression of 0.9: for its white share alone the sigmas would be four times too small."""
+    x, pulls, claims = swinging(lambda x, v: 0.0), [], 0
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        white = rng.standard_normal(len(TIME) + 100)
+        noise = np.zeros(len(white))
+        for i in range(1, len(white)):
+            noise[i] = 0.9 * noise[i - 1] + white[i]
+        answer = diagnose(OSCILLATOR, Run(TIME, {"x": x + SIGMA * noise[100:]}), FIVE)
+        claims += bool(answer.found)
+        pulls.append((answer.values["omega"] - 12.0) / answer.sigmas["omega"])
+        assert any("remembers" in note for note in answer.notes)
+    assert claims == 0
+    assert np.sqrt(np.mean(np.square(pulls))) < 2.0  # of five standard normals: exceeded once in 10 000
+
+
+def test_what_no_term_describes_is_unexplained():
+    noise = SIGMA * np.random.default_rng(7).standard_normal(len(TIME))
+    pushed = motion(
+        lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1] + 20 * np.exp(-(((t - 4) / 0.05) ** 2))], [1.0, 0.0], TIME,
+        max_step=0.02,
+    )[0]  # fmt: skip
+    answer = diagnose(OSCILLATOR, Run(TIME, {"x": pushed + noise}, sigma=SIGMA), FIVE)
+    assert answer.verdict == "unexplained"
+
+
+def test_parameters_that_cannot_be_parted_are_held_and_named():
+    equations = Equations({"x": "v", "v": "-(stiffness/mass)*x"}, {"stiffness": 140.0, "mass": 1.0})
+    noise = SIGMA * np.random.default_rng(2).standard_normal(len(TIME))
+    answer = diagnose(equations, Run(TIME, {"x": np.cos(12 * TIME) + noise}, sigma=SIGMA), [terms.coulomb("v")])
+    assert answer.verdict == "nothing missing"
+    assert any("cannot be told from" in note for note in answer.notes)
+    ratio = [answer.diagnosis.after.values.get(n, d) for n, d in (("stiffness", 140.0), ("mass", 1.0))]
+    assert ratio[0] / ratio[1] == pytest.approx(144.0, rel=1e-4)
+
+
+def test_the_noise_of_a_channel_is_found_in_its_data(rng):
+    smooth = np.sin(2 * np.pi * np.arange(4000) / 200)
+    assert fast_part([smooth + 0.01 * rng.standard_normal(4000)]) == pytest.approx(0.01, rel=0.06)
+    assert step_of([np.round(smooth / 0.005) * 0.005]) == pytest.approx(0.005)
+    assert step_of([smooth + 0.01 * rng.standard_normal(4000)]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("declare", "message"),
+    [
+        (lambda: diagnose(Equations({"x": "-kk*x"}, {"k": 1.0}), Run(TIME, {"x": TIME})), "did you mean 'k'"),
+        (lambda: diagnose(Equations({"x": "-k*x"}, {"k": 1.0}), Run(TIME, {"y": TIME})), "is a state"),
+        (lambda: diagnose(Equations({"x": "-k*x"}, {"k": 1.0}), Run(TIME[::-1], {"x": TIME})), "increasing times"),
+        (lambda: diagnose(Equations({"x": "-k*x"}, {"k": 1.0}), Run(TIME, {"x": TIME[1:]})), "869 values for 870"),
+        (lambda: diagnose(Equations({"x": "-k*x+u"}, {"k": 1.0}, inputs=["u"]), Run(TIME, {"x": TIME})), "input 'u'"),
+        (lambda: Equations({"lambda": "1"}), "cannot use this name"),
+        (lambda: Equations({"x": "-x("}, {"x": 1.0}), "declared twice"),
+        (lambda: diagnose(Equations({"x": "-x("}), Run(TIME, {"x": TIME})), "cannot read"),
+        (lambda: diagnose(Equations({"x": "foo(x)"}), Run(TIME, {"x": TIME})), "foo"),
+        (lambda: diagnose(OSCILLATOR, Run(TIME, {"x": TIME}), [Term("a", {"w": "1"})]), "term a, rates"),
+        (lambda: diagnose(OSCILLATOR, Run(TIME, {"x": TIME}, start={"w": 1.0})), "start"),
+    ],
+)  # fmt: skip
+def test_what_is_declared_wrongly_is_named(declare, message):
+    with pytest.raises(AnalysisError, match=re.escape(message)):
+        declare()
+
+
+def test_the_answer_is_written_as_json_and_as_a_page(with_friction, tmp_path):
+    paths = with_friction.write(tmp_path)
+    found = json.loads(paths[0].read_text())
+    assert {"verdict", "sentence", "effects", "before", "after", "tried", "notes", "runs"} <= set(found)
+    assert found["effects"][0]["name"] == "coulomb_v"
+    assert found["after"]["channels"]["x"]["rms"] < found["before"]["channels"]["x"]["rms"]
+    assert "dry friction" in paths[1].read_text()
+    assert "dry friction" in str(with_friction)
+
+
+def snippets():
+    page = Path(disctrack.__file__).parent / "docs" / "systems.md"
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_every_snippet_of_the_documentation_runs(capsys):
+    scope: dict = {}
+    for code in snippets():
+        exec(compile(code, "systems.md", "exec"), scope)
+    assert "dry friction" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_false_alarms_are_as_rare_as_stated():
+    """One in 200 searches may claim something; of 120 more than four would be as rare as one in 250."""
+    x, claims, pulls = swinging(lambda x, v: 0.0), 0, []
+    for seed in range(120):
+        noise = SIGMA * np.random.default_rng(seed).standard_normal(len(TIME))
+        answer = diagnose(OSCILLATOR, Run(TIME, {"x": x + noise}), FIVE)
+        claims += bool(answer.found)
+        pulls.append((answer.values["omega"] - 12.0) / answer.sigmas["omega"])
+    assert claims <= 4
+    assert np.std(pulls) == pytest.approx(1.0, abs=4 / np.sqrt(240))
