@@ -19,7 +19,7 @@ from disctrack.analyse.propagation import Series, common_sigma
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
-from disctrack.files.trajectory_file import read_provenance, read_setup, read_trajectory, write_group
+from disctrack.files.trajectory_file import Group, read_provenance, read_setup, read_trajectory, write_groups
 from disctrack.frames import euler_jacobian
 
 Array = NDArray[np.float64]
@@ -108,44 +108,42 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
     def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
         return {name: _at_full_length(item, len(file_time), first) for name, item in variables.items()}
 
-    motion = whole(_motion_variables(analysis))
-    write_group(path, "motion", motion, axes=_state_axes(), attributes=_motion_attributes(analysis))
-    onset, circle = analysis.contact.onset, analysis.contact.circle
-    write_group(
-        path,
-        "contact",
-        whole(_series_variables(analysis.contact.series)),
-        attributes={
-            "rolling_onset_s": onset.time,
-            "rolling_onset_low_s": onset.low,
-            "rolling_onset_high_s": onset.high,
-            "rolling_probability": onset.probability,
-            "rolling_verdict": onset.verdict,
-            "slip_distance_m": onset.slip_distance,
-            "slip_distance_sigma_m": onset.slip_distance_sigma,
-            "locus_circle_radius_m": circle.radius,
-            "locus_circle_radius_sigma_m": circle.sigma,
-            "locus_circle_radius_sigma_calibration_m": circle.sigma_calibration,
-            "locus_circle_expected_radius_m": circle.expected,
-            "locus_circle_centre_m": circle.centre,
-            "locus_circle_interval_s": np.array([circle.start, circle.end]),
-        },
-    )
-    energy = analysis.energy
-    write_group(
-        path,
-        "energy",
-        whole(_series_variables(energy.series)),
-        attributes={
-            "loss_J": energy.loss,
-            "loss_sigma_J": energy.loss_sigma,
-            "loss_sigma_calibration_J": energy.loss_sigma_calibration,
-            "precession_level_over_4g_r": energy.level_ratio,
-            "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
-            "precession_level_over_4g_r_steady": energy.level_ratio_steady,
-        },
-    )
-    _write_scaling(path, analysis.scaling)
+    onset, circle, energy = analysis.contact.onset, analysis.contact.circle, analysis.energy
+    groups = {
+        "motion": Group(whole(_motion_variables(analysis)), _motion_attributes(analysis)),
+        "contact": Group(
+            whole(_series_variables(analysis.contact.series)),
+            {
+                "rolling_onset_s": onset.time,
+                "rolling_onset_low_s": onset.low,
+                "rolling_onset_high_s": onset.high,
+                "rolling_probability": onset.probability,
+                "rolling_verdict": onset.verdict,
+                "slip_distance_m": onset.slip_distance,
+                "slip_distance_sigma_m": onset.slip_distance_sigma,
+                "locus_circle_radius_m": circle.radius,
+                "locus_circle_radius_sigma_m": circle.sigma,
+                "locus_circle_radius_sigma_calibration_m": circle.sigma_calibration,
+                "locus_circle_expected_radius_m": circle.expected,
+                "locus_circle_centre_m": circle.centre,
+                "locus_circle_interval_s": np.array([circle.start, circle.end]),
+            },
+        ),
+        "energy": Group(
+            whole(_series_variables(energy.series)),
+            {
+                "loss_J": energy.loss,
+                "loss_sigma_J": energy.loss_sigma,
+                "loss_sigma_calibration_J": energy.loss_sigma_calibration,
+                "precession_level_over_4g_r": energy.level_ratio,
+                "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
+                "precession_level_over_4g_r_steady": energy.level_ratio_steady,
+            },
+        ),
+        "scaling": _scaling_group(analysis.scaling),
+    }
+    axis = Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")
+    write_groups(path, groups, axes={**_state_axes(), "scaling_window": axis})
 
 
 def _at_full_length(item: Variable, n: int, first: int) -> Variable:
@@ -227,7 +225,7 @@ def _motion_attributes(analysis: Analysis) -> dict[str, object]:
     }
 
 
-def _write_scaling(path: Path, scaling: Scaling) -> None:
+def _scaling_group(scaling: Scaling) -> Group:
     fits = scaling.by_window
     dims = ("scaling_window",)
     variables = {}
@@ -255,5 +253,4 @@ def _write_scaling(path: Path, scaling: Scaling) -> None:
         attributes[name] = exponent.value
         attributes[f"{name}_sigma"] = exponent.sigma
         attributes[f"{name}_confidence_95"] = np.array([exponent.low, exponent.high])
-    axis = Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")
-    write_group(path, "scaling", variables, axes={"scaling_window": axis}, attributes=attributes)
+    return Group(variables, attributes)

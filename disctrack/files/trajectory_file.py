@@ -1,7 +1,7 @@
 """The trajectory file: HDF5 that explains itself, written whole, and read back equal.
 
 Layout (axes in brackets): at the root time, frame, x y z psi theta phi with their sigmas, quaternion, pose_covariance,
-reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_group`).
+reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_groups`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import io
 import json
 import platform
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ import disctrack
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError
-from disctrack.files.labelled_arrays import Variable, flags, read_variables, write_variables
+from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
 from disctrack.files.whole import write_whole
 from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -118,6 +118,14 @@ def is_result_of(path: Path, provenance: Provenance) -> bool:
         return False
 
 
+@dataclass(frozen=True)
+class Group:
+    """What a stage adds to a trajectory file."""
+
+    variables: Mapping[str, Variable]
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
 def write_group(
     path: Path,
     group: str,
@@ -125,20 +133,25 @@ def write_group(
     axes: Mapping[str, Variable] | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add a stage's group to a trajectory file, or replace it; all else stays. The file is whole at every instant.
+    """Add a stage's group to a trajectory file, or replace it; as `write_groups`."""
+    write_groups(path, {group: Group(variables, attributes or {})}, axes)
 
-    axes : those that the file's root does not have yet
+
+def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Variable] | None = None) -> None:
+    """Add groups of a stage to a trajectory file, all or none; older ones of these names go, and all else stays.
+
+    The file is written anew without what was replaced: it does not grow, and is whole at every instant.
+    axes : those that only these groups use
     Raises TrajectoryFileError, OutputError.
     """
-    with _Reading(path):  # a complete trajectory file, or an error
-        pass
-    buffer = io.BytesIO(path.read_bytes())
-    with h5py.File(buffer, "r+", track_order=True) as file:
-        if group in file:
-            del file[group]
-        created = file.create_group(group, track_order=True)
-        write_variables(created, variables, axes)
-        created.attrs.update(dict(attributes or {}))
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", track_order=True) as file:
+        with _Reading(path) as old:
+            copy_without(old, file, groups, axes or {})
+        for name, group in groups.items():
+            created = file.create_group(name, track_order=True)
+            write_variables(created, group.variables, axes)
+            created.attrs.update(dict(group.attributes))
     write_whole(path, buffer.getbuffer(), adds_to_input=True)
 
 

@@ -23,6 +23,7 @@ from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
 from disctrack.files import trajectory_file as storage
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.trajectory_file import (
+    Group,
     Provenance,
     is_result_of,
     read_group,
@@ -30,6 +31,7 @@ from disctrack.files.trajectory_file import (
     read_trajectory,
     write_csv,
     write_group,
+    write_groups,
     write_trajectory,
 )
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
@@ -220,6 +222,44 @@ def test_a_stage_adds_its_group_and_leaves_the_rest_untouched(file, trajectory):
     assert attributes["window_s"] == 0.01
     assert_equal(read_trajectory(file), trajectory)
     assert is_result_of(file, PROVENANCE)
+
+
+def series(trajectory, n, axis="window"):
+    speed = Variable(np.arange(len(trajectory), dtype=float), ("time",), "m/s", "speed")
+    return {"speed": speed, "fit": Variable(np.arange(float(n)), (axis,), "1", "fitted in each window")}
+
+
+def test_replacing_groups_again_and_again_does_not_let_the_file_grow(file, trajectory):
+    sizes = []
+    for n in (5, 5, 7, 5):  # an axis that only these groups use may change its length
+        axis = {"window": Variable(np.arange(float(n)), ("window",), "s", "window")}
+        groups = {name: Group(series(trajectory, n), {"n": n}) for name in ("motion", "scaling")}
+        write_groups(file, groups, axis)
+        sizes.append(file.stat().st_size)
+        assert len(read_group(file, "motion")[0]["fit"]) == n
+    assert sizes[1] == sizes[3] <= sizes[0]
+    write_groups(file, {"other": Group({"fit": series(trajectory, 5)["fit"]})})  # the axis is shared from here on
+    with pytest.raises(ValueError, match="window of 5"):
+        write_groups(file, {name: Group(series(trajectory, 6)) for name in ("motion", "scaling")},
+                     {"window": Variable(np.arange(6.0), ("window",), "s", "window")})  # fmt: skip
+    assert_equal(read_trajectory(file), trajectory)
+    with h5py.File(file) as h5:
+        assert h5["motion/fit"].dims[0][0].name == "/window" == h5["other/fit"].dims[0][0].name
+        assert h5["markers/centre_px"].dims[1][0].name == "/camera"
+
+
+def test_groups_of_a_stage_are_written_together_or_not_at_all(file, trajectory, monkeypatch):
+    from disctrack.files import trajectory_file
+
+    axis = {"window": Variable(np.arange(5.0), ("window",), "s", "window")}
+    before, writes = file.read_bytes(), []
+    monkeypatch.setattr(trajectory_file, "write_whole", lambda *arguments, **how: writes.append(arguments))
+    write_groups(file, {name: Group(series(trajectory, 5)) for name in ("motion", "contact", "energy")}, axis)
+    assert len(writes) == 1
+    assert file.read_bytes() == before
+    with pytest.raises(ValueError, match="no axis nowhere"):
+        write_groups(file, {"motion": Group(series(trajectory, 5, "nowhere"))}, axis)
+    assert len(writes) == 1
 
 
 def test_a_missing_group_is_told_with_those_that_are_there(file):
