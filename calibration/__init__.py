@@ -22,6 +22,7 @@ _ON_DEMAND = {
     "chessboard": ("BoardNotFound", "CornerView", "find_corners"),
     "refinement": ("refine_stereo",),
     "stereo_model": ("Observations", "StereoModel", "Terms"),
+    "tolerances": ("BoardTolerances",),
     "stereo": ("CalibrationSettings", "StereoCalibration", "calibrate_from_corners", "calibrate_stereo"),
 }
 
@@ -36,6 +37,7 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "Board",
     "BoardNotFound",
+    "BoardTolerances",
     "CalibrationError",
     "CalibrationSettings",
     "Camera",

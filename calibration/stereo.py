@@ -20,6 +20,7 @@ from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
 from calibration.table_frame import rig_with_covariance
+from calibration.tolerances import BoardTolerances, with_tolerances
 
 CAMERA_NAMES = ("left", "right")
 MAX_LOST = 0.3  # share of one image's corners that do not fit the others: beyond, the view as a whole is at fault
@@ -35,6 +36,7 @@ class CalibrationSettings:
     board: str = "auto"  # or one of refinement.BOARD_MODELS
     equal_aspect: bool = False  # fx = fy
     threads: int = 2
+    tolerances: BoardTolerances = field(default_factory=BoardTolerances)
 
     def __post_init__(self) -> None:
         if self.distortion not in ("auto", *DISTORTION_MODELS):
@@ -229,10 +231,11 @@ def calibrate_from_corners(
     report("judging")
     inflation = max(consistency_factor(refinement), 1.0)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation)
+    with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances)
     halves = half_set_differences(refinement, inflation)
     assessment = assess(refinement, candidates, rig, table_view, inflation, halves)
     return StereoCalibration(
-        rig=rig,
+        rig=with_board,
         refinement=refinement,
         board=board,
         board_points=refinement.model.points,

@@ -47,6 +47,7 @@ class CalibrationSource:
                 "distortion": self.settings.distortion,
                 "board": self.settings.board,
                 "equal_aspect": self.settings.equal_aspect,
+                "tolerances": dataclasses.asdict(self.settings.tolerances),
             },
         )
 
@@ -74,7 +75,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
         Board(chessboard.inner_corners, chessboard.square),
         table.view,
         table.board_thickness,
-        settings,
+        dataclasses.replace(settings, tolerances=recording.board_tolerances),
     )
 
 

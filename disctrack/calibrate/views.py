@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from numpy.typing import NDArray
@@ -127,6 +127,7 @@ def calibrate_recording(
         )
     views = find_views(chessboard.left, chessboard.right, recording.folder)
     board = Board(chessboard.inner_corners, chessboard.square)
+    settings = replace(settings or CalibrationSettings(), tolerances=recording.board_tolerances)
     return calibrate_views(views, board, table.view, table.board_thickness, settings, progress)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calibration.tolerances import BoardTolerances
 from disctrack.disc import Disc, disc_from_mm
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep
@@ -22,8 +23,16 @@ KEYS: dict[str, tuple[str, ...]] = {
     "cameras": ("frame_rate_hz", "left", "right"),
     "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm"),
     "markers": ("diameter_mm", "centres_mm"),
-    "calibration": ("left", "right", "inner_corners", "square_mm", "rig"),
-    "table": ("view", "board_thickness_mm", "from"),
+    "calibration": (
+        "left",
+        "right",
+        "inner_corners",
+        "square_mm",
+        "rig",
+        "square_tolerance_mm",
+        "flatness_tolerance_mm",
+    ),
+    "table": ("view", "board_thickness_mm", "from", "board_thickness_tolerance_mm"),
     "gravity": ("g_m_s2",),
 }
 
@@ -32,6 +41,9 @@ OPTIONAL = {
     ("disc", "radius_tolerance_mm"),
     ("disc", "thickness_tolerance_mm"),
     ("calibration", "rig"),
+    ("calibration", "square_tolerance_mm"),
+    ("calibration", "flatness_tolerance_mm"),
+    ("table", "board_thickness_tolerance_mm"),
     ("table", "from"),
 }
 
@@ -69,6 +81,7 @@ class Recording:
     table: TableView | None  # None only where a rig file brings the lab frame with it
     rig_file: Path | None
     gravity: float  # [m/s^2]
+    board_tolerances: BoardTolerances
     declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
 
     @property
@@ -102,6 +115,7 @@ def read_recording(path: str | Path) -> Recording:
         chessboard=chessboard,
         table=_table(file, declared, required=rig_file is None),
         rig_file=rig_file,
+        board_tolerances=_tolerances(file, declared),
         gravity=_Section(file, declared, "gravity").get("g_m_s2", _positive),
         declared=declared,
     )
@@ -295,6 +309,21 @@ def _calibration_source(section: _Section) -> tuple[ChessboardViews | None, Path
     left, right = section.get("left", _pattern), section.get("right", _pattern)
     corners = section.get("inner_corners", _corner_counts)
     return ChessboardViews(left, right, corners, section.get("square_mm", _positive) * 1e-3), None
+
+
+def _tolerances(file: Path, declared: Mapping[str, Any]) -> BoardTolerances:
+    """What is not declared takes its default."""
+    given: dict[str, float] = {}
+    calibration = _Section(file, declared, "calibration")
+    if "square_tolerance_mm" in calibration and "square_mm" in calibration:
+        given["square"] = calibration.get("square_tolerance_mm", _not_negative) / calibration.get(
+            "square_mm", _positive
+        )
+    if "flatness_tolerance_mm" in calibration:
+        given["flatness"] = calibration.get("flatness_tolerance_mm", _not_negative) * 1e-3
+    if "board_thickness_tolerance_mm" in declared.get("table", {}):
+        given["thickness"] = _Section(file, declared, "table").get("board_thickness_tolerance_mm", _not_negative) * 1e-3
+    return BoardTolerances(**given)
 
 
 def _table(file: Path, declared: Mapping[str, Any], required: bool) -> TableView | None:

@@ -211,6 +211,8 @@ right = "right/*.png"
 radius_mm = {scene.disc.radius_mm!r}
 thickness_mm = {scene.disc.thickness_mm!r}
 mass_g = {scene.disc.mass_g!r}
+radius_tolerance_mm = 0.0       # here, what is declared is exact
+thickness_tolerance_mm = 0.0
 
 [markers]                       # black dots on the white paper of the disc's upper face (z = +h)
 diameter_mm = {scene.markers.diameter_mm!r}
@@ -221,10 +223,13 @@ left = "calibration/left/*.png"
 right = "calibration/right/*.png"
 inner_corners = [{board.inner_corners[0]}, {board.inner_corners[1]}]  # along the long side, along the short side
 square_mm = {board.square_mm!r}
+square_tolerance_mm = 0.0
+flatness_tolerance_mm = 0.0
 
 [table]                         # the lab frame: k up from the table, which is z = 0
 view = 0                        # in this calibration view the board lies flat on the table
 board_thickness_mm = {board.thickness_mm!r}        # its printed face is at that height
+board_thickness_tolerance_mm = 0.0
 
 [gravity]
 g_m_s2 = {scene.gravity_m_s2!r}

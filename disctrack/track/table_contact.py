@@ -35,8 +35,6 @@ THETA_RANGE = np.radians(0.7), np.radians(85.0)
 MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
 NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that is more
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
-# Of a board on a table, where the rig's covariance does not tell; for the weights of board and disc alone.
-BOARD_HEIGHT, BOARD_SLOPE = 20e-6, 5e-4  # [m], [rad]: thickness and flatness of 20 um, over 40 mm
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
 _CAMERAS = slice(24, 30)  # of RIG_PARAMETERS: the world as the left camera sees it
 
@@ -51,7 +49,7 @@ class TableFromDisc:
     sigma: Array  # (3,) of the plane by the disc: noise, what repeats, tolerances of the disc
     board_sigma: Array  # (3,) of the table by the board, the rig's covariance
     applied: Array  # (3,) by which the world was moved
-    probability: float  # that board and disc differ by as much, with BOARD_HEIGHT and BOARD_SLOPE in the board's sigma
+    probability: float  # that board and disc differ by as much if both sigmas are right
     scatter: float  # [m] of the gaps about the plane
     n_frames: int
 
@@ -91,10 +89,10 @@ def table_from_disc(
     V = noise + np.outer(by_radius, by_radius) + 4.0 * np.outer(by_thickness, by_thickness)
     stated = V - 3.0 * np.outer(by_thickness, by_thickness)
     board = H @ rig.covariance @ H.T
-    usual = np.array([BOARD_HEIGHT, BOARD_SLOPE, BOARD_SLOPE])
-    difference = np.linalg.solve(board + V + np.diag(usual**2), plane) @ plane
-    # where they differ by more, it is by what they do that the board lies off
-    weigh = rig.covariance + M @ np.diag(np.maximum(usual, np.abs(plane)) ** 2) @ M.T
+    difference = np.linalg.solve(board + V, plane) @ plane
+    # where they differ by more than both sigmas, it is the board that bends and lies on dust
+    more = np.maximum(plane**2 - np.diag(board + V), 0.0)
+    weigh = rig.covariance + M @ np.diag(more) @ M.T
     gains = {"board": np.zeros((3, 3)), "disc": np.eye(3)}
     gain = gains[source] if source in gains else back @ weigh @ H.T @ np.linalg.inv(H @ weigh @ H.T + V)
     applied = gain @ plane

@@ -39,7 +39,7 @@ from disctrack.track.dots import (
 from disctrack.track.motion_span import StillScene
 from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses
-from disctrack.track.table_contact import BOARD_HEIGHT, BOARD_SLOPE, TableFromDisc, table_from_disc
+from disctrack.track.table_contact import TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
@@ -752,9 +752,8 @@ def _warnings(
     if table is not None and table.probability < DISAGREE:
         warnings.append(
             f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
-            f"a board's usual {BOARD_HEIGHT * 1e6:.0f} um and {np.degrees(BOARD_SLOPE) * 1e3:.0f} mdeg: the board is "
-            "bowed or its thickness is another, the disc's radius or thickness is, or the cameras moved together since "
-            "the table view"
+            "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
+            "is, or the cameras moved together since the table view"
         )
     gap = _table_gap(trajectory)
     if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:

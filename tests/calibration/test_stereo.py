@@ -22,10 +22,12 @@ from calibration.camera import rotation_from_vector, triangulate
 from calibration.images import calibrate_files, find_pairs
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.table_frame import table_pose
+from calibration.tolerances import BoardTolerances
 
 BOARD = Board((7, 4), 9e-3)
 THICKNESS = 2e-3
-FLAT = CalibrationSettings(distortion="k1", board="flat")
+EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)  # what is declared of a drawn board is true
+FLAT = CalibrationSettings(distortion="k1", board="flat", tolerances=EXACT)
 
 
 def small_scene(scene_maker, **options):
