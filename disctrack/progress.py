@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -16,23 +17,37 @@ from tqdm import tqdm
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Function that is told how many more are done; the bar vanishes at the end, and never goes beyond its end."""
+    """Function that is told how many more are done. The bar vanishes at the end; a line with the time stays.
+
+    What is reported beyond the total is not shown.
+    """
+    began = time.perf_counter()
     with tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
         yield lambda n: bar.update(max(0, min(n, total - bar.n))) and None
+    _tell(began, f"{what}: {total} {unit}{'' if total == 1 else 's'}")
 
 
 @contextlib.contextmanager
 def stage(what: str) -> Iterator[None]:
-    """Name the stage while it lasts (terminals only), and write a line with its time when it has ended well."""
-    began = time.perf_counter()
+    """Name the stage and its age while it lasts (terminals only), and write a line with its time when it ends well."""
+    began, over = time.perf_counter(), threading.Event()
+
+    def tick() -> None:
+        while not over.wait(1.0):
+            _show(f"{what} ... {time.perf_counter() - began:.0f} s")
+
     _show(f"{what} ...")
+    ticking = threading.Thread(target=tick, daemon=True) if sys.stderr.isatty() else None
+    if ticking is not None:
+        ticking.start()
     try:
         yield
-    except BaseException:
+    finally:
+        over.set()
+        if ticking is not None:
+            ticking.join()
         _show("")
-        raise
-    _show("")
-    print(f"{time.perf_counter() - began:7.1f} s  {what}", file=sys.stderr, flush=True)
+    _tell(began, what)
 
 
 @contextlib.contextmanager
@@ -46,3 +61,7 @@ def _show(text: str) -> None:
     """One line that the next one replaces; nothing where stderr is no terminal."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _tell(began: float, what: str) -> None:
+    print(f"{time.perf_counter() - began:7.1f} s  {what}", file=sys.stderr, flush=True)

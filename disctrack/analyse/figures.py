@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import Series
+from disctrack.disc import MA_2014
 from disctrack.pages.figures import Drawn, dress
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
@@ -204,11 +205,13 @@ def contact_locus(analysis: Analysis) -> Drawn | None:
     axes.set(xlabel="x (mm)", ylabel="y (mm)")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=9)
+    same_disc = np.isclose(analysis.trajectory.disc.radius, MA_2014.radius)
     caption = (
         f"Contact point from {circle.start:.3f} to {circle.end:.3f} s with the fitted circle: radius "
         f"{1e3 * circle.radius:.4f} ± {1e3 * circle.sigma:.4f} mm (scatter) ± {1e6 * circle.sigma_calibration:.2g} µm "
         f"(calibration). With the centre at rest it would be r cos θ - h sin θ = {1e3 * circle.expected:.4f} mm on "
-        f"average; the locus departs from the circle by {1e3 * circle.rms:.3f} mm rms. The paper found 37.286 mm."
+        f"average; the locus departs from the circle by {1e3 * circle.rms:.3f} mm rms."
+        + (" Ma et al. (2014) found 37.286 mm with a disc of this radius." if same_disc else "")
     )
     return Drawn("09_contact_locus", "Locus of the contact", caption, figure)
 

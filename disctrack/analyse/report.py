@@ -21,6 +21,8 @@ from disctrack.trajectory import FrameStatus
 
 Array = NDArray[np.float64]
 
+# Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
+ASYMPTOTIC_BELOW = np.radians(1.0)
 GOAL_POSITION, GOAL_ROTATION = 2e-6, np.radians(3e-3)  # [m], [rad] error of the lab frame, calibration included
 SECTIONS = (
     ("Quality of the measurement", ("03",)),
@@ -168,15 +170,15 @@ def _exponents_table(analysis: Analysis) -> str:
     laws = analysis.scaling.laws
     if not laws.determined:
         return paragraph(f"No exponents are given: {laws.reason}.")
+    theta = _largest_nutation(analysis)
+    asymptotic = theta <= ASYMPTOTIC_BELOW
     rows = []
     for name, exponent, of_theta in (
         ("energy", laws.n_energy, 1.0),
         ("nutation", laws.n_theta, 1.0),
         ("precession rate", laws.n_psidot, -0.5),
     ):
-        agree = [
-            f"{of_theta * n:.3f} {'yes' if exponent.agrees_with(of_theta * n) else 'no'}" for _, n in MODEL_EXPONENTS
-        ]
+        agree = [_agreement(exponent, of_theta * n, asymptotic) for _, n in MODEL_EXPONENTS]
         rows.append((name, _plus_minus(exponent), f"{exponent.low:.4f} to {exponent.high:.4f}", *agree))
     first, last = laws.window
     said = (
@@ -185,8 +187,29 @@ def _exponents_table(analysis: Analysis) -> str:
         f"{5e-3 * laws.n_theta_per_t_f:.3f}. The confidence is that of a power law over this window; how far the law "
         "itself bends shows in the dependence on the window."
     )
+    if not asymptotic:
+        said += (
+            f" The models' exponents hold for a nutation that goes to zero. Here it reaches {np.degrees(theta):.2f} "
+            f"degrees, more than {np.degrees(ASYMPTOTIC_BELOW):.0f}: the same law then has another slope, so that "
+            "agreement is marked where it is found and disagreement is not."
+        )
     header = ("exponent of", "value", "95 % confidence", *(name.split(",")[0] for name, _ in MODEL_EXPONENTS))
     return paragraph(said) + table("Exponents in (t_f - t) and the models that they agree with.", header, rows)
+
+
+def _agreement(exponent: Exponent, model: float, asymptotic: bool) -> str:
+    """A model's exponent and whether the confidence interval holds it; no "no" where the law bends by itself."""
+    if exponent.agrees_with(model):
+        return f"{model:.3f} yes"
+    return f"{model:.3f} no" if asymptotic else f"{model:.3f} as θ → 0"
+
+
+def _largest_nutation(analysis: Analysis) -> float:
+    """In the window of the exponents [rad]."""
+    laws, motion = analysis.scaling.laws, analysis.motion
+    left = laws.t_f - motion.time
+    inside = motion.known & (left >= min(laws.window)) & (left <= max(laws.window))
+    return float(motion.euler[inside, 1].max()) if inside.any() else np.inf
 
 
 def _windows_table(fits: Sequence[PowerLaws]) -> str:

@@ -1,10 +1,11 @@
 """A measured motion as a file for the 3-D viewer rerun (.rrd): disc, dots, contact point, cameras and curves over time.
 
-Needs the optional package: pip install disctrack[viewer].
+Needs the optional package: pip install rerun-sdk.
 """
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +26,27 @@ _RIM_POINTS = 96
 _DISC, _DOT, _CONTACT, _TABLE = (120, 132, 148), (20, 20, 20), (214, 39, 40), (200, 200, 200)
 
 
+def require_rerun(path: Path) -> None:
+    """Raise OutputError if the package that writes `path` is not installed."""
+    try:
+        found = find_spec("rerun")
+    except ValueError:  # blocked
+        found = None
+    if found is None:
+        raise OutputError(
+            f"{path}: writing it needs the package rerun-sdk, which is not installed. Install it with "
+            "pip install rerun-sdk, or leave out --rerun."
+        )
+
+
 def write_rerun(path: Path, analysis: Analysis) -> None:
     """Write the motion for the 3-D viewer: world in metres, k up; frames without a pose are left out.
 
     Raises OutputError if the package rerun-sdk is not installed, or the file cannot be written.
     """
-    try:
-        import rerun
-    except ImportError as error:
-        raise OutputError(
-            f"{path}: writing it needs the package rerun-sdk, which is not installed. Install it with "
-            "pip install disctrack[viewer], or leave out --rerun."
-        ) from error
+    require_rerun(path)
+    import rerun
+
     with whole_file(path) as part:
         stream = rerun.RecordingStream("disctrack", send_properties=False)
         stream.save(part)

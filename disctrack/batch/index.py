@@ -45,7 +45,8 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
     done = [row for row in rows if row["pairs_measured"] is not None]
     pairs = sum(row["pairs_measured"] for row in done)
     said = (
-        f"{len(rows)} recordings, {len(done)} of them measured, {pairs} pairs with a pose. Values with one standard "
+        f"{_counted(len(rows), 'recording')}, {len(done)} of them measured, {_counted(pairs, 'pair')} with a pose. "
+        "Values with one standard "
         "deviation; a dash where the recording does not determine a number."
     )
     files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
@@ -58,6 +59,10 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
         "Batch of recordings",
         [paragraph(said), warning("Not as it should be", problems), section("Results", [results, files]), fragment],
     )
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
 def _cells(row: Row) -> list[str]:

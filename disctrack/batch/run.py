@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,6 +174,7 @@ class _Bar:
         if job.kind == "recording":
             self._finished += 1
             self._n_failed += result.status == FAILED
+            tqdm.write(f"{self._finished:4d} of {self._n}  {job.name}: {result.status}", file=sys.stderr)
         self._tell()
 
     def _tell(self) -> None:

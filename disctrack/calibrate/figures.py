@@ -6,14 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibration import StereoCalibration
 from disctrack.frames import CAMERAS
-from disctrack.pages.palette import COLOURS, INK
+from disctrack.pages.palette import BLUE, COLOURS, INK
 
 COVERAGE_CELLS = 8
+_SHADES = LinearSegmentedColormap.from_list("coverage", ["#dceefa", BLUE])
 
 
 def residuals_figure(found: StereoCalibration) -> Figure:
@@ -28,7 +30,7 @@ def residuals_figure(found: StereoCalibration) -> Figure:
         _arrows(axes, found, camera, typical)
         axes.set_title(f"{name}: rms {found.rms_per_camera_px[camera]:.4f} px", color=INK, fontsize=10)
     _views(figure.add_subplot(grid[1, :]), found)
-    figure.suptitle(f"Calibration residuals (arrows {_magnification(found, typical):.0f} times longer; red: not used)")
+    figure.suptitle(f"Calibration residuals (arrows {_magnification(found, typical):.0f} times longer; black: unused)")
     return figure
 
 
@@ -43,7 +45,7 @@ def _arrows(axes: Axes, found: StereoCalibration, camera: int, typical: float) -
     mine = refinement.observations.camera == camera
     for select, colour, most in (
         (refinement.kept, COLOURS[CAMERAS[camera]], np.inf),
-        (~refinement.kept, "red", 4.0),
+        (~refinement.kept, INK, 4.0),
     ):
         pixels = refinement.observations.pixels[mine & select]
         arrows = refinement.residuals[mine & select] * scale
@@ -59,7 +61,7 @@ def _views(axes: Axes, found: StereoCalibration) -> None:
     for camera, name in enumerate(CAMERAS):
         axes.bar(place + 0.4 * (camera - 0.5), np.nan_to_num(rms[:, camera]), 0.38, color=COLOURS[name], label=name)
     for view in found.rejected_views:
-        axes.text(view, 0, "not used", rotation=90, ha="center", va="bottom", fontsize=7, color="red")
+        axes.text(view, 0, "not used", rotation=90, ha="center", va="bottom", fontsize=7, color=INK)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("view")
     axes.set_ylabel("rms (px)")
@@ -77,7 +79,7 @@ def coverage_figure(found: StereoCalibration) -> Figure:
         width, height = found.rig.cameras[camera].image_size
         edges = [np.linspace(-0.5, size - 0.5, COVERAGE_CELLS + 1) for size in (width, height)]
         counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)
-        shading = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, cmap="GnBu", vmin=-0.2 * counts.max())
+        shading = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, cmap=_SHADES, vmin=0)
         figure.colorbar(shading, ax=axes, label="corners in the cell", shrink=0.7)
         axes.plot(*pixels.T, ".", color=INK, markersize=1.5, alpha=0.5)
         _image_frame(axes, found, camera)

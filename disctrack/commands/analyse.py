@@ -19,7 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--circle", type=_seconds, default=0.6, help="last seconds for the circle through the contact (default: 0.6)"
     )
     parser.add_argument(
-        "--rerun", action="store_true", help="also write motion.rrd for the 3-D viewer rerun (needs disctrack[viewer])"
+        "--rerun",
+        action="store_true",
+        help="also write motion.rrd for the 3-D viewer (needs rerun-sdk)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an older report")
 
@@ -35,19 +37,30 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
     from disctrack.analyse.stage import run_analyse
     from disctrack.cli import DONE
+    from disctrack.files.reuse import origin_of, remember, reusable
+    from disctrack.progress import stage
 
-    outcome = run_analyse(
-        arguments.trajectory,
-        arguments.output,
-        window=arguments.window,
-        circle_duration=arguments.circle,
-        overwrite=arguments.overwrite,
-    )
-    print("\n".join(outcome.lines()))
+    path = arguments.trajectory
+    folder = arguments.output or path.with_name(f"{path.stem}_analysis")
+    motion = folder / "motion.rrd"
     if arguments.rerun:
-        from disctrack.analyse.viewer import write_rerun
+        from disctrack.analyse.viewer import require_rerun, write_rerun
 
-        recording = outcome.report.with_name("motion.rrd")
-        write_rerun(recording, outcome.analysis)
-        print(f"              {recording}")
+        require_rerun(motion)  # at once: the analysis takes a while
+    origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
+    told = None if arguments.overwrite or (arguments.rerun and not motion.exists()) else reusable(folder, origin)
+    if told is not None:
+        print(
+            "\n".join([f"reused        {folder}: complete result of the same trajectory, settings and version", *told])
+        )
+        return DONE
+    again = arguments.overwrite or reusable(folder, origin) is not None
+    with stage("analyse"):
+        outcome = run_analyse(path, folder, window=arguments.window, circle_duration=arguments.circle, overwrite=again)
+    lines = outcome.lines()
+    if arguments.rerun:
+        write_rerun(motion, outcome.analysis)
+        lines.append(f"              {motion}")
+    remember(folder, origin, lines, (outcome.report, *outcome.figures))
+    print("\n".join(lines))
     return DONE

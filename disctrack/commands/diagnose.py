@@ -20,11 +20,24 @@ def run(arguments: argparse.Namespace) -> int:
     from disctrack.cli import DONE
     from disctrack.commands import _outputs as outputs
     from disctrack.diagnosis import run_diagnose
+    from disctrack.files.reuse import origin_of, remember, reusable
+    from disctrack.progress import stage
     from disctrack.track import summary
 
     path = arguments.trajectory
     folder = arguments.output or path.with_name(f"{path.stem}_diagnosis")
-    outcome = run_diagnose(path, folder, model=arguments.model, overwrite=arguments.overwrite)
+    model = Path(arguments.model)
+    told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
+    origin = origin_of(path, {"model": told_model})
+    told = None if arguments.overwrite else reusable(folder, origin)
+    if told is not None:
+        reused = f"{'reused':<13} {folder}: complete result of the same trajectory, model and version"
+        print("\n".join([reused, *told]))
+        return DONE
+    with stage("diagnose"):
+        outcome = run_diagnose(path, folder, model=arguments.model, overwrite=arguments.overwrite)
     files = [outputs.relative(file) for file in (path, *outcome.files)]
-    print("\n".join([*outcome.summary, *summary.file_lines(files)]))
+    lines = [*outcome.summary, *summary.file_lines(files)]
+    remember(folder, origin, lines, outcome.files)
+    print("\n".join(lines))
     return DONE

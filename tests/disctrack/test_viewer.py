@@ -33,7 +33,7 @@ def test_disc_is_a_closed_body_with_its_outside_to_the_front():
 
 def test_without_the_package_the_message_tells_what_to_install(analysis, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(OutputError, match=r"disctrack\[viewer\]"):
+    with pytest.raises(OutputError, match="pip install rerun-sdk"):
         write_rerun(tmp_path / "motion.rrd", analysis)
     assert not list(tmp_path.iterdir())
 

@@ -67,3 +67,30 @@ def test_bad_input_is_one_line_and_an_exit_code(tmp_path, capsys):
     assert said.count("\n") == 1
     assert "foreign.h5" in said
     assert "not a trajectory" in said
+
+
+def test_a_second_analysis_is_reused_and_another_window_or_a_missing_figure_is_not(analysed_clip, capsys):
+    report = analysed_clip.parent / "report"
+    command = ["analyse", str(analysed_clip), "-o", str(report)]
+    before = (report / "report.html").stat().st_mtime_ns
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("reused")
+    assert "rolls without slip" in told
+    assert (report / "report.html").stat().st_mtime_ns == before
+    assert main([*command, "--window", "0.4"]) == 1  # another result: kept unless told otherwise
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_asymptotic_exponents_are_not_refused_where_the_law_is_not_asymptotic(analysed_clip):
+    """The clip was drawn with the law of Ma et al.; over 3.3 to 1.4 deg its slope is not yet 2/3."""
+    page = (analysed_clip.parent / "report" / "report.html").read_text()
+    assert "as θ → 0" in page
+    assert "0.667 no" not in page
+
+
+def test_a_viewer_that_is_not_installed_is_said_before_the_work(analysed_clip, capsys, monkeypatch):
+    monkeypatch.setattr("disctrack.analyse.viewer.find_spec", lambda name: None)
+    monkeypatch.setattr("disctrack.analyse.stage.run_analyse", lambda *a, **k: pytest.fail("analysed first"))
+    assert main(["analyse", str(analysed_clip), "--overwrite", "--rerun"]) == 1
+    assert "pip install rerun-sdk" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import subprocess
 import sys
 import time
@@ -25,7 +26,8 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
     output, errors = capsys.readouterr()
     for word in ("views", "rms", "baseline", "measured", "sigma", "pairs/s", "trajectory.h5", "overlay.mp4"):
         assert word in output
-    assert errors == ""  # no progress bar where stderr is no terminal
+    # where stderr is no terminal: no bars, one line for each stage when it has ended
+    assert re.fullmatch(r"( *[0-9.]+ s  (calibrate|track|figures|video): \d+ \w+\n){4}", errors), errors
     trajectory = read_trajectory(results / "trajectory.h5")
     assert (trajectory.frame_status == FrameStatus.MEASURED).all()
     # the height of the centre follows from the nutation in rolling contact (z = r sin theta + h cos theta)

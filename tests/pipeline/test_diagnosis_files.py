@@ -125,7 +125,9 @@ def test_against_the_enlarged_model_nothing_is_missing(diagnosed, tmp_path):
 
 
 def test_errors_are_one_line(diagnosed, tmp_path, capsys):
-    assert main(["diagnose", str(diagnosed[0])]) == 1
+    assert main(["diagnose", str(diagnosed[0])]) == 0
+    assert capsys.readouterr().out.startswith("reused")
+    assert main(["diagnose", str(diagnosed[0]), "--model", "none"]) == 1  # another result: kept unless told otherwise
     assert "--overwrite" in capsys.readouterr().err
     assert main(["diagnose", str(diagnosed[0]), "-o", str(tmp_path / "x"), "--model", "no-such-model"]) == 1
     assert "no such model" in capsys.readouterr().err

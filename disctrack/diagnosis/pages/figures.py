@@ -177,15 +177,23 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
         axes.plot(missing.time, value, lw=1.3, color=RED, label="missing")
         if law is not None:
             axes.plot(law[0], 1e6 * law[1][:, i], lw=1.0, color=BLUE, label="added by what was found")
-        _frame(axes, np.concatenate([value - 2 * sigma, value + 2 * sigma]))
+        # the band, and all of the law that is not a spike at the ends, where splines of short moments run away
+        inner = np.empty(0) if law is None else 1e6 * law[1][len(law[1]) // 20 : -(len(law[1]) // 20) or None, i]
+        _frame(axes, np.concatenate([value - 2 * sigma, value + 2 * sigma, inner]))
         axes.axhline(0.0, color=MUTED, lw=0.7)
-        axes.set_ylabel(f"along {name} [uN m]")
+        axes.set_ylabel(f"along {name} (µN m)")
     grid[0].legend(frameon=False, fontsize=9, ncols=2, loc="upper right")
     grid[-1].set_xlabel("time [s]")
     caption = (
         "Contact moment M_n, M_m, M_z that the model before fails to supply, with two standard deviations: what short "
         "moments would have to be for the dots to fall where they did. A missing force, inertia or an error of the "
         "measurement shows as the moment that does the same."
+        + (
+            " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the "
+            "other fitted numbers cannot take up, so that a steady part, along n0 above all, is smaller in red."
+            if result.learned is not None
+            else ""
+        )
     )
     return Drawn("missing_moment", "The missing moment", caption, figure)
 

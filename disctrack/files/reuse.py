@@ -1,0 +1,38 @@
+"""A folder of results is reused where it was made, completely, from the same trajectory, settings and version."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import disctrack
+from disctrack.files.trajectory_file import read_setup
+from disctrack.files.whole import write_whole
+
+FILE_NAME = "made_from.json"
+
+
+def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:
+    """SHA-256 (hex) of what a result is made from. Raises TrajectoryFileError."""
+    content = [read_setup(trajectory).fingerprint, dict(settings), disctrack.__version__]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def remember(folder: Path, origin: str, lines: Sequence[str], files: Sequence[Path]) -> None:
+    """Keep beside the results what they were made from, and what was said of them. Raises OutputError."""
+    names = [file.relative_to(folder).as_posix() for file in files if file.is_relative_to(folder)]
+    content = {"origin": origin, "version": disctrack.__version__, "summary": list(lines), "files": names}
+    write_whole(folder / FILE_NAME, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def reusable(folder: Path, origin: str) -> list[str] | None:
+    """What was said of the results in the folder, if they are all there and of this origin; None otherwise."""
+    try:
+        content = json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))
+        whole = content["origin"] == origin and all((folder / name).is_file() for name in content["files"])
+        return [str(line) for line in content["summary"]] if whole else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
