@@ -1,6 +1,7 @@
 """The engine on a system that is no disc: a damped oscillator with a known answer."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -211,3 +212,23 @@ def test_a_quantity_that_the_data_do_not_see_is_open_and_its_neighbour_is_not(rn
     )
     assert slope.sigma[0] == pytest.approx(SIGMA / np.sqrt(np.sum(time**2)), rel=1e-6)
     assert slope.sigma[1] == np.inf
+
+
+def test_linear_quantities_that_are_taken_out_beforehand_leave_the_same_fit(rng):
+    system = oscillator(rng, {"drift": 0.02, "hum_c": 0.01})
+    nuisances = [Quantity("drift", "1", 0.1, prior_sigma=0.01), Quantity("hum_c", "1", 0.1, prior_sigma=0.03)]
+    fits, scores = [], []
+    for linear in (False, True):
+        system.base = (*system.base[:3], *(replace(q, linear=linear) for q in nuisances))
+        fits.append(fit(system, system.base, START))
+        others = [c for c in system.candidates if c.name in ("damping", "nothing")]
+        scores.append(score_all(Linearisation(system, fits[-1], others), others))
+    plain, taken_out = fits
+    sigmas = np.sqrt(np.diag(plain.covariance))
+    for name, sigma in zip(plain.names, sigmas, strict=True):
+        assert_allclose(taken_out.values[name], plain.values[name], atol=0.05 * sigma)  # both stop 1e-3 of chi^2 short
+    assert_allclose(taken_out.covariance, plain.covariance, rtol=1e-3, atol=1e-3 * np.outer(sigmas, sigmas).max())
+    assert_allclose([taken_out.chi_square, taken_out.penalty], [plain.chi_square, plain.penalty], atol=0.1)
+    for one, other in zip(*scores, strict=True):
+        assert one.candidate.name == other.candidate.name
+        assert_allclose([other.gain, *other.sigma], [one.gain, *one.sigma], rtol=0.02, atol=0.02)

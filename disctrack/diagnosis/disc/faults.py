@@ -107,8 +107,9 @@ class Fault:
     step: ClassVar[float]  # of a fit: a hundredth of a pixel or so in the image
     parts: ClassVar[tuple[str, ...]]  # its numbers
     meaning: ClassVar[str]
-    bounds: ClassVar[tuple[float, float]] = (-np.inf, np.inf)
+    bounds: ClassVar[tuple[float, float]] = (-np.inf, np.inf)  # beyond which no laboratory's lies
     in_images: ClassVar[bool] = False  # adds its number times `column` to the dots' images
+    of_poses_alone: ClassVar[bool] = True  # may show in dots about free poses, without a model of the motion
 
     @property
     def name(self) -> str:
@@ -202,7 +203,8 @@ class FrameRate(Fault):
     family, unit, step, parts = "frame_rate", "1", 1e-4, ("change",)
     title = "the true frame rate differs from the declared one"
     source, meaning = "clock of the cameras", "true over declared minus one"
-    bounds = (-0.3, 0.3)
+    bounds = (-0.6, 1.2)
+    of_poses_alone = False
 
     def alter(self, setup: Setup, v: Array) -> None:
         setup.rate = 1.0 + float(v[0])
@@ -277,6 +279,7 @@ class CameraTurned(_OfCamera):
     parts = ("rotation_x", "rotation_y", "rotation_z")
     title = "the {} camera turned after its calibration"
     source, meaning = "mount, cable, knock", "in its own axes"
+    bounds = (-0.06, 0.06)
     key, factor = "rotation_deg", 180 / np.pi
 
     def alter(self, setup: Setup, v: Array) -> None:
@@ -290,6 +293,7 @@ class CameraShifted(_OfCamera):
     parts = ("translation_x", "translation_y", "translation_z")
     title = "the {} camera moved after its calibration"
     source, meaning = "mount, cable, knock", "in its own axes"
+    bounds = (-0.01, 0.01)
     key, factor = "translation_mm", 1e3
 
     def alter(self, setup: Setup, v: Array) -> None:
@@ -302,6 +306,7 @@ class FocalLength(_OfCamera):
     family, unit, step, parts = "focal", "1", 1e-5, ("change",)
     title = "the focal length of the {} camera changed"
     source, meaning = "focus, temperature", "relative"
+    bounds = (-0.05, 0.05)
     key, null = "focal_scale", 1.0
 
     def alter(self, setup: Setup, v: Array) -> None:
@@ -314,6 +319,7 @@ class PrincipalPoint(_OfCamera):
     family, unit, step, parts = "principal_point", "px", 0.01, ("x", "y")
     title = "the principal point of the {} camera moved"
     source, meaning = "lens not fixed", "in the image"
+    bounds = (-5.0, 5.0)
     key = "principal_point_change_px"
 
     def alter(self, setup: Setup, v: Array) -> None:
@@ -326,6 +332,7 @@ class Distortion(_OfCamera):
     family, unit, step, parts = "distortion", "1", 1e-3, ("k1",)
     title = "the distortion of the {} camera changed"
     source, meaning = "focus, aperture, other lens", "change of Brown's k1"
+    bounds = (-1.0, 1.0)
     key = "k1_change"
 
     def alter(self, setup: Setup, v: Array) -> None:
@@ -451,6 +458,7 @@ class ExposureBlur(Fault):
     source, meaning = "centre moves by T^2/24 times its acceleration", "square of the exposure"
     bounds = (0.0, 1e-3)
     in_images = True
+    of_poses_alone = False  # takes the second derivative of the images
 
     def column(self, part: str, sight: Sight) -> Array:
         """Second derivative of the dots' images by differences over neighbouring frames."""

@@ -18,6 +18,7 @@ from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, slip_candidate
 from disctrack.diagnosis.disc.start import first_slip
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc.systematic import find_systematic, with_noise_of_frames
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
@@ -55,15 +56,19 @@ def diagnose_motion(
 ) -> Answer:
     """Diagnose the motion, rolling or slipping at its start. Raises AnalysisError."""
     settings = settings or Settings()
+    trajectory, noise = with_noise_of_frames(trajectory)
     stretch = free_stretch(trajectory)
     rolling = DiscSystem(trajectory, model, stretch=stretch)
+    systematic = find_systematic(rolling, noise)
+    if systematic != rolling.systematic:
+        rolling = DiscSystem(trajectory, model, stretch=stretch, systematic=systematic)
     base = fit(rolling, rolling.base, rolling.start(faults))
     may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
         return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
-        slipping = DiscSystem(trajectory, model, stretch=stretch, starts_in_slip=True)
+        slipping = DiscSystem(trajectory, model, stretch=stretch, starts_in_slip=True, systematic=systematic)
         alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
             return _slipping(trajectory, model, faults, settings, rolling, base, onset)
@@ -92,10 +97,11 @@ def _slipping(
     onset: RollingOnset,
 ) -> Answer:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
-    system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True)
+    systematic = rolling.systematic
+    system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
     diagnosis = diagnose(system, system.start(faults), settings)
     if diagnosis.verdict == "unexplained" and np.isfinite(onset.high):
-        later = _after_slip(trajectory, model, faults, settings, onset, diagnosis)
+        later = _after_slip(rolling, faults, settings, onset, diagnosis)
         if later is not None:
             return later
     if diagnosis.held_out_after is None or not _declares(system):
@@ -112,8 +118,7 @@ def _declares(system: DiscSystem) -> bool:
 
 
 def _after_slip(
-    trajectory: Trajectory,
-    model: Model,
+    rolling: DiscSystem,
     faults: Mapping[str, float],
     settings: Settings,
     onset: RollingOnset,
@@ -121,7 +126,8 @@ def _after_slip(
 ) -> Answer | None:
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
-        system = DiscSystem(trajectory, model, stretch=free_stretch(trajectory, onset.high))
+        stretch = free_stretch(rolling.trajectory, onset.high)
+        system = DiscSystem(rolling.trajectory, rolling.model, stretch=stretch, systematic=rolling.systematic)
     except AnalysisError:
         return None
     diagnosis = diagnose(system, system.start(faults), settings)

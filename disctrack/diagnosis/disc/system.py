@@ -20,6 +20,7 @@ from disctrack.diagnosis.disc.motion import (
     state_quantities,
 )
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
+from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.diagnosis.engine.fit import triangle
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
@@ -33,7 +34,6 @@ Array = NDArray[np.float64]
 RTOL = 1e-10  # of the integration: a millionth of the noise
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
-DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 
@@ -48,6 +48,20 @@ class _Path:
     by_motion: Array  # (n, 6, k) pose components (rotation vector) by `names`
 
 
+@dataclass(frozen=True)
+class StaticView:
+    """Dots of k frames about their measured poses, and what would move them: no model of the motion."""
+
+    residual: Array  # (k, 4 m) whitened
+    by_pose: Array  # (k, 4 m, 6) whitened
+    rig: Array  # (k, 4 m, r) by directions of the calibration's covariance, in their sigmas, whitened
+    dots: Array  # (k, 4 m, 2 m) by the dots' places on the face [m], whitened
+    faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by faults of the measurement, in their typical sizes
+    places: Array  # (k, 2, m, 2) [px]
+    used: NDArray[np.bool_]  # (k, 2, m)
+    whiten: Array  # (k, 2, m, 2, 2)
+
+
 class DiscSystem:
     """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
 
@@ -59,14 +73,17 @@ class DiscSystem:
         *,
         stretch: Stretch | None = None,
         starts_in_slip: bool = False,
+        systematic: Systematic | None = None,
     ) -> None:
         """Model : declared disc, gravity and effects; the parameters of its effects are fitted along.
 
         candidates : all of the catalogue and of the measurement, if not given
         stretch : frames to take; those of `free_stretch` if not given
         starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
+        systematic : sizes of the dots' systematic errors, that are fitted along as fields with these sizes as priors
         Raises AnalysisError.
         """
+        self.systematic = systematic or Systematic()
         self.stretch = stretch or free_stretch(trajectory)
         self.starts_in_slip = starts_in_slip
         rows = self.stretch.rows
@@ -100,31 +117,72 @@ class DiscSystem:
         They are so small that their columns at the measured poses serve for every prediction. Directions of the
         calibration's covariance are in units of their own sigma.
         """
-        q = np.array(self.trajectory.q[self.rows])
-        known = np.isfinite(q).all(axis=1)
-        q[~known] = q[np.argmax(known)]  # rows without a pose have no dots that count either
-        R = rotation_from_euler(*q[:, 3:].T)
-        points = self.disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]
-        _, by_point, by_rig = self.rig.project_with_jacobians(points)
+        R, t = self._measured_poses()
+        points = self.disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]
+        places, by_point, by_rig = self.rig.project_with_jacobians(points)
+        n = len(t)
         correlation, sigma = _scaled(self.rig.covariance)
         eigenvalues, vectors = np.linalg.eigh(correlation)
         root = sigma[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-        shift = (self._whiten @ by_rig).reshape(len(q), -1, root.shape[0]) @ root
+        shift = (self._whiten @ by_rig).reshape(n, -1, root.shape[0]) @ root
         _, singular, V = np.linalg.svd(triangle(shift.reshape(-1, root.shape[1])))
         rig = shift @ V[singular > MIN_NUISANCE].T
         along = np.einsum("ncmap,npb->ncmab", by_point, R[:, :, :2])  # by the dots' places on the face
         m = self.disc.n_markers
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]
-        meanings = ("direction of the calibration's covariance", "bias common to all images of a dot")
+        sizes = self.systematic
+        print_sigma = float(np.hypot(DOT_SIGMA, sizes.print_m))
         quantities = [
-            *(Quantity(f"rig.{k}", "sigma", 0.1, prior_sigma=1.0, meaning=meanings[0]) for k in range(rig.shape[-1])),
+            *_nuisances("rig", rig.shape[-1], "direction of the calibration's covariance"),
             *(
-                Quantity(f"dot_{i}.{a}", "m", 1e-8, prior_sigma=DOT_SIGMA, meaning=meanings[1])
+                replace(_nuisances(f"dot_{i}", 1, "bias common to all images of a dot")[0], name=f"dot_{i}.{a}",
+                        unit="m", scale=1e-8, prior_sigma=print_sigma)
                 for i in range(m)
                 for a in "xy"
             ),
-        ]
-        return tuple(quantities), np.concatenate([rig, dots.reshape(len(q), -1, 2 * m)], axis=-1)
+        ]  # fmt: skip
+        columns = [rig, dots.reshape(n, -1, 2 * m)]
+        per_px = float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
+        fields = (
+            ("lens_field", sizes.lens_px, sizes.lens_length_px, lens_columns, "mode of the lenses' residual fields"),
+            ("dot_field", sizes.dot_px, sizes.dot_length_px, dot_columns, "mode of the dots' own residual fields"),
+        )
+        for name, size, length, of_unit_size, meaning in fields:
+            if size > 0:
+                shifts = size * of_unit_size(places, self.used, length, size * per_px)
+                columns.append(np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts).reshape(n, -1, shifts.shape[-1]))
+                quantities += _nuisances(name, shifts.shape[-1], meaning)
+        return tuple(quantities), np.concatenate(columns, axis=-1)
+
+    def _measured_poses(self) -> tuple[Array, Array]:
+        """R (n, 3, 3), t (n, 3); rows without a pose, which have no dots that count either, get another's."""
+        q = np.array(self.trajectory.q[self.rows])
+        known = np.isfinite(q).all(axis=1)
+        q[~known] = q[np.argmax(known)]
+        return rotation_from_euler(*q[:, 3:].T), q[:, :3]
+
+    def static_view(self, rows: NDArray[np.intp]) -> StaticView:
+        """The dots of these rows about their measured poses."""
+        R, t = (np.stack([part] * 2) for part in self._measured_poses())
+        images = predict(R, t, self.rig, self.disc, {})
+        pixels, by_pose = images.pixels, images.by_pose
+        sight = Sight(self.time, R, t, np.zeros((*t.shape[:2], 6)), self.rig, self.disc, {}, images)
+        faults = {}
+        for fault in self.faults:
+            if fault.of_poses_alone:
+                shifts = [fault.column(part, sight)[rows] for part in fault.parts]
+                if fault.name == "time_offset":  # at the speed that the dots are seen to have
+                    shifts[0][:, 1] = np.gradient(pixels[:, 1], self.time, axis=0)[rows]
+                sizes = [q.typical for q in fault.candidate().quantities]
+                faults[fault.name] = np.stack([x * size for x, size in zip(shifts, sizes, strict=True)], axis=-1)
+        nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
+        n_rig = sum(name.startswith("rig.") for name in self._nuisance_column)
+        whitened = (self._whiten[rows] @ by_pose[rows]).reshape(len(rows), -1, 6)
+        residual = np.asarray((self._whiten @ (self._observed - pixels)[..., None]).reshape(len(self.time), -1), float)
+        return StaticView(
+            residual[rows], whitened, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
+            pixels[rows], self.used[rows], self._whiten[rows],
+        )  # fmt: skip
 
     def start(self, known: Values | None = None) -> dict[str, float]:
         """Values of the base quantities from the measured poses, good enough for Gauss-Newton.
@@ -287,6 +345,11 @@ class DiscSystem:
                 shift = sum(x * fault.column(part, sight) for x, part in zip(v, fault.parts, strict=True))
                 sight = replace(sight, images=replace(sight.images, pixels=sight.images.pixels + shift))
         return sight
+
+
+def _nuisances(name: str, k: int, meaning: str) -> list[Quantity]:
+    """Linear quantities in units of their own standard deviation."""
+    return [Quantity(f"{name}.{i}", "sigma", 0.1, prior_sigma=1.0, meaning=meaning, linear=True) for i in range(k)]
 
 
 def _nowhere(n: int) -> _Path:

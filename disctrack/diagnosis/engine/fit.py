@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from disctrack.diagnosis.engine.nuisances import Projection, is_linear, projection
 from disctrack.diagnosis.engine.system import Quantity, System, Values
 
 Array = NDArray[np.float64]
@@ -57,13 +58,14 @@ class Fit:
         return float(np.sqrt(max(self.covariance[i, i], 0.0)))
 
 
-def compress(residual: Array, derivative: Array) -> tuple[Array, Array]:
+def compress(residual: Array, derivative: Array, common: Projection | None = None) -> tuple[Array, Array]:
     """Smaller least-squares problem with the same solutions: (right side (m,), matrix (m, k)), m = k + 1 at most.
 
-    The Q of [derivative, residual] is dropped; norms and angles of all combinations of columns stay.
+    The Q of [derivative, residual] is dropped; norms and angles of all combinations of columns stay, once what linear
+    quantities in `common` absorb is taken off.
     """
     stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
-    R = triangle(stacked)
+    R = triangle(stacked if common is None else common.cleared(stacked))
     return R[:, -1], R[:, :-1]
 
 
@@ -113,19 +115,21 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
     or the iterations run out.
     """
     quantities = tuple(quantities)
-    names = [q.name for q in quantities]
     values = {q.name: q.null for q in quantities} | dict(start)
     for q in quantities:
-        values[q.name] = float(np.clip(values[q.name], q.lower, q.upper))
-    lower, upper = np.array([q.lower for q in quantities]), np.array([q.upper for q in quantities])
+        values[q.name] = q.null if is_linear(q) else float(np.clip(values[q.name], q.lower, q.upper))
+    common = projection(system, quantities, values)
+    moved = [q for q in quantities if not is_linear(q)]
+    names = [q.name for q in moved]
+    lower, upper = np.array([q.lower for q in moved]), np.array([q.upper for q in moved])
     residual, derivative = system.linearise(values, names)
-    prior, prior_matrix = prior_rows(quantities, values)
-    cost = _cost(residual, prior, derivative)
+    prior, prior_matrix = prior_rows(moved, values)
+    cost = _cost(residual, prior, derivative, common)
     converged, iteration = False, 0
     matrix = np.zeros((0, len(names)))
     while np.isfinite(cost) and iteration < max_iterations:
         iteration += 1
-        right, matrix = compress(residual, derivative)
+        right, matrix = compress(residual, derivative, common)
         right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
         x = np.array([values[n] for n in names])
         step = solve_bounded(right, matrix, lower - x, upper - x)
@@ -137,8 +141,8 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             factor = 0.5**halving
             trial = values | dict(zip(names, np.clip(x + factor * step, lower, upper).tolist(), strict=True))
             new_residual, new_derivative = system.linearise(trial, names)
-            new_prior, _ = prior_rows(quantities, trial)
-            new_cost = _cost(new_residual, new_prior, new_derivative)
+            new_prior, _ = prior_rows(moved, trial)
+            new_cost = _cost(new_residual, new_prior, new_derivative, common)
             if np.isfinite(new_cost) and new_cost < cost:
                 break
         else:
@@ -146,16 +150,41 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             converged = bool(expected < max(0.1, 1e-7 * cost))
             break
         values, residual, derivative, prior, cost = trial, new_residual, new_derivative, new_prior, new_cost
-    penalty = float(prior @ prior)
     n_data = int(np.sum(system.weights))
     covariance = _covariance(matrix, np.array([values[n] for n in names]), lower, upper)
-    return Fit(quantities, values, covariance, float(cost - penalty), penalty, n_data, converged, iteration)
+    chi_square, penalty = float(cost), 0.0
+    if np.isfinite(cost):
+        penalty = float(prior @ prior)
+        chi_square = cost - penalty
+    if np.isfinite(cost) and common.names:
+        flat = residual.reshape(-1, 1)
+        penalty += float(np.sum((common.prior_rows @ (common.rows.T @ flat)) ** 2))
+        chi_square = cost - penalty
+        found = common.null + common.absorbed(flat)[:, 0]
+        values |= dict(zip(common.names, found.tolist(), strict=True))
+        covariance = _joint(covariance, common, derivative.reshape(-1, len(names)))
+        order = [[*names, *common.names].index(q.name) for q in quantities]
+        covariance = covariance[np.ix_(order, order)]
+    elif common.names:
+        covariance = np.zeros((len(quantities), len(quantities)))
+    return Fit(quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration)
 
 
-def _cost(residual: Array, prior: Array, derivative: Array) -> float:
-    """Chi-square with priors; infinite where there is no prediction, or none next to it."""
+def _joint(covariance: Array, common: Projection, derivative: Array) -> Array:
+    """Covariance of the moved quantities, and after them of the linear ones, from that of the former."""
+    by_moved = -common.absorbed(derivative)
+    across = by_moved @ covariance
+    own = common.covariance + across @ by_moved.T
+    return np.block([[covariance, across.T], [across, own]])
+
+
+def _cost(residual: Array, prior: Array, derivative: Array, common: Projection) -> float:
+    """Chi-square with priors, at the best values of the linear quantities; infinite where there is no prediction.
+
+    Nor is there one where it has no derivative.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
-        cost = float(np.sum(residual**2) + prior @ prior)
+        cost = float(np.sum(common.cleared(residual.reshape(-1, 1)) ** 2) + prior @ prior)
         usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
     return cost if usable else np.inf
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.diagnosis.engine.fit import Fit, compress, prior_rows, solve_bounded
+from disctrack.diagnosis.engine.nuisances import is_linear, projection
 from disctrack.diagnosis.engine.system import Candidate, System
 
 Array = NDArray[np.float64]
@@ -39,12 +40,14 @@ class Linearisation:
         """Linearise at the fit for its own quantities and for those of all candidates."""
         known = set(fit.names)
         new = {q.name: q for c in candidates for q in c.quantities if q.name not in known}
-        self.fit = fit
-        self.quantities = {q.name: q for q in fit.quantities} | new
+        common = projection(system, fit.quantities, fit.values)
+        self.fitted = tuple(q for q in fit.quantities if not is_linear(q))
+        self.quantities = {q.name: q for q in self.fitted} | new
         self.values = {name: q.null for name, q in new.items()} | fit.values
+        self.values |= dict(zip(common.names, common.null.tolist(), strict=True))
         names = list(self.quantities)
         residual, derivative = system.linearise(self.values, names)
-        right, matrix = compress(residual, derivative)
+        right, matrix = compress(residual, derivative, common)
         prior, prior_matrix = prior_rows(list(self.quantities.values()), self.values)
         self.right, self.matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
         self.column = {name: i for i, name in enumerate(names)}
@@ -53,7 +56,7 @@ class Linearisation:
 
     def _free_columns(self) -> list[int]:
         free = []
-        for q in self.fit.quantities:
+        for q in self.fitted:
             at_bound = not q.lower < self.values[q.name] < q.upper
             if not at_bound:
                 free.append(self.column[q.name])
@@ -71,7 +74,7 @@ class Linearisation:
 
     def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
         """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
-        fitted = [q.name for q in self.fit.quantities if q.name not in names]
+        fitted = [q.name for q in self.fitted if q.name not in names]
         everything = [*fitted, *names]
         A = self.columns(everything)
         x0 = np.array([self.values[n] for n in everything])

@@ -31,6 +31,7 @@ class Quantity:
     prior_sigma: float = np.inf  # about `null`; infinite: nothing is known beforehand
     meaning: str = ""
     typical: float = np.inf  # size that would surprise nobody; decides between explanations that fit alike
+    linear: bool = False  # the prediction is linear in it with a derivative that is the same everywhere
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,7 @@ class Subset(Wrapped):
         """Rows (n,) True where the sample belongs to the subset."""
         super().__init__(system)
         self._rows = rows
+        self.whole, self.key = system, rows.tobytes()
 
     @property
     def weights(self) -> Array:

@@ -9,12 +9,13 @@ error drawn from its covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import N_RIG, StereoRig
+from disctrack.diagnosis.trials.imperfect import Laboratory, shifted_dots
 from disctrack.disc import Disc
 from disctrack.frames import (
     continuous_quaternions,
@@ -54,6 +55,7 @@ class Unseen:
     clock: float = 0.0  # relative change of the frame rate
     exposure: float = 0.0  # [s] both cameras; a dot's image is averaged over it
     image_centres: bool = False  # the centre of a dot's image is taken for the image of its centre
+    laboratory: Laboratory = field(default_factory=Laboratory)
 
 
 def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
@@ -108,21 +110,40 @@ def measured(
     # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them
     sigma = np.sqrt(np.diag(covariance))
     error = sigma * rng.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
+    u, prints = _of_the_laboratory(u, disc, rng)
     true_rig = _on_the_true_table(rig_after_faults(believed_rig.perturbed(error), scene), u)
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
     if motion is None:
         amounts = dict({"km.k_m": K_M} if base is None else base) | dict(effects or {})
         motion = _rolling(Model(disc, laws=tuple(laws)).with_values(amounts), theta_deg, nutation_deg, omega3, rng)
     true_times = np.arange(n) / ((f.frame_rate_hz or declared_rate) * (1.0 + u.clock)) + STATION
-    centres = _true_centres(disc, f, u)
+    centres = _true_centres(disc, f, u) + prints
     views = [
         _exposed(motion, true_times + delay, u, true_rig, centres, disc)[:, camera]
         for camera, delay in enumerate((0.0, f.right_delay_s))
     ]
     pixels = np.stack(views, axis=1)
+    if u.laboratory != Laboratory():
+        pixels = shifted_dots(rng, pixels, scene.cameras.image_size[0], u.laboratory)
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     dots = np.broadcast_to(sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
     return _tracked(pixels, dots, motion(true_times), believed_rig, disc, declared_rate)
+
+
+def _of_the_laboratory(u: Unseen, disc: Disc, rng: np.random.Generator) -> tuple[Unseen, Array]:
+    """With the board's errors among the others, and the errors (m, 3) of the dots' places [m]."""
+    lab, shift = u.laboratory, np.zeros((disc.n_markers, 3))
+    if lab == Laboratory():
+        return u, shift
+    height, scale, x, y = rng.standard_normal(4)
+    shift[:, :2] = lab.print_m * rng.standard_normal((disc.n_markers, 2))
+    u = replace(
+        u,
+        table_height=u.table_height + lab.board_bow_m * height,
+        table_turn=(u.table_turn[0] + lab.board_tilt * x, u.table_turn[1] + lab.board_tilt * y),
+        pattern_scale=u.pattern_scale + lab.board_scale * scale,
+    )
+    return u, shift
 
 
 def _rolling(model: Model, theta_deg: float, nutation_deg: float, omega3: float, rng: np.random.Generator) -> Motion:

@@ -1,0 +1,302 @@
+"""Systematic errors of the dots' places, as far as the dots themselves show them: no model of the motion is asked.
+
+Two cameras see a rigid pattern: of the 4 m numbers of a frame six are its pose, and the others should be noise. What
+they scatter from frame to frame is the noise. What is left beside it moves slowly, and is a smooth function of the
+place in the image (lens, board), of the dot (print), or of both (gleam, gradients of light). The sizes and the length of
+these fields are found by restricted maximum likelihood from the numbers that no pose can absorb; the same fields,
+with these sizes as priors, then stand beside the motion, and take from it what a pose could have absorbed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from disctrack.trajectory import MarkerStatus, Trajectory
+
+if TYPE_CHECKING:
+    from disctrack.diagnosis.disc.system import DiscSystem
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MIN_DIFFERENCES = 20  # third differences from which a noise is read
+INFLATED = 0.8  # variance from frame to frame over that stated, below which the statement holds more than noise
+MARGIN = 0.6  # of a field's length, by which its grid exceeds the places
+DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
+LENS_LENGTHS = (0.3, 0.6, 0.17)  # of a camera's field, over the extent of the dots' places
+DOT_LENGTH = 0.5  # of the fields of single dots, likewise
+MIN_FRAMES, MAX_FRAMES = 30, 200  # that are looked at: fields move slowly
+ROUNDS = 3  # over the sizes
+WORTH = 20.0  # of twice the log likelihood, that a fault or a field must gain: odds of 2e4
+MOST_FAULTS = 2
+SEEN = 0.2  # a mode of a field that moves all dots together by less than this many sigmas is left out
+
+
+def noise_over_stated(trajectory: Trajectory) -> float:
+    """Variance of the dots from frame to frame over that stated; 1 where too few frames follow each other.
+
+    From third differences of what the poses leave of the dots: neither motion nor any slow error passes them.
+    """
+    residual = trajectory.markers_residual_px
+    seen = (trajectory.marker_status == MarkerStatus.MEASURED) & np.isfinite(residual).all(-1)
+    variance = 0.5 * np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1)
+    seen &= np.isfinite(variance) & (variance > 0)
+    scaled = np.where(seen, residual.transpose(3, 0, 1, 2) / np.sqrt(np.where(seen, variance, 1.0)), 0.0)
+    together = seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3] & np.all(np.diff(trajectory.frame) == 1)
+    if together.any(axis=(1, 2)).sum() < MIN_DIFFERENCES:
+        return 1.0
+    difference = np.diff(scaled, 3, axis=1)[:, together]
+    numbers = 2.0 * seen.sum(axis=(1, 2))
+    free = np.mean(np.clip((numbers - 6.0) / np.maximum(numbers, 1.0), 0.0, 1.0)[numbers > 6])
+    # a heavy tail of single bad frames is no noise of the others
+    return float(_robust_variance(difference) / 20.0 / free)
+
+
+def _robust_variance(x: Array) -> float:
+    """Mean square without the twentieth that is largest, as of normal numbers."""
+    squares = np.sort(np.ravel(x) ** 2)
+    kept = squares[: int(0.95 * squares.size)]
+    return float(np.mean(kept) / 0.7588)  # of a standard normal number cut at its 95th percentile in size
+
+
+def with_noise_of_frames(trajectory: Trajectory) -> tuple[Trajectory, float]:
+    """The trajectory with its covariances brought down to the scatter from frame to frame, and by which factor.
+
+    A covariance that was enlarged to cover systematic errors says nothing of the noise: motions look like rests, and
+    effects like chance.
+    """
+    ratio = noise_over_stated(trajectory)
+    if not 0 < ratio < INFLATED:
+        return trajectory, 1.0
+    return replace(
+        trajectory,
+        pose_covariance=ratio * trajectory.pose_covariance,
+        markers_covariance_px2=ratio * trajectory.markers_covariance_px2,
+        reduced_chi_square=trajectory.reduced_chi_square / ratio,
+    ), ratio
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """Sizes of the systematic errors of a recording's dots; zero: none is seen."""
+
+    lens_px: float = 0.0  # rms of each camera's field of the place in the image, per coordinate
+    lens_length_px: float = 100.0  # over which it changes
+    dot_px: float = 0.0  # rms of each dot's own field in each camera
+    dot_length_px: float = 200.0
+    print_m: float = 0.0  # rms of the dots' places on the face, per coordinate
+    noise: float = 1.0  # variance from frame to frame over that stated by the tracking
+    gain: float = 0.0  # of twice the log likelihood, over noise alone
+    beside: tuple[str, ...] = field(default=())  # faults of the measurement that were fitted along
+
+    @property
+    def present(self) -> bool:
+        """Is there anything beside noise?"""
+        return max(self.lens_px, self.dot_px, self.print_m) > 0
+
+    @property
+    def rms_px(self) -> float:
+        """Of all fields together, per coordinate."""
+        return float(np.hypot(self.lens_px, self.dot_px))
+
+
+@dataclass(frozen=True)
+class SmoothField:
+    """A random field with unit variance of places in the image, smooth over a length; k independent modes."""
+
+    centres: Array  # (g, 2) [px]
+    length: float  # [px]
+    mixing: Array  # (g, k)
+
+    def modes(self, places: Array) -> Array:
+        """(..., k) at places (..., 2)."""
+        return _bumps(places, self.centres, self.length) @ self.mixing
+
+
+def smooth_field(places: Array, length: float, sigmas: float) -> SmoothField:
+    """The field over places (n, 2) at which dots were seen.
+
+    sigmas : size of the field over the noise of one place; modes that all n places together do not see are left out
+    """
+    low, high = places.min(axis=0) - MARGIN * length, places.max(axis=0) + MARGIN * length
+    counts = np.maximum(np.ceil((high - low) / length).astype(int) + 1, 2)
+    x, y = (np.linspace(a, b, int(n)) for a, b, n in zip(low, high, counts, strict=True))
+    centres = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    near = np.zeros(len(centres), bool)  # the bumps that no dot comes near to would all be one mode without effect
+    for block in np.array_split(places, max(1, len(places) // 4096)):
+        near |= np.any(np.sum((block[:, None] - centres) ** 2, axis=-1) < (2.5 * length) ** 2, axis=0)
+    centres = centres[near]
+    bumps = _bumps(places, centres, length)
+    gram = bumps.T @ bumps
+    size = float(np.sqrt(np.trace(gram) / len(places)))  # rms of the sum of bumps with weights of unit variance
+    eigenvalues, vectors = np.linalg.eigh(gram / size**2)
+    seen = sigmas * np.sqrt(np.maximum(eigenvalues, 0.0)) > SEEN
+    return SmoothField(centres, length, vectors[:, seen] / size)
+
+
+def _bumps(places: Array, centres: Array, length: float) -> Array:
+    squared = np.sum(places**2, axis=-1)[..., None] + np.sum(centres**2, axis=-1) - 2 * places @ centres.T
+    return np.asarray(np.exp(-0.5 * squared / length**2), float)
+
+
+def lens_columns(places: Array, used: Mask, length: float, sigmas: float) -> Array:
+    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate, common to its dots."""
+    found = []
+    for camera in range(2):
+        seen = used[:, camera]
+        modes = smooth_field(places[:, camera][seen], length, sigmas).modes(places[:, camera])
+        found += _along(modes, camera, slice(None), places.shape)
+    return np.concatenate(found, axis=-1)
+
+
+def dot_columns(places: Array, used: Mask, length: float, sigmas: float) -> Array:
+    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each dot, camera and coordinate."""
+    found = []
+    for camera in range(2):
+        for dot in range(places.shape[2]):
+            seen = used[:, camera, dot]
+            if seen.any():
+                modes = smooth_field(places[:, camera, dot][seen], length, sigmas).modes(places[:, camera, dot])
+                found += _along(modes[:, None], camera, slice(dot, dot + 1), places.shape)
+    return np.concatenate(found, axis=-1)
+
+
+def _along(modes: Array, camera: int, dots: slice, shape: tuple[int, ...]) -> list[Array]:
+    """The modes (n, m', k) as shifts along x, and along y, of these dots in this camera."""
+    columns = []
+    for axis in range(2):
+        column = np.zeros((*shape, modes.shape[-1]))
+        column[:, camera, dots, axis] = modes
+        columns.append(column)
+    return columns
+
+
+class Evidence:
+    """Likelihood of numbers (n,) that are noise of unit variance plus columns (n, k_i) times numbers of unit variance.
+
+    Everything is in inner products, so that sizes of the groups of columns are tried without touching the data.
+    """
+
+    def __init__(self, data: Array, groups: Mapping[str, Array]) -> None:
+        """Groups : columns of each group, whitened as the data are."""
+        self._slices = {}
+        first = 0
+        for name, group in groups.items():
+            self._slices[name] = slice(first, first + group.shape[1])
+            first += group.shape[1]
+        columns = np.concatenate(list(groups.values()), axis=1)
+        self._gram, self._inner, self._power = columns.T @ columns, columns.T @ data, float(data @ data)
+
+    def twice_log(self, sizes: Mapping[str, float]) -> float:
+        """Twice the log likelihood, up to a constant, where the columns of each group are multiplied by its size.
+
+        Groups without a size do not act.
+        """
+        scaled = np.zeros(len(self._inner))
+        for name, size in sizes.items():
+            scaled[self._slices[name]] = size
+        index = np.flatnonzero(scaled > 0)
+        scaled = scaled[index]
+        root = np.linalg.cholesky(self._gram[np.ix_(index, index)] * np.outer(scaled, scaled) + np.eye(len(index)))
+        known = solve_triangular(root, scaled * self._inner[index], lower=True)
+        return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
+
+
+Sizes = dict[str, float]
+
+
+def _best_sizes(evidence: Evidence, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
+    """Sizes of the groups in `grids` that make the data most probable: one after the other, up and down its grid."""
+    best = evidence.twice_log(sizes)
+    for _ in range(ROUNDS):
+        before = best
+        for name, grid in grids.items():
+            if name in sizes:
+                here = int(np.argmin(np.abs(np.log(grid / sizes[name]))))
+                ways = [range(here + 1, len(grid)), range(here - 1, -1, -1)]
+            else:
+                ways = [range(len(grid))]
+            for way in ways:
+                for i in way:
+                    trial = sizes | {name: float(grid[i])}
+                    value = evidence.twice_log(trial)
+                    if value <= best:
+                        break
+                    best, sizes = value, trial
+        if best - before < 1.0:
+            break
+    return best, sizes
+
+
+def _with_faults(
+    evidence: Evidence, sizes: Sizes, faults: Mapping[str, float], most: int
+) -> tuple[float, Sizes, tuple[str, ...]]:
+    """The faults that make the data more probable beside these sizes, one after the other."""
+    best = evidence.twice_log(sizes)
+    chosen: tuple[str, ...] = ()
+    while len(chosen) < most:
+        trials = {name: evidence.twice_log(sizes | {name: size}) for name, size in faults.items() if name not in sizes}
+        name = max(trials, key=lambda n: trials[n])
+        if trials[name] < best + WORTH:
+            break
+        best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
+    return best, sizes, chosen
+
+
+def find_systematic(system: DiscSystem, noise: float = 1.0) -> Systematic:
+    """Sizes of the systematic errors of the dots, next to whatever fault of the measurement explains them better.
+
+    noise : variance from frame to frame over that stated, to be kept in the answer
+    """
+    rows = np.flatnonzero(system.weights >= np.max(system.weights))
+    if len(rows) < MIN_FRAMES:
+        return Systematic(noise=noise)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_FRAMES, len(rows))).astype(int))]
+    view = system.static_view(rows)
+    across = np.eye(view.residual.shape[1]) - view.by_pose @ np.linalg.pinv(view.by_pose)
+    free = lambda columns: (across @ columns.reshape(*view.residual.shape, -1)).reshape(view.residual.size, -1)  # noqa: E731
+    whitened = lambda shifts: free(np.einsum("ncmab,ncmbk->ncmak", view.whiten, shifts))  # noqa: E731
+    data = free(view.residual)[:, 0]
+    per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))  # whitened units in a pixel
+    rms = float(np.sqrt(np.mean(data**2)))
+    used, places = view.used, view.places
+    extent = float(np.max([np.ptp(places[:, c][used[:, c]], axis=0).max() for c in range(2)]))
+    faults = {name: whitened(columns) for name, columns in view.faults.items()}
+    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
+    size = max(rms, 1.0)
+    groups = {"rig": free(view.rig), "print": free(view.dots), **faults}
+    groups["dot"] = whitened(dot_columns(places, used, DOT_LENGTH * extent, size))
+    start = {"rig": 1.0, "print": DOT_SIGMA}
+    steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
+    grids: dict[str, Array] = {"print": np.asarray(DOT_SIGMA * 2.0 ** np.arange(0, 7), float), "lens": steps, "dot": steps}
+    amounts = dict.fromkeys(faults, 1.0)
+    best: Systematic | None = None
+    nothing = 0.0
+    for share in LENS_LENGTHS:
+        groups["lens"] = whitened(lens_columns(places, used, share * extent, size))
+        evidence = Evidence(data, groups)
+        if best is None:
+            nothing = evidence.twice_log(start)
+            value, _, chosen = _with_faults(evidence, start, amounts, MOST_FAULTS)
+            best = Systematic(noise=noise, gain=value - nothing, beside=chosen)
+        trial, sizes = _best_sizes(evidence, dict(start), grids)
+        if trial < nothing + best.gain - 4 * WORTH and share != LENS_LENGTHS[0]:
+            continue
+        value, sizes, chosen = _with_faults(evidence, sizes, amounts, MOST_FAULTS)
+        if chosen:  # what a fault explains is no field
+            refitted = dict(start) | dict.fromkeys(chosen, 1.0)
+            value, sizes = _best_sizes(evidence, refitted, grids)
+        found = Systematic(
+            sizes.get("lens", 0.0), share * extent, sizes.get("dot", 0.0), DOT_LENGTH * extent,
+            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, noise, value - nothing, chosen,
+        )  # fmt: skip
+        if found.present and found.gain > best.gain + WORTH:
+            best = found
+    assert best is not None
+    return best
