@@ -2,8 +2,8 @@
 
 Two cameras see a rigid pattern: of the 4 m numbers of a frame six are its pose, and the others should be noise. What
 they scatter from frame to frame is the noise. What is left beside it moves slowly, and is a smooth function of the
-place in the image (lens, board), of the dot (print), or of both (gleam, gradients of light). The sizes and the length of
-these fields are found by restricted maximum likelihood from the numbers that no pose can absorb; the same fields,
+place in the image (lens, board), of the dot (print), or of both (gleam, gradients of light). The sizes and the length
+of these fields are found by restricted maximum likelihood from the numbers that no pose can absorb; the same fields,
 with these sizes as priors, then stand beside the motion, and take from it what a pose could have absorbed.
 """
 
@@ -274,7 +274,8 @@ def find_systematic(system: DiscSystem, noise: float = 1.0) -> Systematic:
     groups["dot"] = whitened(dot_columns(places, used, DOT_LENGTH * extent, size))
     start = {"rig": 1.0, "print": DOT_SIGMA}
     steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
-    grids: dict[str, Array] = {"print": np.asarray(DOT_SIGMA * 2.0 ** np.arange(0, 7), float), "lens": steps, "dot": steps}
+    prints: Array = DOT_SIGMA * 2.0 ** np.arange(7.0)
+    grids = {"print": prints, "lens": steps, "dot": steps}
     amounts = dict.fromkeys(faults, 1.0)
     best: Systematic | None = None
     nothing = 0.0
