@@ -12,12 +12,14 @@ from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
 from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment, learn, without_idle_terms
+from disctrack.diagnosis.disc.left_over import LeftOver, left_over
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.disc.separation import separations
 from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
+from disctrack.diagnosis.engine.memory import with_memory
 from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import System, Wrapped
@@ -60,6 +62,8 @@ def diagnose_trajectory(
         text = sentence(diagnosis, diagnosis.after, None, None)
         return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
     diagnosis, remarks = refine_shapes(system, diagnosis)
+    left = left_over(system, diagnosis.after, diagnosis.noise)
+    diagnosis = judged_by_what_is_left(diagnosis, left)
     moment, learned = _beyond_the_catalogue(system, diagnosis)
     if learned is not None:
         system = system.knowing(learned.law.effect)
@@ -72,10 +76,15 @@ def diagnose_trajectory(
     held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
     assert held_before is not None
     assert held_after is not None
+    if learned is not None:
+        learned = replace(learned, fit=with_memory(_judged(diagnosis, system), learned.fit))
+        left = left_over(system, learned.fit, diagnosis.noise)
+    else:
+        diagnosis = replace(diagnosis, after=with_memory(_judged(diagnosis, system), diagnosis.after))
     fit_ = learned.fit if learned else diagnosis.after
     before = errors(system, diagnosis.before, held_before)
     after = errors(system, fit_, learned.held_out if learned else held_after)
-    text = sentence(diagnosis, fit_, after, learned.law if learned else None)
+    text = sentence(diagnosis, fit_, after, learned.law if learned else None, system.systematic, left)
     energy = energy_balance(system, fit_.values)
     apart = {
         f.candidate.name: separations(system, fit_, f.candidate, [r.candidate for r in f.cannot_be_told_from])
@@ -85,6 +94,25 @@ def diagnose_trajectory(
     return DiscDiagnosis(
         system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, (*answer.notes, *remarks)
     )
+
+
+def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagnosis:
+    """The verdict on the motion: what is left may be its, although chi-square is small, or the measurement's."""
+    if left is None or not diagnosis.after.converged:
+        return diagnosis
+    if diagnosis.verdict != "unexplained" and left.of_the_motion:
+        reason = (
+            f"{diagnosis.reason}; but what is left of the poses is not noise (p = {left.pose_p_value:.1g} over "
+            f"{left.n_tests} tests), while the numbers that no pose takes are"
+        )
+        return replace(diagnosis, verdict="unexplained", reason=reason)
+    if diagnosis.verdict == "unexplained" and left.of_the_measurement:
+        reason = (
+            f"{diagnosis.reason}; but what is left in the poses ({left.pose_chi_square:.3g} of the noise) is no more "
+            f"than errors of the measurement leave in the numbers that no pose takes ({left.other_chi_square:.3g})"
+        )
+        return replace(diagnosis, verdict="found" if diagnosis.found else "nothing missing", reason=reason)
+    return diagnosis
 
 
 def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:

@@ -280,6 +280,17 @@ class DiscSystem:
         known = (self.weights >= 6)[:, None]
         return np.where(known, delta, np.nan), np.where(known, sigma, np.nan)
 
+    def parts_of_residual(self, values: Values) -> tuple[Array, Array]:
+        """The part (n, 6) of the whitened residual that a free pose per frame would take, and the rest (n, 4 m)."""
+        pixels, by_pose = self._pixels(self._path(values, ()), values)
+        r = self._residual(pixels, values)
+        J = (self._whiten @ by_pose).reshape(len(r), -1, 6)
+        normal = np.swapaxes(J, 1, 2) @ J
+        normal[self.weights < 6] = np.eye(6)
+        gradient = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
+        pose = np.linalg.solve(np.linalg.cholesky(normal), gradient[..., None])[..., 0]
+        return pose, r - (J @ np.linalg.solve(normal, gradient[..., None]))[..., 0]
+
     def _pose_equations(self, values: Values) -> tuple[Array, Array]:
         """Gradient (n, 6) and normal matrix (n, 6, 6) of a free pose per frame, at the predicted poses."""
         images = self._sight(self._path(values, ()), values).images

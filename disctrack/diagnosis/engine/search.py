@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from scipy import stats
 
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
+from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_all, score_pairs
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
@@ -25,6 +27,7 @@ Array = NDArray[np.float64]
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
+CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -168,6 +171,7 @@ class _Search:
             linear = Linearisation(self.system, current.fit, self.system.candidates)
         if current.candidates and not self._worth_naming(before, current):
             return self._answer(before, before, (), scores, partial=current)
+        current = self._standing(current)
         current, rivals = self._settled(current)
         found = tuple(self._found(current, c, rivals[c.name]) for c in current.candidates)
         return self._answer(before, current, found, scores)
@@ -315,7 +319,27 @@ class _Search:
     def _enough(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
         k = len({n for c in extra for n in c.names})
         enough = self.threshold(k) if len(extra) == 1 else self.threshold(k) + self.threshold(1)
-        return trial.fit.converged and trial.gain > enough
+        return trial.fit.converged and trial.gain > enough and not self._incredible(trial, extra)
+
+    def _incredible(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
+        """Is an amount at the limit of what is ever met, or do two faults of the measurement undo each other?"""
+        values = trial.fit.values
+        limits = [(values[q.name], q) for c in extra if c.kind == "measurement" for q in c.quantities]
+        if any(v != q.null and not q.lower < v < q.upper for v, q in limits):
+            return True
+        faults = [c for c in trial.candidates if c.kind == "measurement"]
+        if len(faults) < 2:
+            return False
+        names = [q.name for c in faults for q in c.quantities]
+        _, derivative = self.system.linearise(values, names)
+        signals, first = [], 0
+        for c in faults:
+            amount = np.array([values[q.name] - q.null for q in c.quantities])
+            signals.append((derivative[..., first : first + len(amount)] @ amount).ravel())
+            first += len(amount)
+        powers = [float(s @ s) for s in signals]
+        pairs = combinations(range(len(faults)), 2)
+        return any(np.sum((signals[a] + signals[b]) ** 2) < CANCELLING * min(powers[a], powers[b]) for a, b in pairs)
 
     def _pruned(self, trial: Trial) -> Trial:
         """Without effects that have become unnecessary."""
@@ -325,6 +349,24 @@ class _Search:
             loss = self._cost(smaller) - self._cost(trial.fit)
             if smaller.converged and loss < self.threshold(len(candidate.names)):
                 trial = replace(trial, candidates=rest, fit=smaller, held_out=self._held_out(smaller))
+        return trial
+
+    def _standing(self, trial: Trial) -> Trial:
+        """Without effects that gain no more than a residual with the memory of what is left may give them."""
+        while trial.candidates and self.settings.noise is None:
+            factors = dict(zip(trial.fit.names, inflation(self.system, trial.fit), strict=True))
+            losses = []
+            for candidate in trial.candidates:
+                rest = tuple(c for c in trial.candidates if c is not candidate)
+                smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
+                loss = self._cost(smaller) - self._cost(trial.fit)
+                enough = self.threshold(len(candidate.names)) * max(factors[n] for n in candidate.names) ** 2
+                if smaller.converged:
+                    losses.append((loss / enough, candidate.name, rest, smaller))
+            if not losses or min(losses, key=lambda item: item[0])[0] >= 1.0:
+                return trial
+            _, _, rest, smaller = min(losses, key=lambda item: item[0])
+            trial = replace(trial, candidates=rest, fit=smaller, held_out=self._held_out(smaller))
         return trial
 
     def _settled(self, trial: Trial) -> tuple[Trial, dict[str, list[Rival]]]:

@@ -6,7 +6,9 @@ import numpy as np
 
 from disctrack.diagnosis.disc.errors import Errors
 from disctrack.diagnosis.disc.learned_law import LearnedLaw
+from disctrack.diagnosis.disc.left_over import LEVEL, LeftOver
 from disctrack.diagnosis.disc.motion import SLIP
+from disctrack.diagnosis.disc.systematic import Systematic
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Found
 from disctrack.diagnosis.engine.system import Quantity
@@ -64,29 +66,72 @@ def law_text(law: LearnedLaw, fit: Fit) -> str:
     return f"{formulas} with {numbers} (SI)" + (", locked to the disc's angles" if law.locked else "")
 
 
-def sentence(diagnosis: Diagnosis, fit: Fit, after: Errors | None, law: LearnedLaw | None) -> str:
-    """The answer in one or a few sentences; `fit` is that of the enlarged model."""
+def systematic_text(systematic: Systematic) -> str:
+    """The measurement's systematic errors, as far as the dots show them; empty where they show none."""
+    parts = []
+    if systematic.lens_px:
+        parts.append(f"{systematic.lens_px:.2g} px in the cameras' fields, over {systematic.lens_length_px:.0f} px")
+    if systematic.dot_px:
+        parts.append(f"{systematic.dot_px:.2g} px of single dots")
+    if systematic.print_m:
+        parts.append(f"{1e6 * systematic.print_m:.2g} um in the dots' places on the face")
+    if not parts:
+        return ""
+    total = f" of {systematic.rms_px:.2g} px" if systematic.rms_px else ""
+    return f"The measurement has systematic errors{total} ({', '.join(parts)}), which all sigmas contain."
+
+
+def sentence(
+    diagnosis: Diagnosis,
+    fit: Fit,
+    after: Errors | None,
+    law: LearnedLaw | None,
+    systematic: Systematic | None = None,
+    left: LeftOver | None = None,
+) -> str:
+    """The answer in one or a few sentences, the motion first; `fit` is that of the enlarged model."""
     if after is None:
         return f"No answer: {diagnosis.reason}."
     level = (
         f"{after.position_um:.2g} um and {after.theta_mdeg:.2g} mdeg a frame ({after.rms_px:.4f} px rms, "
         f"{after.reduced_chi_square:.3f} of the expected variance)"
     )
+    errors = systematic_text(systematic) if systematic is not None else ""
+    white = left is None or left.white
+    remark = "" if white or left is None else _not_noise(left)
+    ending = " ".join(text for text in ("", errors, remark) if text)
+    ending = f" {ending}" if ending else ""
     if law is not None:
         first = "".join(f"Missing in the model: {effect_text(f, diagnosis)}. " for f in diagnosis.found)
         described = f"{law_text(law, fit)} describes it and leaves {level}"
-        return f"{first}A moment is missing that the catalogue does not name: {described}."
+        return f"{first}A moment is missing that the catalogue does not name: {described}.{ending}"
     if diagnosis.verdict == "nothing missing":
-        return f"Nothing is missing at the level of {level}."
+        in_the_motion = " in the motion" if ending else ""
+        return f"Nothing is missing{in_the_motion} at the level of {level}.{ending}"
     effects = "; and ".join(effect_text(f, diagnosis) for f in diagnosis.found)
     it = "it" if len(diagnosis.found) == 1 else "them"
     if diagnosis.verdict == "found":
         fall = f"{diagnosis.before.reduced_chi_square:.4g} to {after.reduced_chi_square:.4g}"
-        return (
-            f"Missing in the model: {effects}. With {it} chi-square per degree of freedom falls from {fall}, and what "
-            f"is left is noise: {level}."
-        )
+        motion = any(f.candidate.kind == "motion" for f in diagnosis.found)
+        rivals = any(r.candidate.kind == "motion" for f in diagnosis.found for r in f.cannot_be_told_from)
+        is_need = "need be" if rivals else "is"
+        of_the_measurement = f"Nothing {is_need} missing in the motion; wrong in the measurement"
+        first = "Missing in the model" if motion else of_the_measurement
+        rest = f"what is left is noise: {level}" if white else f"{level} are left"
+        return f"{first}: {effects}. With {it} chi-square per degree of freedom falls from {fall}, and {rest}.{ending}"
     if effects:
         nearest = f"the nearest description is {effects}, which leaves {level}"
-        return f"Something is missing that the catalogue does not name; {nearest}."
-    return f"Something is missing that no effect of the catalogue describes: {level} are left."
+        return f"Something is missing that the catalogue does not name; {nearest}.{ending}"
+    return f"Something is missing that no effect of the catalogue describes: {level} are left.{ending}"
+
+
+def _not_noise(left: LeftOver) -> str:
+    """What is left, where it is not noise."""
+    where = "in the poses" if left.of_the_motion else "in all numbers of the dots alike"
+    if left.other_p_value >= LEVEL and not left.of_the_motion:
+        where = "in the poses, though no larger than the noise's own scatter allows"
+    p = min(left.pose_p_value, left.other_p_value)
+    return (
+        f"What is left is not noise: it has a memory (p = {p:.1g}, corrected for {left.n_tests} tests), {where}: "
+        f"{left.pose_chi_square:.3f} of the noise in the poses, {left.other_chi_square:.3f} elsewhere."
+    )
