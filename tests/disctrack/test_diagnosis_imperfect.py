@@ -79,6 +79,7 @@ def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
     assert "systematic errors of 0.0" in result.sentence
 
 
+@pytest.mark.slow
 def test_what_is_planted_in_an_imperfect_laboratory_is_named_and_sized():
     trajectory, _ = recording({"kz.k_z": 3e-5}, seed=6)
     result = diagnose_trajectory(trajectory, separate=False)

@@ -282,9 +282,9 @@ class DiscSystem:
 
     def parts_of_residual(self, values: Values) -> tuple[Array, Array]:
         """The part (n, 6) of the whitened residual that a free pose per frame would take, and the rest (n, 4 m)."""
-        pixels, by_pose = self._pixels(self._path(values, ()), values)
-        r = self._residual(pixels, values)
-        J = (self._whiten @ by_pose).reshape(len(r), -1, 6)
+        images = self._sight(self._path(values, ()), values).images
+        r = self._residual(images.pixels, values)
+        J = (self._whiten @ images.by_pose).reshape(len(r), -1, 6)
         normal = np.swapaxes(J, 1, 2) @ J
         normal[self.weights < 6] = np.eye(6)
         gradient = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
