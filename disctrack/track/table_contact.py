@@ -83,7 +83,6 @@ def table_from_disc(
     M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
     M[24:27] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
     M[27:30] = turn[:, 2:] * np.array([1.0, *-middle])
-    back = np.linalg.pinv(M)
 
     # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
     V = noise + np.outer(by_radius, by_radius) + 4.0 * np.outer(by_thickness, by_thickness)
@@ -91,10 +90,10 @@ def table_from_disc(
     board = H @ rig.covariance @ H.T
     difference = np.linalg.solve(board + V, plane) @ plane
     # where they differ by more than both sigmas, it is the board that bends and lies on dust
-    more = np.maximum(plane**2 - np.diag(board + V), 0.0)
-    weigh = rig.covariance + M @ np.diag(more) @ M.T
+    more = board + np.diag(np.maximum(plane**2 - np.diag(board + V), 0.0))
     gains = {"board": np.zeros((3, 3)), "disc": np.eye(3)}
-    gain = gains[source] if source in gains else back @ weigh @ H.T @ np.linalg.inv(H @ weigh @ H.T + V)
+    # of what the plane is as these cameras see the disc: errors that both share do not count
+    gain = gains[source] if source in gains else more @ np.linalg.inv(more + V)
     applied = gain @ plane
     kept = np.eye(N_RIG) - M @ gain @ H
     covariance = kept @ rig.covariance @ kept.T + M @ gain @ stated @ gain.T @ M.T
