@@ -21,7 +21,9 @@ from calibration.stereo_model import (
     predict,
 )
 
+HOPELESS = 1.5  # times the noise of the best model, left in the views it was fitted to: not worth views left out
 FOLDS = 5
+NEGLIGIBLE = 1e-5  # of chi-square, still to be gained: of 10^4 points, a third of a sigma of one parameter
 TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
 SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler model may be worse
 
@@ -60,7 +62,7 @@ def held_out(
         problem = replace(
             refinement.problem, observations=train, weights=inverse_covariance(train.covariance, sigma**2)
         )
-        model = minimise(problem, refinement.model, iterations=12, tolerance=1e-6, damping=1e-7).model
+        model = minimise(problem, refinement.model, iterations=8, tolerance=NEGLIGIBLE, damping=1e-7).model
         tested = np.isin(everything.view, left_out)
         test = everything[tested]
         model = fit_poses(test, model, sigma)
@@ -84,7 +86,7 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
         len(model.R_left_board),
         huber=3.0,
     )
-    return minimise(problem, model, iterations=12, tolerance=1e-6, damping=1e-7).model
+    return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7).model
 
 
 def candidate(refinement: Refinement, sigma: float, good: NDArray[np.bool_]) -> Candidate:
@@ -142,9 +144,11 @@ def choose_terms(
                 progress(f"trying distortion {key[0]!r}, {key[1]} board")
                 terms = Terms(key[0], key[1], equal_aspect)
                 fits[key] = refine_stereo(observations, start, nominal, terms, begin=begin)
+        quietest = min((fits[key] for key in keys), key=lambda fit: fit.unexplained_sigma)
+        worst = HOPELESS * quietest.unexplained_sigma + 1e-3
+        keys = [key for key in keys if fits[key].unexplained_sigma <= worst]
         if len(keys) == 1:
             return keys[0]
-        quietest = min((fits[key] for key in keys), key=lambda fit: fit.unexplained_sigma)
         rows = [candidate(fits[key], quietest.unexplained_sigma, quietest.kept) for key in keys]
         table.extend(rows)
         return keys[best(rows)]

@@ -19,7 +19,10 @@ from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved,
 class Normal:
     """Normal equations of one linearisation: shared parameters first, the views' poses kept apart."""
 
-    shared: Array  # (n_views, s, s) each view's part
+    stereo: Array  # (n_views, s1, s1) each view's part, stereo parameters alone
+    stereo_point: Array  # (n_views, s1, 3 n) the same between stereo parameters and the target's points
+    point: Array  # (n_views, n, 3, 3) and of each point
+    shape: Array  # (3 n, s2) directions in which the points may move
     gradient: Array  # (n_views, s)
     cross: Array  # (n_views, s, 6)
     pose: Array  # (n_views, 6, 6)
@@ -27,12 +30,30 @@ class Normal:
     cost: float  # chi-square, or Huber's sum when robust
     residuals: Array  # (m, 2) observed - predicted [px]
 
+    def _assembled(self, stereo: Array, stereo_point: Array, point: Array) -> Array:
+        """(s, s) of all shared parameters, from one view's parts or from their sums."""
+        s1, s2 = len(stereo), self.shape.shape[1]
+        if not s2:
+            return stereo
+        total = np.empty((s1 + s2, s1 + s2))
+        total[:s1, :s1] = stereo
+        total[:s1, s1:] = stereo_point @ self.shape
+        total[s1:, :s1] = total[:s1, s1:].T
+        moved_points = (point @ self.shape.reshape(len(point), 3, s2)).reshape(-1, s2)
+        total[s1:, s1:] = self.shape.T @ moved_points
+        return total
+
+    @property
+    def shared(self) -> Array:
+        """(s, s) of the shared parameters, all views together, before the poses are eliminated."""
+        return self._assembled(self.stereo.sum(0), self.stereo_point.sum(0), self.point.sum(0))
+
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Damped step of the shared parameters (s,) and of the poses (n_views, 6)."""
         pose = self.pose * (1 + damping * np.eye(6))
         carried, own = self._eliminated(pose)
-        total = self.shared.sum(0)
-        schur = total + damping * np.diag(np.diag(total)) - np.einsum("vsi,vit->st", self.cross, carried)
+        total = self.shared
+        schur = total + damping * np.diag(np.diag(total)) - self._by_poses(carried)
         step = _scaled_solve(schur, (self.gradient - np.einsum("vsi,vi->vs", self.cross, own)).sum(0))
         return step, own - carried @ step
 
@@ -41,15 +62,23 @@ class Normal:
         own: Array = np.asarray(np.linalg.solve(pose, self.pose_gradient[..., None])[..., 0], np.float64)
         return np.asarray(carried, np.float64), own
 
+    def _by_poses(self, carried: Array) -> Array:
+        """What the poses take from the shared parameters' information (s, s)."""
+        V, s, _ = self.cross.shape
+        taken: Array = np.swapaxes(self.cross, 1, 2).reshape(6 * V, s).T @ carried.reshape(6 * V, s)
+        return taken
+
     def view_information(self) -> tuple[Array, Array]:
         """What each view, its pose eliminated, tells of the shared parameters: (v, s, s) and gradient (v, s)."""
         carried, own = self._eliminated(self.pose)
-        return self.shared - self.cross @ carried, self.gradient - np.einsum("vsi,vi->vs", self.cross, own)
+        parts = zip(self.stereo, self.stereo_point, self.point, strict=True)
+        shared = np.stack([self._assembled(*part) for part in parts])
+        return shared - self.cross @ carried, self.gradient - np.einsum("vsi,vi->vs", self.cross, own)
 
     def covariances(self) -> tuple[Array, Array, Array]:
         """Of the shared parameters (s, s), of each pose (v, 6, 6), and between shared and pose (v, s, 6)."""
         carried, _ = self._eliminated(self.pose)
-        information = self.shared.sum(0) - np.einsum("vsi,vit->st", self.cross, carried)
+        information = self.shared - self._by_poses(carried)
         shared = _scaled_solve(information, np.eye(len(information)))
         cross = -shared @ np.swapaxes(carried, 1, 2)
         return shared, np.linalg.inv(self.pose) - carried @ cross, cross
@@ -84,30 +113,41 @@ class Problem:
         pixels, d_stereo, d_pose, d_point = predict(model, o)
         residuals = o.pixels - pixels
         m, s1, s2 = len(o), self.stereo_basis.shape[1], self.shape_basis.shape[-1]
-        s = s1 + s2
-        block = np.empty((m, 2, s + 7))  # derivatives by shared parameters and pose, then the residual
+        n = len(self.shape_basis)
+        block = np.empty((m, 2, s1 + 10))  # derivatives by stereo parameters, pose and point, then the residual
         block[..., :s1] = (d_stereo.reshape(2 * m, N_STEREO) @ self.stereo_basis).reshape(m, 2, s1)
-        if s2:
-            block[..., s1:s] = d_point @ self.shape_basis[o.point]
-        block[..., s : s + 6] = d_pose
-        block[..., s + 6] = residuals
+        block[..., s1 : s1 + 6] = d_pose
+        block[..., s1 + 6 : s1 + 9] = d_point
+        block[..., s1 + 9] = residuals
         mahalanobis = np.sqrt(quadratic(self.weights, residuals))
         cost, factor = _huber(mahalanobis, self.huber)
-        block = _whitened(block, self.weights * factor[:, None, None]).reshape(2 * m, s + 7)
+        block = _whitened(block, self.weights * factor[:, None, None])
         V = self.n_views
-        squares = np.zeros((V, s + 7, s + 7))
-        bounds = 2 * np.searchsorted(o.view, np.arange(V + 1))
+        squares = np.zeros((V, s1 + 10, s1 + 10))
+        bounds = np.searchsorted(o.view, np.arange(V + 1))
         for v in range(V):
-            rows = block[bounds[v] : bounds[v + 1]]
+            rows = block[bounds[v] : bounds[v + 1]].reshape(-1, s1 + 10)
             squares[v] = rows.T @ rows
-        pose = squares[:, s : s + 6, s : s + 6]
+        pose = squares[:, s1 : s1 + 6, s1 : s1 + 6]
         pose[bounds[1:] == bounds[:-1]] = np.eye(6)
+        per_point = np.zeros((V, n if s2 else 0, 3, s1 + 10))  # a view sees a point twice at most, once per camera
+        if s2:
+            products = np.swapaxes(block[..., s1 + 6 : s1 + 9], 1, 2) @ block
+            for camera in (0, 1):
+                seen = o.camera == camera
+                per_point[o.view[seen], o.point[seen]] += products[seen]
+        shape = self.shape_basis.reshape(3 * n, s2)[: 3 * n if s2 else 0]
+        flat = per_point.reshape(V, -1, s1 + 10)
+        of_shape = shape.T @ flat  # (V, s2, s1 + 10)
         return Normal(
-            shared=squares[:, :s, :s],
-            gradient=squares[:, :s, s + 6],
-            cross=squares[:, :s, s : s + 6],
+            stereo=squares[:, :s1, :s1],
+            stereo_point=np.swapaxes(flat[..., :s1], 1, 2),
+            point=per_point[..., s1 + 6 : s1 + 9],
+            shape=shape,
+            gradient=np.concatenate([squares[:, :s1, s1 + 9], of_shape[..., s1 + 9]], axis=1),
+            cross=np.concatenate([squares[:, :s1, s1 : s1 + 6], of_shape[..., s1 : s1 + 6]], axis=1),
             pose=pose,
-            pose_gradient=squares[:, s : s + 6, s + 6],
+            pose_gradient=squares[:, s1 : s1 + 6, s1 + 9],
             cost=cost,
             residuals=residuals,
         )

@@ -5,7 +5,7 @@ Outliers are rejected and the noise that the points' own covariances leave unexp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,26 +82,29 @@ def refine_stereo(
     for turn in range(MAX_ROUNDS):
         used = observations[kept]
         problem = Problem(used, inverse_covariance(used.covariance, extra), stereo_basis, shape_basis, n_views)
-        if _degrees_of_freedom(problem, len(used)) <= 0:
+        dof = _degrees_of_freedom(problem, len(used))
+        if dof <= 0:
             raise CalibrationError(
                 f"{len(used)} points in {len(np.unique(used.view))} views are fewer than the parameters to be found: "
                 "take more views, or fewer free terms"
             )
-        minimum = minimise(problem, model, damping=1e-6)
+        minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict(model, observations)[0]
-        dof = _degrees_of_freedom(problem, len(used))
         new_extra = _extra_variance(residuals[kept], used.covariance, dof)
-        distance = _mahalanobis2(residuals, observations.covariance, new_extra)
-        new_kept = distance < reject_beyond**2
+        new_kept = _mahalanobis2(residuals, observations.covariance, new_extra) < reject_beyond**2
         if turn >= FREE_ROUNDS:
             new_kept &= kept
-        same = bool((new_kept == kept).all())
-        settled = same and abs(new_extra - extra) <= 1e-3 * extra + 1e-10
+        settled = abs(new_extra - extra) <= 0.01 * extra + 1e-10 and bool((new_kept == kept).all())
         extra = new_extra
         if settled or turn == MAX_ROUNDS - 1:  # what is returned belongs to the points that were fitted
             break
         kept = new_kept
+    # noise and points are settled: now the minimum itself
+    problem = replace(problem, weights=inverse_covariance(used.covariance, extra))
+    minimum = minimise(problem, model, damping=1e-6)
+    model, total = minimum.model, total + minimum.iterations
+    residuals = observations.pixels - predict(model, observations)[0]
     own = _mahalanobis2(residuals[kept], observations.covariance[kept], 0.0)
     return Refinement(
         model=model,
