@@ -159,7 +159,7 @@ def _put(group: h5py.Group, name: str, value: Any, units: str, description: str)
 
 
 def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
-    """A rig as datasets of an HDF5 group: also part of trajectory files."""
+    """A rig as datasets of an HDF5 group. (A trajectory file holds the same numbers with labelled axes.)"""
     group.attrs["world"] = "table, k up" if rig.world_is_table else "axes of the left camera"
     group.attrs["world_is_table"] = int(rig.world_is_table)
     for name, camera in zip(("left", "right"), rig.cameras, strict=True):

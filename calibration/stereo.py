@@ -32,8 +32,8 @@ Progress = Callable[[str, int, int], None]
 class CalibrationSettings:
     """What the user may decide; "auto" is decided by held-out error."""
 
-    distortion: str = "auto"  # or a key of refinement.DISTORTION_MODELS
-    board: str = "auto"  # or one of refinement.BOARD_MODELS
+    distortion: str = "auto"  # or a key of stereo_model.DISTORTION_MODELS
+    board: str = "auto"  # or one of stereo_model.BOARD_MODELS
     equal_aspect: bool = False  # fx = fy
     threads: int = 2
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)

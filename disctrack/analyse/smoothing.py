@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 LENGTHS = 2.0 * 1.15 ** np.arange(20)  # l in frame intervals: 2 (content up to the Nyquist rate) to 28
 RATIOS = 10.0 ** np.arange(0.0, 10.1, 0.5)  # (A / sigma)^2
 SEGMENT = 96  # frames in which l and A are taken as constant: 48 or 64 make the variance too small by a factor 2
+MAX_SLOPE = 0.25  # of l, in intervals per interval
 # A disc's motion is a sum of near-sinusoids, smoother than any sample of the process: the likelihood then prefers an l
 # that is a little too long. One step shorter costs 15 % in scatter and brings the squared error of accelerations from
 # 2 to 4 times the predicted variance to 0.87 to 1.0 (simulated motions at 60, 25 and 9 degrees).
-MAX_SLOPE = 0.25  # of l, in intervals per interval
 SHORTEN_STEPS = 1
 HALF_WINDOW_LENGTHS = 3.0  # half width of a window in l; 4 would gain 3 % in scatter and cost twice the time
 MIN_WINDOW_SAMPLES = 4  # a line and a curvature, and one to spare
-NOISE_SCALES = 2.0 ** np.arange(-3.0, 3.01, 0.05)  # of sigma^2
+NOISE_SCALES = 2.0 ** np.arange(-3.0, 3.01, 0.05)  # variance found over variance stated
 
 
 @dataclass(frozen=True)

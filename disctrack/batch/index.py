@@ -46,14 +46,27 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
     pairs = sum(row["pairs_measured"] for row in done)
     said = (
         f"{_counted(len(rows), 'recording')}, {len(done)} of them measured, {_counted(pairs, 'pair')} with a pose. "
-        "Values with one standard "
-        "deviation; a dash where the recording does not determine a number."
+        "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the dots "
+        "is the only loss of a rolling model fitted to all images; where repeats are compared, k_m is what accounts for "
+        "the whole loss of energy, or that of the diagnosis: other losses enter these in other ways, and so they differ."
     )
     files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
     problems = [
         Markup(f"<b>{text(r['recording'])}</b> ({text(r['status'])}): {text(r['reason'])}") for r in rows if r["reason"]
     ]
-    header = ("recording", "status", "pairs", "k_m (10⁻⁸ m s²)", "n_E", "n_θ", "n_ψ̇", "t_f (s)", "rms (px)", "χ²", "")
+    header = (
+        "recording",
+        "status",
+        "pairs",
+        "k_m from the dots (10⁻⁸ m s²)",
+        "n_E",
+        "n_θ",
+        "n_ψ̇",
+        "t_f (s)",
+        "rms (px)",
+        "χ²",
+        "",
+    )
     results = table("", header, [_cells(row) for row in rows], [row["status"].split()[0] for row in rows])
     return page(
         "Batch of recordings",

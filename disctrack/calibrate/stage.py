@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 from dataclasses import dataclass
@@ -161,6 +160,6 @@ def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str,
             source.board,
             source.table_view,
             source.board_thickness,
-            dataclasses.replace(source.settings),
+            source.settings,
             report,
         )

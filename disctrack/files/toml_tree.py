@@ -1,4 +1,4 @@
-"""Settings as frozen dataclasses, and the TOML text of the same shape: one way and back, for any tree of them.
+"""TOML files: read with errors that name them; settings as frozen dataclasses from such a tree, and back to text.
 
 Fields may be bool, int, float, str, tuples, dictionaries by name, and dataclasses; a Path is not part of the file.
 """
@@ -6,6 +6,7 @@ Fields may be bool, int, float, str, tuples, dictionaries by name, and dataclass
 from __future__ import annotations
 
 import json
+import tomllib
 import types
 import typing
 from dataclasses import fields, is_dataclass
@@ -13,7 +14,27 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from disctrack.errors import SceneError
+import numpy as np
+
+from disctrack.errors import DiscTrackError, SceneError
+
+
+def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
+    """The file's tree. Raises `error` with the file, what is wrong with it, and what to do."""
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except UnicodeDecodeError as reason:
+        raise error(f"{path}: byte {reason.start} is not UTF-8 text. Save the file as UTF-8.") from reason
+    except tomllib.TOMLDecodeError as reason:
+        raise error(
+            f"{path}: not valid TOML: {reason}. Correct that line; if this is not a TOML file, give the right one."
+        ) from reason
+    except RecursionError as reason:
+        raise error(f"{path}: nested too deeply for a file of settings.") from reason
+    except ValueError as reason:  # e.g. an integer of thousands of digits, a date that does not exist
+        raise error(f"{path}: a value cannot be read: {reason}.") from reason
+    except OSError as reason:
+        raise error(f"{path}: cannot be read: {reason.strerror}. Give the path of a TOML file.") from reason
 
 
 def build(kind: Any, tree: dict[str, Any], where: str, section: str = "") -> Any:
@@ -63,15 +84,25 @@ def toml_lines(settings: Any, name: str = "") -> list[str]:
         if is_dataclass(value):
             below += toml_lines(value, f"{name}.{f.name}" if name else f.name)
         else:
-            own.append(f"{f.name} = {_toml_value(value)}")
+            own.append(f"{f.name} = {toml_value(value)}")
     return own + below
 
 
-def _toml_value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A value as TOML writes it."""
     if is_dataclass(value):
         value = {f.name: getattr(value, f.name) for f in fields(value)}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {_toml_value(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    return json.dumps(value) if isinstance(value, str) else repr(value)
+        return "{" + ", ".join(f"{_text(str(k))} = {toml_value(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return _text(value) if isinstance(value, str) else repr(value)
+
+
+def _text(value: str) -> str:
+    # JSON's escapes are TOML's, but for the pairs by which it writes what lies beyond 16 bits, and for DEL
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from calibration.tolerances import BoardTolerances
 from disctrack.disc import Disc, disc_from_mm
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep
+from disctrack.files.toml_tree import read_toml
 
 FILE_NAME = RECORDING_FILE
 
@@ -97,7 +97,7 @@ def read_recording(path: str | Path) -> Recording:
     """
     file = _recording_file(Path(path))
     keep(file)
-    declared = _parse_toml(file)
+    declared = read_toml(file, RecordingError)
     _refuse_unknown_keys(file, declared)
     cameras, disc, markers = (_Section(file, declared, name) for name in ("cameras", "disc", "markers"))
     calibration = _Section(file, declared, "calibration")
@@ -132,21 +132,6 @@ def _recording_file(path: Path) -> Path:
     except (OSError, ValueError) as error:  # a name too long, or with a null character
         raise RecordingError(f"{path!s:.200}: not a usable path ({error}). Give a recording's folder.") from error
     return path
-
-
-def _parse_toml(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_bytes().decode("utf-8"))
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{file}: byte {error.start} is not UTF-8 text. Save the file as UTF-8.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise RecordingError(f"{file}: not valid TOML: {error}. Correct that line.") from error
-    except RecursionError as error:
-        raise RecordingError(f"{file}: nested too deeply to be a {FILE_NAME}.") from error
-    except ValueError as error:  # e.g. an integer of thousands of digits, a date that does not exist
-        raise RecordingError(f"{file}: a value cannot be read: {error}.") from error
-    except OSError as error:
-        raise RecordingError(f"{file}: cannot be read: {error.strerror}.") from error
 
 
 def _refuse_unknown_keys(file: Path, declared: Mapping[str, Any]) -> None:

@@ -22,8 +22,8 @@ from disctrack.repeats.spread import Spread
 Array = NDArray[np.float64]
 
 MOST_NAMED = 8  # runs in a legend
-FITTED_LABELS = {"n_energy": "n_E", "n_theta": "n_θ", "n_psidot": "n_ψ̇", "k_m": "k_m (10⁻⁷ m s²)"}
-FITTED_SCALES = {"n_energy": 1.0, "n_theta": 1.0, "n_psidot": 1.0, "k_m": 1e7}
+FITTED_LABELS = {"n_energy": "n_E", "n_theta": "n_θ", "n_psidot": "n_ψ̇", "k_m": "k_m (10⁻⁸ m s²)"}
+FITTED_SCALES = {"n_energy": 1.0, "n_theta": 1.0, "n_psidot": 1.0, "k_m": 1e8}
 
 
 def group_figures(group: RepeatGroup, number: int) -> tuple[Drawn, ...]:

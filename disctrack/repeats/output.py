@@ -83,12 +83,17 @@ def _table_section(found: ExponentTable, figure: Any, pictures: dict[str, str]) 
     ):
         cells = [cell(n, found.averages[n]) if n in found.averages else "-" for n in FITTED]
         rows.append((label, "", "", *cells))
-    header = ("case", "trial", "recording", "n_E", "n_θ", "n_ψ̇", "t_f (s)", "k_m (10⁻⁷ m s²)")
+    sources = sorted({run.k_m_source for _, _, run in found.rows})
+    k_m = f"k_m {_K_M_SOURCES[sources[0]]} (10⁻⁸ m s²)"  # one kind of number in one column
+    header = ("case", "trial", "recording", "n_E", "n_θ", "n_ψ̇", "t_f (s)", k_m)
     caption = "As tables 2 and 3 of Ma et al. 2014 (value ± σ of one run). t_f is on each recording's own clock."
     verdicts = bullets(f"{name}: {a.verdict}" for name, a in found.averages.items() if a.n > 1)
-    said = paragraph(f"k_m: {_k_m_words(sorted({run.k_m_source for _, _, run in found.rows}))}")
+    said = paragraph(f"k_m: {_k_m_words(sources)}")
     picture = gallery([figure], pictures) if figure else ""
     return section(found.title, [table(caption, header, rows), verdicts, said, picture])
+
+
+_K_M_SOURCES = {"diagnosis": "of the diagnosis", "energy": "from the energy"}
 
 
 def _k_m_words(sources: Sequence[str]) -> str:

@@ -9,14 +9,13 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from disctrack.disc import MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
-from disctrack.files.toml_tree import build, toml_lines
+from disctrack.files.toml_tree import build, read_toml, toml_lines
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -276,15 +275,7 @@ def load_scene(path: str | Path) -> Scene:
     wrong kind.
     """
     path = Path(path)
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(
-            f"{path}: the scene cannot be read ({error.strerror}); give the path of a TOML file"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: not a TOML file ({error}); correct it there") from error
-    return scene_from_tree(tree, where=str(path), folder=path.parent)
+    return scene_from_tree(read_toml(path, SceneError), where=str(path), folder=path.parent)
 
 
 def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = Path()) -> Scene:

@@ -85,7 +85,9 @@ def test_a_trajectory_without_any_answer_can_be_drawn(trajectory, tmp_path, name
         if isinstance(value := getattr(trajectory, f.name), np.ndarray) and value.dtype.kind == "f" and f.name != "time"
     }
     lost = dataclasses.replace(trajectory, **nothing, frame_status=np.full(12, FrameStatus.NOT_CONVERGED, np.uint8))
-    save_figure(plots.FIGURES[name](lost), tmp_path / f"{name}.png")
+    drawn = plots.FIGURES[name](lost)
+    picture = cv2.imread(str(save_figure(drawn, tmp_path / f"{name}.png")))
+    assert picture.std() > 1  # axes and their names are there all the same
 
 
 def test_the_coordinates_are_drawn_in_millimetres_and_degrees(trajectory):

@@ -297,7 +297,7 @@ def test_truth_of_another_file_is_refused(tmp_path):
         ("[cameras]\nbit_depth = 9", "bit_depth = 9; expected 8, 10, 12, 16"),
         ("[cameras]\nn_frames = 2.5", "cameras.n_frames = 2.5 is of the wrong kind; expected int"),
         ("[rig]\ndistance_mm = [400.0]", "rig.distance_mm has 1 values, 2 are expected"),
-        ("seed = ", "not a TOML file"),
+        ("seed = ", "not valid TOML"),
         ('folder = "x"', "unknown key 'folder'"),
         ("[rig]\nmm_per_px = 0.0", "rig.mm_per_px = 0.0; expected a positive number"),
         ("[markers]\ncentres_mm = [[36, 0], [0, 9], [9, 0]]", "a dot over the disc's rim"),

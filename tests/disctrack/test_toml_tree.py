@@ -1,0 +1,68 @@
+"""Settings survive their TOML, whatever they hold."""
+
+import tomllib
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from disctrack.errors import RecordingError
+from disctrack.files.toml_tree import build, read_toml, toml_lines, toml_value
+
+
+@dataclass(frozen=True)
+class Inner:
+    on: bool = True
+    share: float = 0.5
+
+
+@dataclass(frozen=True)
+class Outer:
+    title: str = "x"
+    off: bool = False
+    pairs: tuple[tuple[float, float], ...] = ()
+    named: dict[str, float] = field(default_factory=dict)
+    inner: Inner = field(default_factory=Inner)
+    many: tuple[Inner, ...] = ()
+
+
+@pytest.mark.parametrize(
+    "title", ["", 'a "b" \\ c', "ψ̇ µm", "disc \U0001d703 \U0001f4bf", "tab\tline\nend\x00\x1f\x7f"]
+)
+def test_settings_survive_their_text(title):
+    settings = Outer(
+        title,
+        True,
+        ((1.0, float("inf")), (-0.0, 1e-300)),
+        {title or "k": 2.0},
+        Inner(False, float(np.float64(0.1))),
+        (Inner(), Inner(False)),
+    )
+    assert build(Outer, tomllib.loads("\n".join(toml_lines(settings))), "test") == settings
+
+
+def test_numbers_of_numpy_are_numbers():
+    values = [np.float64(0.1), np.float32(2.0), np.int64(3), np.bool_(True), np.array([1.5, np.nan])]
+    text = toml_value(values)
+    again = tomllib.loads(f"a = {text}")["a"]
+    assert again[:4] == [0.1, 2.0, 3, True]
+    assert again[4][0] == 1.5
+    assert np.isnan(again[4][1])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"a = ", "not valid TOML"),
+        (b"a = '\xff'", "byte 5 is not UTF-8"),
+        (b"a = " + b"[" * 100_000, "nested too deeply"),
+        (b"a = " + b"1" * 10_000, "a value cannot be read"),
+    ],
+)
+def test_a_file_that_is_no_toml_is_named_with_the_reason(tmp_path, content, message):
+    path = tmp_path / "settings.toml"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=f"settings.toml: .*{message}"):
+        read_toml(path, RecordingError)
+    with pytest.raises(RecordingError, match=r"nowhere\.toml: cannot be read"):
+        read_toml(tmp_path / "nowhere.toml", RecordingError)
