@@ -46,9 +46,10 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
     pairs = sum(row["pairs_measured"] for row in done)
     said = (
         f"{_counted(len(rows), 'recording')}, {len(done)} of them measured, {_counted(pairs, 'pair')} with a pose. "
-        "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the dots "
-        "is the only loss of a rolling model fitted to all images; where repeats are compared, k_m is what accounts for "
-        "the whole loss of energy, or that of the diagnosis: other losses enter these in other ways, and so they differ."
+        "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the "
+        "dots is the only loss of a rolling model fitted to all images; where repeats are compared, k_m is what accounts "
+        "for the whole loss of energy, or that of the diagnosis: other losses enter these in other ways, and so they "
+        "differ."
     )
     files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
     problems = [
