@@ -47,7 +47,7 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
     said = (
         f"{_counted(len(rows), 'recording')}, {len(done)} of them measured, {_counted(pairs, 'pair')} with a pose. "
         "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the "
-        "dots is the only loss of a rolling model fitted to all images; where repeats are compared, k_m is what accounts "
+        "dots is the only loss of a rolling model fitted to all images; where repeats are compared, k_m accounts "
         "for the whole loss of energy, or that of the diagnosis: other losses enter these in other ways, and so they "
         "differ."
     )
