@@ -181,6 +181,59 @@ def test_noise_that_remembers_is_no_effect_and_widens_sigmas():
     assert np.sqrt(np.mean(np.square(pulls))) < 2.0  # of five standard normals: exceeded once in 10 000
 
 
+def test_parameters_may_be_off_by_a_factor_of_two(rng):
+    time = np.arange(0, 40, 0.02)
+    angle = motion(lambda t, y: [y[1], -64 * np.sin(y[0]) - 0.05 * y[1]], [1.2, 0.0], time)[0]
+    pendulum = Equations({"th": "w", "w": "-k*sin(th) - c*w"}, {"k": 30.0, "c": 0.0})
+    run = Run(17.0 + time, {"th": angle + 1e-3 * rng.standard_normal(len(time))})
+    answer = diagnose(pendulum, run, [terms.coulomb("w"), terms.quadratic("w")])
+    assert answer.verdict == "nothing missing"
+    assert within(answer, "k", 64.0)
+
+
+def test_where_the_model_loses_the_motion_it_is_asked_in_stretches_and_then_as_a_whole(rng):
+    """Hares and lynxes, the hares with a limit of their own that the equations do not know."""
+    time = np.arange(0, 40, 0.2)
+    x, y = motion(lambda t, s: [1.1 * s[0] - 0.4 * s[0] * s[1] - 0.02 * s[0] ** 2, -0.4 * s[1] + 0.1 * s[0] * s[1]],
+                  [10.0, 5.0], time)  # fmt: skip
+    known = Equations({"x": "a*x - b*x*y", "y": "-c*y + d*x*y"}, {"a": 1.0, "b": 0.35, "c": 0.45, "d": 0.12})
+    run = Run(time, {"x": x + 0.05 * rng.standard_normal(200), "y": y + 0.05 * rng.standard_normal(200)})
+    answer = diagnose(known, run, [*terms.products("x", ["x", "y"], 2), *terms.products("y", ["x", "y"], 2)])
+    assert answer.found == ("x_gets_x_x",)
+    assert within(answer, "x_gets_x_x.amount", -0.02)
+    assert any("whole runs" in note for note in answer.notes)
+
+
+@pytest.mark.slow
+def test_friction_in_the_joint_of_a_chaotic_double_pendulum_is_named(rng):
+    """Twenty seconds of which no model can follow more than six; masses, lengths and frictions are all fitted."""
+    l1, l2, m1, m2, c1, c2, f = 0.2, 0.25, 0.15, 0.1, 3e-4, 2e-4, 1e-3
+
+    def rates(t, y):
+        a, b, p, q = y
+        d, joint = a - b, c2 * (y[3] - y[2]) + f * np.tanh((y[3] - y[2]) / 1e-3)
+        M = np.array([[(m1 + m2) * l1**2, m2 * l1 * l2 * np.cos(d)], [m2 * l1 * l2 * np.cos(d), m2 * l2**2]])
+        F = [-m2 * l1 * l2 * np.sin(d) * q**2 - (m1 + m2) * 9.81 * l1 * np.sin(a) - c1 * p + joint,
+             m2 * l1 * l2 * np.sin(d) * p**2 - m2 * 9.81 * l2 * np.sin(b) - joint]  # fmt: skip
+        return [p, q, *np.linalg.solve(M, F)]
+
+    time = np.arange(0, 20, 0.004)
+    y = motion(rates, [2.5, 2.0, 0.0, 0.0], time)
+    double = Equations(
+        {"a": "p", "b": "q",
+         "p": "-m2*l1*l2*sin(a-b)*q**2 - (m1+m2)*9.81*l1*sin(a) - c1*p + c2*(q-p)",
+         "q": "m2*l1*l2*sin(a-b)*p**2 - m2*9.81*l2*sin(b) - c2*(q-p)"},
+        {"m1": 0.16, "m2": 0.1, "l1": 0.2, "l2": 0.24, "c1": 1e-4, "c2": 1e-4},
+        mass={("p", "p"): "(m1+m2)*l1**2", ("p", "q"): "m2*l1*l2*cos(a-b)", ("q", "q"): "m2*l2**2"},
+    )  # fmt: skip
+    joint = Term("joint", {"p": "f*sign(q-p)", "q": "-f*sign(q-p)"}, parameters={"f": Parameter(0.0, lower=0.0)})
+    data = {"a": y[0] + 2e-3 * rng.standard_normal(len(time)), "b": y[1] + 2e-3 * rng.standard_normal(len(time))}
+    answer = diagnose(double, Run(time, data), [terms.coulomb("p"), terms.quadratic("p"), terms.quadratic("q"), joint])
+    assert answer.found == ("joint",)
+    assert within(answer, "joint.f", f)
+    assert any("stretches" in note for note in answer.notes)
+
+
 def test_what_no_term_describes_is_unexplained():
     noise = SIGMA * np.random.default_rng(7).standard_normal(len(TIME))
     pushed = motion(

@@ -253,7 +253,10 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
     pieces[:, 3] = values[:, :-1]
     if run.hold == "linear":
         pieces[:, 2] = np.diff(values, axis=1) / np.diff(time)
-    return time, pieces
+        return time, pieces
+    changes = np.flatnonzero(np.any(np.diff(pieces[:, 3], axis=1) != 0, axis=0)) + 1
+    kept = np.concatenate([[0], changes])
+    return np.concatenate([time[kept], time[-1:]]), np.ascontiguousarray(pieces[:, :, kept])
 
 
 def _numbers(values: ArrayLike, what: str) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from disctrack.diagnosis.engine.fit import compress, fit
-from disctrack.diagnosis.engine.score import Linearisation
+from disctrack.diagnosis.engine.held_out import held_out
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import System
@@ -26,7 +26,7 @@ from disctrack.diagnosis.equations.noise import (
     with_noise,
 )
 from disctrack.diagnosis.equations.start import LOST, guessed, led, misfit, turn
-from disctrack.diagnosis.equations.system import EquationSystem, cut
+from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part
 from disctrack.errors import AnalysisError
 
 Array = NDArray[np.float64]
@@ -35,6 +35,7 @@ JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a 
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
 MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
+SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
@@ -67,20 +68,26 @@ def ask(
     samples = with_noise(given)
     notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
     system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
-    system, values = _prepared(system)
-    start = led(system, values) if stretch is None else None
-    if start is not None and start.followed == 0.0:
-        raise AnalysisError(_not_followed(system, values))
+    system, declared = _prepared(system)
+    start = None
+    if stretch is None:
+        start = led(system, declared)
+        if start.followed == 0.0:
+            raise AnalysisError(_not_followed(system, declared))
+        followed = system.with_(stretches=first_part(system.stretches, start.followed))
+        held, remark = redundant(followed, start.values)
+        if held:
+            system, notes = system.with_(held=held), [*notes, remark]
+            start = led(system, declared)
+    values = declared if start is None else start.values
     if start is None or not start.whole:
-        length = stretch or (start.followed if start else np.inf)
-        system, values, note = _in_stretches(system, values if start is None else start.values, length)
+        length = stretch or (SAFE * start.followed if start else np.inf)
+        system, values, note = _in_stretches(system, values, length)
         notes.append(note)
-    else:
-        values = start.values
+    if not np.isfinite(system.linearise(values, [])[0]).all():
+        raise AnalysisError(_not_followed(system, values))
     system = _sized(system, values)
-    system, held = _without_redundant(system, values)
-    notes += held
-    diagnosis = _searched(system, values, settings)
+    diagnosis = diagnose(system, values, settings, system.training)
     if start is not None and not start.whole and diagnosis.found:
         system, diagnosis, more = _joined(system, samples, diagnosis, settings)
         notes += more
@@ -95,12 +102,6 @@ def ask(
         diagnosis, shapes = refine_shapes(judged, diagnosis)
         notes += list(shapes)
     return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory)
-
-
-def _searched(system: EquationSystem, values: Mapping[str, float], settings: Settings | None) -> Diagnosis:
-    """The engine's answer; where the channels' noise turns out otherwise than their data said, once more."""
-    diagnosis = diagnose(system, values, settings, system.training)
-    return diagnosis
 
 
 def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
@@ -163,32 +164,29 @@ def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, f
     return found
 
 
-def _without_redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[EquationSystem, list[str]]:
-    """Parameters that the data cannot part from others are held as declared, and that is said."""
+def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tuple[str, ...], str]:
+    """Parameters that the data cannot part from others, to be held as declared; and how to say that."""
     free = [q for q in system.base if not q.name.startswith("state.") and np.isinf(q.prior_sigma)]
-    if len(free) < 2:
-        return system, []
-    here = fit(system, tuple(q for q in system.base if q.name.startswith("state.")), values, max_iterations=0)
-    linear = Linearisation(system, here, [])
-    residual, derivative = system.linearise(values, [*here.names, *(q.name for q in free)])
+    states = [q.name for q in system.base if q.name.startswith("state.")]
+    residual, derivative = system.linearise(values, [*states, *(q.name for q in free)])
+    if len(free) < 2 or not np.isfinite(derivative).all():
+        return (), ""
     _, matrix = compress(residual, derivative)
-    k = len(here.names)
+    k = len(states)
     basis = np.linalg.qr(matrix[:, :k] / np.maximum(np.linalg.norm(matrix[:, :k], axis=0), 1e-300))[0]
-    del linear
     columns = matrix[:, k:] * np.array([max(abs(values.get(q.name, q.null)), q.scale) for q in free])
     before = np.linalg.norm(columns, axis=0)
     cleared = columns - basis @ (basis.T @ columns)
     _, R, order = qr(cleared / np.where(before > 0, before, 1.0), mode="economic", pivoting=True)
     weak = [free[j] for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
     if not weak:
-        return system, []
+        return (), ""
     names = sorted({q.name.partition("[")[0] for q in weak})
     others = sorted({q.name.partition("[")[0] for q in free} - set(names))
-    note = (
+    return tuple(names), (
         f"{', '.join(names)} cannot be told from {', '.join(others) or 'the initial states'} with these data and "
         f"{'is' if len(names) == 1 else 'are'} held as declared; values of the others hold for that"
     )
-    return system.with_(held=(*system.held, *names)), [note]
 
 
 def _in_stretches(
@@ -217,24 +215,31 @@ def _joined(
     """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
     names = tuple(f.candidate.name for f in diagnosis.found)
     whole = system.with_(stretches=samples, promoted=names)
-    first = {k: v for k, v in diagnosis.after.values.items() if not k.startswith("state.") or not k.endswith("#")}
     guesses, _ = guessed(whole)
-    start = led(whole, guesses | first)
+    # a run's first stretch begins where the run does, under the same name
+    start = led(whole, guesses | diagnosis.after.values)
     if not start.whole:
         return system, diagnosis, [f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"]
     rest = diagnose(whole, start.values, settings, whole.training)
     plain = whole.with_(promoted=())
-    before = fit(plain, plain.base, led(plain, guesses | first).values)
+    declared = _without(rest.before.values, names)
+    before = fit(plain, plain.base, declared)
     found = []
     for f in diagnosis.found:
-        others = tuple(n for n in names if n != f.candidate.name)
-        smaller = whole.with_(promoted=others)
-        without = fit(smaller, smaller.base, rest.before.values)
-        gain = (without.cost - rest.before.cost) / rest.noise
-        found.append(replace(f, gain=float(gain)))
-    merged = replace(rest, verdict="found" if rest.verdict == "nothing missing" else rest.verdict,
-                     found=(*found, *rest.found), before=before, tried=diagnosis.tried)  # fmt: skip
-    return plain, merged, []
+        smaller = whole.with_(promoted=tuple(n for n in names if n != f.candidate.name))
+        without = fit(smaller, smaller.base, _without(rest.before.values, (f.candidate.name,)))
+        found.append(replace(f, gain=float((without.cost - rest.before.cost) / rest.noise)))
+    merged = replace(
+        rest, verdict="found" if rest.verdict == "nothing missing" else rest.verdict, found=(*found, *rest.found),
+        before=before, held_out_before=held_out(plain, plain.base, before.values, plain.training),
+        tried=diagnosis.tried, reason=f"over the whole runs {rest.reason}",
+    )  # fmt: skip
+    return plain, merged, ["with what was found the model follows the whole runs, and they are judged whole"]
+
+
+def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, float]:
+    """Values in which these terms' numbers are absent."""
+    return {k: v for k, v in values.items() if k.partition(".")[0] not in terms}
 
 
 def _with_memory(
@@ -273,10 +278,12 @@ def _with_memory(
 
 def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
     lost = misfit(system, dict(values))
-    what = "cannot be integrated from the guessed start" if not np.isfinite(lost) else "is nothing like the data"
+    what = "is nothing like the data"
+    if not np.isfinite(lost):
+        what = "has no value somewhere on the way (the root of a negative number, a division by zero, no end of growth)"
     guess = ", ".join(f"{k.partition('.')[2]} = {v:.4g}" for k, v in list(values.items())[:4] if k.startswith("state."))
     return (
-        f"the model does not follow the data even over its first half turn (residual over {LOST:.0%} of the signal): "
+        f"the model does not follow the data even over a short time (residual over {LOST:.0%} of the signal): "
         f"as declared it {what}. Guessed start: {guess}. Check signs and units of the equations, declare parameters "
         "nearer to the truth, or give Run(start={...})."
     )

@@ -58,7 +58,7 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
     slope_size = value_size / max(turn(s), 1e-300) * 2 * np.pi
     knots, pieces = s.knots, s.pieces
 
-    def misfit(y: Array) -> Array:
+    def misfit(y: Array, slopes: float) -> Array:
         t, y = np.array([s.time[first]]), np.ascontiguousarray(y[None])
         h, H_y, H_p = np.zeros((1, w)), np.zeros((1, w, n)), np.zeros((1, w, len(p)))
         f, F_p = np.zeros((1, n)), np.zeros((1, n, len(p)))
@@ -69,10 +69,14 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
         for c, known in enumerate(local):
             if known is not None:
                 parts.append(np.array([h[0, c] - known[0]]) / value_size[c])
-                parts.append(np.array([slope[c] - known[1]]) / slope_size[c])
+                parts.append(slopes * np.array([slope[c] - known[1]]) / slope_size[c])
         return np.nan_to_num(np.concatenate(parts), nan=1e6, posinf=1e6, neginf=-1e6)
 
-    return np.asarray(least_squares(misfit, begin, max_nfev=60, x_scale=np.maximum(np.abs(begin), 1e-3)).x, float)
+    # first what is shown: slopes have other solutions besides, and are those of parameters not yet fitted
+    for slopes in (0.0, 0.1):
+        scale = np.maximum(np.abs(begin), 1e-3)
+        begin = np.asarray(least_squares(misfit, begin, max_nfev=60, x_scale=scale, args=(slopes,)).x, float)
+    return begin
 
 
 def turn(s: Samples) -> float:
@@ -148,6 +152,16 @@ def led(system: EquationSystem, values: dict[str, float], begin: float | None = 
     """Fit over windows that grow from `begin` [s] (half a turn) to the whole, or until the model loses the motion."""
     duration = max(float(s.time[-1] - s.time[0]) for s in system.stretches)
     window = begin or max(0.5 * min(turn(s) for s in system.stretches), duration / 4000)
+    found = _led(system, values, window, duration)
+    shortest = 12 * max(float(np.median(np.diff(s.time))) for s in system.stretches)
+    while found.followed == 0.0 and begin is None and window > shortest:
+        # what turns and drifts, or is chaotic, has no half turn: begin with less
+        window = max(0.25 * window, shortest)
+        found = _led(system, values, window, duration)
+    return found
+
+
+def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:
     values, followed, last = dict(values), 0.0, False
     parameters = [q for q in system.base if not q.name.startswith("state.")]
     leash = {q.name: _LEASH * max(abs(q.null), q.scale) for q in parameters}

@@ -137,20 +137,19 @@ def input_delay(v: str, u: str, gain: str, name: str = "") -> Term:
 
 
 def usual(equations: Equations) -> tuple[Term, ...]:
-    """What is offered where the user offers nothing: friction and springs on every pair (x, v), and the sensors.
+    """What is offered where the user offers nothing: friction on velocities, springs on coordinates, and sensors.
 
-    A pair is a state whose declared rate is another state: rates={"x": "v", "v": ...}.
+    A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}.
     """
     found: list[Term] = []
-    for x, formula in equations.rates.items():
-        v = str(formula).strip()
-        if v in equations.rates and v != x:
-            found += [coulomb(v), viscous(v), quadratic(v), constant(v), spring(v, x), asymmetric_spring(v, x),
-                      cubic_spring(v, x)]  # fmt: skip
-    if not found:  # first-order systems
-        for y in equations.rates:
-            found += [constant(y), viscous(y, f"leak_{y}"), asymmetric_spring(y, y, f"square_{y}"),
-                      cubic_spring(y, y, f"cube_{y}")]  # fmt: skip
+    pairs = {x: str(f).strip() for x, f in equations.rates.items() if str(f).strip() in equations.rates}
+    for v in equations.rates:
+        if v not in pairs:
+            found += [constant(v), viscous(v), coulomb(v), quadratic(v)]
+            if v not in pairs.values():  # of first order: what it is itself drives it
+                found += [asymmetric_spring(v, v, f"square_{v}"), cubic_spring(v, v, f"cube_{v}")]
+    for x, v in pairs.items():
+        found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x)]
     observed = equations.observed if equations.observed is not None else {}
     for channel, formula in observed.items():
         found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]
