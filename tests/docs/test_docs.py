@@ -1,0 +1,205 @@
+"""What README and documentation say is run: commands, snippets, tables of keys and effects, links and pictures.
+
+A block ```sh or ```python runs in the default tests, ```sh slow and ```python slow with `-m slow`, page by page in one
+folder with the sample data in it. Commands that do not begin with disctrack are the shell's own (mkdir, cp, cat, rm).
+"""
+
+import argparse
+import ast
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import disctrack.cli
+from disctrack.cli import COMMANDS
+from disctrack.recording.declaration import KEYS, read_recording
+from disctrack.rolling import CATALOGUE
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "disctrack" / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+RUN = [page for page in PAGES if page.name != "systems.md"]  # that page has a test of its own
+BLOCK = re.compile(r"^```(sh|python|toml)( slow)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+IN_TEXT = re.compile(r"`(disctrack [^`]+)`")
+
+
+def names(pages):
+    return [page.name for page in pages]
+
+
+def text_of(page: Path) -> str:
+    if not page.is_file():
+        pytest.skip("not in this checkout")
+    return page.read_text(encoding="utf-8")
+
+
+def commands_of(shell: str) -> list[list[str]]:
+    """disctrack's own commands of a block, without what lies in here-documents."""
+    shell = re.sub(r"<<'(\w+)'\n.*?^\1$", "", shell, flags=re.MULTILINE | re.DOTALL)
+    return [shlex.split(line, comments=True) for line in shell.splitlines() if line.startswith("disctrack ")]
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory) -> Path:
+    """A folder with a copy of the sample data, where pages are run."""
+    folder = tmp_path_factory.mktemp("reader")
+    for file in (ROOT / "sample_data" / "clip").rglob("*"):
+        if file.is_file() and "results" not in file.parts:
+            place = folder / "sample_data" / "clip" / file.relative_to(ROOT / "sample_data" / "clip")
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_bytes(file.read_bytes())
+    return folder
+
+
+def run_shell(block: str, folder: Path) -> None:
+    """A block as bash runs it, disctrack from this interpreter; a command that fails ends it."""
+    bin_folder = folder / ".bin"
+    bin_folder.mkdir(exist_ok=True)
+    program = bin_folder / "disctrack"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m disctrack "$@"\n')
+    program.chmod(0o755)
+    lines = "\n".join(line for line in block.splitlines() if not line.startswith("pip "))
+    environment = os.environ | {"PATH": f"{bin_folder}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-euc", lines], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{lines}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", RUN, ids=names(RUN))
+def test_short_blocks_run(page, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    scope: dict[str, object] = {}
+    for kind, slow, block in BLOCK.findall(text_of(page)):
+        if slow or page.name == "README.md":
+            continue
+        if kind == "sh":
+            run_shell(block, workplace)
+        elif kind == "python":
+            exec(compile(block, page.name, "exec"), scope)
+
+
+@pytest.fixture(scope="module")
+def measured(workplace) -> Path:
+    """The workplace after the README was followed."""
+    for kind, _, block in BLOCK.findall(text_of(ROOT / "README.md")):
+        if kind == "sh":
+            run_shell(block, workplace)
+    return workplace
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN, ids=names(RUN))
+def test_all_blocks_run_in_their_order(page, measured, monkeypatch):
+    monkeypatch.chdir(measured)
+    scope: dict[str, object] = {}
+    for kind, _, block in BLOCK.findall(text_of(page)):
+        if kind == "sh" and page.name != "README.md" and not ("mkdir -p sheets" in block or "-o sheets" in block):
+            run_shell(block.replace("rm my-disc", "rm -f my-disc"), measured)
+        elif kind == "python":
+            exec(compile(block, page.name, "exec"), scope)
+    if page.name == "tour.md":
+        text = (measured / "tour/secret/results/trajectory_diagnosis/diagnosis.json").read_text()
+        assert '"found"' in text
+        assert "centre_of_mass" in text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+def test_every_command_exists_with_its_options(page, monkeypatch):
+    text = text_of(page)
+    written = [command for kind, _, block in BLOCK.findall(text) if kind == "sh" for command in commands_of(block)]
+    written += [shlex.split(command) for command in IN_TEXT.findall(text)]
+    for command in written:
+        if command[1] == "COMMAND":
+            continue
+        assert command[1] in COMMANDS, command
+        parser = disctrack.cli._parser(command[1:])
+        sub = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[command[1]]
+        known = {option for action in sub._actions for option in action.option_strings}
+        for word in command[2:]:
+            if word.startswith("-") and not re.fullmatch(r"-?[0-9.]+", word):
+                assert word.partition("=")[0] in known, f"{' '.join(command)}: no option {word}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+def test_links_and_pictures_are_there(page):
+    for target in LINK.findall(BLOCK.sub("", text_of(page))):
+        if target.startswith(("http:", "https:")):
+            continue
+        file, _, anchor = target.partition("#")
+        place = (page.parent / file) if file else page
+        assert place.is_file(), f"{page.name}: {target}"
+        if anchor:
+            heads = re.findall(r"^#+ (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
+            slugs = {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+            assert anchor in slugs, f"{page.name}: {target}; {slugs}"
+
+
+def test_the_readme_is_short():
+    prose = BLOCK.sub("", text_of(ROOT / "README.md"))
+    assert len(prose.split()) < 950
+
+
+def test_every_key_of_a_recording_is_explained_and_the_example_is_one(tmp_path):
+    text = text_of(DOCS / "recording-toml.md")
+    for section, keys in KEYS.items():
+        for key in keys:
+            assert re.search(rf"`(\[{section}\] )?[^|]*\b{key}\b", text), f"[{section}] {key}"
+    example = next(block for kind, _, block in BLOCK.findall(text) if kind == "toml")
+    (tmp_path / "recording.toml").write_text(example)
+    assert read_recording(tmp_path).disc.radius == pytest.approx(0.0375)
+    declared = tomllib.loads(example)
+    for section, keys in KEYS.items():
+        for key in keys:
+            if (section, key) != ("calibration", "rig"):  # in place of the views
+                assert key in (declared[section] if section else declared), f"[{section}] {key}"
+
+
+def test_every_effect_is_named():
+    text = text_of(DOCS / "scenes.md")
+    for name in CATALOGUE:
+        assert f"`{name}`" in text, name
+
+
+def test_every_attribute_of_the_groups_is_explained(measured_attributes):
+    text = text_of(DOCS / "result-file.md")
+    explained = set(re.findall(r"`([A-Za-z0-9_.]+)`", text))
+    for group, keys in measured_attributes.items():
+        for key in keys:
+            assert key in explained, f"{group}: {key}"
+
+
+@pytest.fixture
+def measured_attributes():
+    """Names of the attributes of the groups that the analysis writes, from its own text."""
+    from disctrack.analyse import stage
+
+    found: dict[str, set[str]] = {}
+    for groups in ast.walk(ast.parse(Path(stage.__file__).read_text(encoding="utf-8"))):
+        if isinstance(groups, ast.Dict):
+            for name, made in zip(groups.keys, groups.values, strict=True):
+                if isinstance(made, ast.Call) and getattr(made.func, "id", "") == "Group":
+                    given = [a for a in made.args if isinstance(a, ast.Dict)]
+                    found[name.value] = {key.value for d in given for key in d.keys if isinstance(key, ast.Constant)}
+    assert len(found["contact"]) > 10
+    assert "loss_J" in found["energy"]
+    return found
+
+
+def test_every_command_is_in_the_documentation():
+    everything = "".join(page.read_text(encoding="utf-8") for page in PAGES if page.is_file())
+    for command in COMMANDS:
+        assert f"disctrack {command}" in everything or f"`{command}`" in everything, command
+
+
+def test_a_wrong_option_or_block_would_be_noticed(workplace):
+    assert commands_of("disctrack run x --no-such\n# disctrack nothing\ncat <<'END'\ndisctrack hidden\nEND\n") == [
+        ["disctrack", "run", "x", "--no-such"]
+    ]
+    with pytest.raises(AssertionError):
+        run_shell("disctrack simulate no-such-scene.toml", workplace)
