@@ -15,7 +15,7 @@ from disctrack.batch import locks
 from disctrack.batch.cluster import run_on_cluster
 from disctrack.batch.columns import COLUMNS
 from disctrack.batch.find import find_recordings
-from disctrack.batch.index import page
+from disctrack.batch.index import index_page
 from disctrack.batch.jobs import JobQueue
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job, Shard
@@ -262,7 +262,7 @@ def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as
         k_m_reduced_chi_square=23.9,
     )
     lost = row(recording="x", status=FAILED, reason="<b>no</b> rig")
-    text = page([there, lost])
+    text = index_page([there, lost])
     (link,) = [a for a in re.findall(r'href="([^"]+)"', text) if "report" in a]
     assert unquote(link) == there["report"]
     assert "#" not in link
