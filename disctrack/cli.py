@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from disctrack import __version__
+from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE
 
 # The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
 # save. It must stand before numpy is loaded; a user's own setting is kept.
@@ -35,13 +36,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "convert": ("disctrack.commands.convert", "trajectory or rig from and to the formats of other programs"),
     "validate": ("disctrack.commands.validate", "render -> measure -> compare: the verdict on 0.005 mm / 0.05 deg"),
 }
-
-DONE = 0
-FAILED = 1  # nothing was written; the reason is on stderr
-USAGE = 2  # argparse's own
-INCOMPLETE = 3  # the result is written, but some of the input could not be read
-INTERNAL = 70
-INTERRUPTED = 130
 
 TRACEBACK_VARIABLE = "DISCTRACK_TRACEBACK"
 

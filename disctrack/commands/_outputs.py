@@ -139,7 +139,7 @@ def shortcomings(findings: Mapping[str, Any]) -> list[str]:
 
 def tell_shortcomings(found: Sequence[str]) -> int:
     """Say on stderr what makes the result incomplete; returns the exit code."""
-    from disctrack.cli import DONE, INCOMPLETE
+    from disctrack.commands import DONE, INCOMPLETE
 
     if found:
         print(f"disctrack: {'; '.join(found)} (see above).", file=sys.stderr)

@@ -36,7 +36,7 @@ def _seconds(text: str) -> float:
 def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
     from disctrack.analyse.stage import run_analyse
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.files.reuse import origin_of, remember, reusable
     from disctrack.progress import stage
 

@@ -43,7 +43,7 @@ def _shard(text: str) -> Shard:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, say what became of each recording; returns the exit code."""
     from disctrack.batch import run_batch, summarise_batch
-    from disctrack.cli import DONE, FAILED, INCOMPLETE
+    from disctrack.commands import DONE, FAILED, INCOMPLETE
     from disctrack.commands import _outputs as outputs
     from disctrack.track import summary
 

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.commands import _calibration as calibration
     from disctrack.commands import _outputs as outputs
     from disctrack.track import summary

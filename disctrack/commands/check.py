@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Look, tell, draw; exit code 1 where a run would fail or mislead."""
-    from disctrack.cli import DONE, FAILED
+    from disctrack.commands import DONE, FAILED
     from disctrack.commands import _outputs as outputs
     from disctrack.first_look.check import run_check
     from disctrack.progress import steps

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Convert; returns the exit code."""
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.errors import OutputError
 
     target: Path = arguments.target

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; returns the exit code."""
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.commands import _outputs as outputs
     from disctrack.diagnosis import run_diagnose
     from disctrack.files.reuse import origin_of, remember, reusable

@@ -35,7 +35,7 @@ _WHAT = {
 
 def run(arguments: argparse.Namespace) -> int:
     """Look, write, and tell what is left to fill in; returns the exit code."""
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.first_look.declare import run_init
 
     known = {key: getattr(arguments, key) for key in _WHAT if getattr(arguments, key) is not None}

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Render, write, and say what; returns the exit code."""
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.errors import SceneError
 
     if arguments.defaults:

@@ -28,7 +28,7 @@ def _positive(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, write, and say how the motion went; returns the exit code."""
-    from disctrack.cli import DONE
+    from disctrack.commands import DONE
     from disctrack.errors import SceneError
 
     if arguments.list_effects:

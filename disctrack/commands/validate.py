@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Validate, write, print the verdict; exit code 1 if a check failed."""
-    from disctrack.cli import DONE, FAILED
+    from disctrack.commands import DONE, FAILED
     from disctrack.errors import SceneError
     from disctrack.validate import complaints, run_validate, verdict
     from disctrack.validate.run import FIRST_SEED

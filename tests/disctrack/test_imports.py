@@ -1,4 +1,4 @@
-"""Imports point one way: the physics needs numpy and scipy alone, calibration never asks for disctrack."""
+"""Imports point one way: between the folders, in a diagnosis, and the physics needs numpy and scipy alone."""
 
 import ast
 import subprocess
@@ -61,3 +61,79 @@ def test_every_public_name_is_there():
     assert set(there) <= set(dir(disctrack))
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         disctrack.nothing  # noqa: B018
+
+
+# Each folder or module of disctrack/ may ask for what stands above it, at whatever place in the file it does so. A new
+# one belongs where what it needs is above, and what needs it below; names in one row know nothing of each other.
+STAIRS = (
+    ("__version__", "frames", "disc", "published", "progress"),  # words shared by all
+    ("errors", "trajectory"),
+    ("files", "rolling"),
+    ("readers", "recording", "pages", "scene"),
+    ("track", "analyse", "render"),  # the measurement; the same physics forwards
+    ("calibrate", "repeats", "diagnosis"),
+    ("first_look", "examples", "validate", "batch"),
+    ("commands",),
+    ("cli",),
+    ("__main__",),
+)
+# An object that people hold may offer a verb that lives further down; it is looked up when it is called.
+ON_CALL = {("trajectory", "files"): "Trajectory.to_xarray"}
+ROOMS_OF_DIAGNOSIS = {"engine": (), "disc": ("engine",), "pages": ("engine", "disc"), "trials": ("engine", "disc"),
+                      "equations": ("engine", "pages")}  # fmt: skip
+
+
+def imported(file: Path) -> set[str]:
+    """Modules of ours that a file asks for, but for types."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for_types = {
+        below
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        for below in ast.walk(node)
+    }
+    found = set()
+    for node in ast.walk(tree):
+        if node in for_types:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith("disctrack.")}
+
+
+def dependencies() -> dict[tuple[str, str], set[str]]:
+    """(folder, folder that it asks for) -> files that do."""
+    found: dict[tuple[str, str], set[str]] = {}
+    for file in (ROOT / "disctrack").rglob("*.py"):
+        own = file.relative_to(ROOT / "disctrack").parts[0].removesuffix(".py")
+        for name in imported(file):
+            other = name.split(".")[1]
+            if other != own and own != "__init__":
+                found.setdefault((own, other), set()).add(file.name)
+    return found
+
+
+def test_folders_ask_only_for_what_stands_above_them():
+    step = {name: i for i, names in enumerate(STAIRS) for name in names}
+    upwards = {}
+    for (own, other), files in dependencies().items():
+        assert own in step, f"{own}: give it a place in STAIRS"
+        if other in step and step[other] >= step[own] and (own, other) not in ON_CALL:
+            upwards[own, other] = sorted(files)
+    assert upwards == {}
+
+
+def test_every_name_of_the_stairs_is_there_and_the_exceptions_are_needed():
+    there = {file.name.removesuffix(".py") for file in (ROOT / "disctrack").iterdir()}
+    assert {name for names in STAIRS for name in names} - there == {"__version__"}  # of the package itself
+    assert set(ON_CALL) <= set(dependencies())
+    assert ("batch", "diagnosis") in dependencies()  # the reading sees what is asked for inside a function
+
+
+@pytest.mark.parametrize("room", ROOMS_OF_DIAGNOSIS)
+def test_the_engine_of_a_diagnosis_knows_no_disc_and_no_page(room):
+    for file in (ROOT / "disctrack" / "diagnosis" / room).rglob("*.py"):
+        rooms = {name.split(".")[2] for name in imported(file) if name.startswith("disctrack.diagnosis.")}
+        assert rooms & set(ROOMS_OF_DIAGNOSIS) <= {room, *ROOMS_OF_DIAGNOSIS[room]}, file
