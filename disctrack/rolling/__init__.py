@@ -1,17 +1,17 @@
 """The rolling disc forwards: equations of motion, effects that are added to them, simulation, derivatives.
 
 Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `struck_disc`), `simulate`,
-`simulate_batch`, `sensitivities`. Effects are in `effects.CATALOGUE`; `evaluate` applies their laws to motions from
+`sensitivities`. Effects are in `effects.CATALOGUE`; `evaluate` applies their laws to motions from
 elsewhere, `run` writes a scene's motion to a file.
 """
 
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, ModelError, Parameter
 from disctrack.rolling.impact import struck_disc
-from disctrack.rolling.model import DEFAULT_THETA_END, Model, effects_from_tables, effects_toml
+from disctrack.rolling.model import DEFAULT_THETA_END, Model, effects_from_tables
 from disctrack.rolling.motion import EndReason, Motion, Regime, Switch
 from disctrack.rolling.sensitivities import Sensitivities, sensitivities
-from disctrack.rolling.simulate import simulate, simulate_batch, time_grid
+from disctrack.rolling.simulate import simulate, time_grid
 from disctrack.rolling.state import State
 from disctrack.rolling.steady import nutation_frequency, precession_rate, steady_precession
 
@@ -30,12 +30,10 @@ __all__ = [
     "Switch",
     "effects",
     "effects_from_tables",
-    "effects_toml",
     "nutation_frequency",
     "precession_rate",
     "sensitivities",
     "simulate",
-    "simulate_batch",
     "steady_precession",
     "struck_disc",
     "time_grid",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -138,19 +138,3 @@ def _from_table(effect: type[Effect], values: Mapping[str, float]) -> Effect:
     if values and set(values) <= {p.name for p in effect.parameters if p.is_shape}:
         raise ModelError(f"effect '{effect.name}' has a shape but no amount: give {' or '.join(amounts)}")
     return effect(**({p.name: p.null for p in effect.parameters if not p.is_shape} | dict(values) if values else {}))
-
-
-def effects_toml(effects: Sequence[Effect], section: str = "motion.rolling.effects") -> str:
-    """TOML text of the effects, ready to stand in a scene; units and meaning as comments."""
-    lines = []
-    for effect in effects:
-        formulas = effect.formulas
-        if formulas:
-            lines += [f"[{section.rpartition('.')[0]}.formulas.{effect.name}]"]
-            lines += [f"{component} = {formula!r}" for component, formula in formulas.items()]
-        lines += [f"[{section}.{effect.name}]  # {effect.title}"]
-        for p in effect.parameters:
-            value = effect.values[p.name]
-            number = repr(value) if np.isfinite(value) else ("inf" if value > 0 else "-inf")
-            lines += [f"{p.name} = {number}  # {p.unit}; {p.meaning}"]
-    return "\n".join(lines) + "\n"

@@ -17,7 +17,7 @@ from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, coordinates
 from disctrack.rolling.records import STATE_COMPONENTS
-from disctrack.rolling.simulate import MAX_SWITCHES, RTOL, _grid, _start, check_in_model, follow
+from disctrack.rolling.simulate import MAX_SWITCHES, RTOL, _grid, _start, follow
 from disctrack.rolling.state import State
 
 Array = NDArray[np.float64]
@@ -55,7 +55,6 @@ def sensitivities(
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
     enlarged = model.with_values(_missing(model, parameters))
-    check_in_model(enlarged, list(parameters))
     components = STATE_COMPONENTS[: len(y0)] if components is None else components
     names = (*components, *parameters)
     dq, dqdot = np.full((2, len(grid), 6, len(names)), np.nan)

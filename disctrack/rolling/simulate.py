@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,41 +54,6 @@ def simulate(
     return motion_from_samples(
         model, assembly.body, path.samples, path.switches, path.end, float(path.end_time), path.end_state
     )
-
-
-def simulate_batch(
-    model: Model,
-    states: Sequence[State] | State,
-    times: ArrayLike,
-    values: Sequence[Mapping[str, float]] | None = None,
-    theta_end: float = DEFAULT_THETA_END,
-    rtol: float = RTOL,
-) -> tuple[Array, Array]:
-    """Q and qdot of many copies, each (n_copies, n_times, 6); NaN after the end of a motion.
-
-    states : one for each copy, or one for all.   values : for each copy, parameters by "effect.parameter" that differ
-    from the model's; all must belong to effects of the model.
-    """
-    grid = _grid(None, 0.0, times)
-    n = len(values) if values is not None else (1 if isinstance(states, State) else len(states))
-    start = [states] * n if isinstance(states, State) else list(states)
-    changes = [{}] * n if values is None else list(values)
-    if len(start) != len(changes):
-        raise ModelError(f"{len(start)} states for {len(changes)} sets of parameter values")
-    q, qdot = np.full((2, n, len(grid), 6), np.nan)
-    for i, (state, change) in enumerate(zip(start, changes, strict=True)):
-        check_in_model(model, change)
-        path = follow(Assembly(model, theta_end, float, change), _start(state, theta_end), grid, rtol)
-        filled = len(path.samples.time)
-        q[i, :filled], qdot[i, :filled] = coordinates(path.samples.kinematics)
-    return q, qdot
-
-
-def check_in_model(model: Model, names: Mapping[str, Any] | Sequence[str]) -> None:
-    """Raise ModelError for a parameter that the model does not have."""
-    for name in names:
-        if name not in model.values:
-            raise ModelError(f"'{name}' is not in the model; it has {', '.join(model.values) or 'no effects'}")
 
 
 def _grid(duration: float | None, rate: float, times: ArrayLike | None) -> Array:

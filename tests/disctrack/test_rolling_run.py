@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 
 from disctrack.cli import main
 from disctrack.errors import OutputError, SceneError
-from disctrack.rolling import CATALOGUE, ModelError, effects_from_tables, effects_toml
+from disctrack.files.toml_tree import toml_value
+from disctrack.rolling import CATALOGUE, ModelError, effects_from_tables
 from disctrack.scene.simulation import run_simulate
 
 SCENE = """
@@ -101,8 +102,8 @@ def test_an_effect_by_formula_is_simulated_and_saved(scene, tmp_path):
     plain.write_text(SCENE)
     without = run_simulate(plain, tmp_path / "plain.h5")
     assert np.abs(run.motion.q - without.motion.q).max() > 1e-6
-    saved = tomllib.loads(effects_toml(run.motion.model.effects))["motion"]["rolling"]
-    assert effects_from_tables(saved["effects"], saved["formulas"]) == run.motion.model.effects
+    (brake,) = (effect for effect in run.motion.model.effects if effect.name == "brake")
+    assert effects_from_tables({"brake": brake.values}, {"brake": brake.formulas}) == (brake,)
     scene.write_text(SCENE + law.replace("omega_z", "thetadot"))  # another law of that name, in the same process
     assert np.abs(run_simulate(scene, tmp_path / "other.h5").motion.q - run.motion.q).max() > 1e-6
     scene.write_text(SCENE + law.partition("[motion.rolling.effects")[0])
@@ -131,8 +132,8 @@ def test_a_scene_without_effects_has_those_of_the_paper_at_their_nominal_sizes(s
 
 def test_effects_survive_their_toml():
     effects = tuple(effect() for effect in CATALOGUE.values())
-    tables = tomllib.loads(effects_toml(effects))["motion"]["rolling"]["effects"]
-    assert effects_from_tables(tables) == effects
+    text = toml_value({effect.name: effect.values for effect in effects})
+    assert effects_from_tables(tomllib.loads(f"effects = {text}")["effects"]) == effects
 
 
 def test_command_writes_the_motion_and_tells_how_it_went(scene, capsys):

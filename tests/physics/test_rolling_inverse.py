@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Model, steady_precession
-from disctrack.rolling.evaluate import effect_wrench, kinematics, required_wrench
+from disctrack.rolling.evaluate import effect_wrench, kinematics
+from tests.oracles.required_wrench import required_wrench
 
 STATE = steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2))
 

@@ -112,19 +112,9 @@ def test_derivatives_are_nan_after_the_end():
     assert np.isfinite(found.dq[~ended]).all()
 
 
-def test_batch_equals_separate_simulations(rng):
-    states = [STATE.moved(theta=STATE.theta + d) for d in rng.normal(size=4) * 1e-3]
-    values = [{"km.k_m": k} for k in rng.uniform(1, 9, 4) * 1e-8]
-    q, qdot = rolling.simulate_batch(MODEL, states, TIMES, values)
-    for i in range(4):
-        motion = rolling.simulate(MODEL.with_values(values[i]), states[i], times=TIMES)
-        assert_allclose(q[i], motion.q, rtol=1e-14)
-        assert_allclose(qdot[i], motion.qdot, rtol=1e-14)
-
-
 def test_a_parameter_that_is_not_there_is_named():
-    with pytest.raises(ModelError, match=r"'kz\.k_z' is not in the model; it has km"):
-        rolling.simulate_batch(MODEL, STATE, TIMES, [{"kz.k_z": 1.0}])
+    with pytest.raises(ModelError, match=r"'kz\.k_x' is no parameter; effect 'kz' has k_z"):
+        rolling.sensitivities(MODEL, STATE, TIMES, ["kz.k_x"])
     with pytest.raises(ModelError, match="no effect 'nothing'"):
         rolling.sensitivities(MODEL, STATE, TIMES, ["nothing.x"])
     with pytest.raises(ModelError, match="increasing"):

@@ -83,7 +83,7 @@ class Tried:
 
     candidate: Candidate
     score: float  # first-order gain against the base fit
-    gain: float | None  # gain of the refit in the last round in which it was refitted
+    gain: float | None  # of the first refit, over the fit that was the best before it
     held_out_gain: float | None
     reason: str
 

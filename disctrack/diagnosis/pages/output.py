@@ -12,6 +12,7 @@ from disctrack.diagnosis.disc.errors import Ahead, Errors
 from disctrack.diagnosis.disc.separation import Separation
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Found, Tried
+from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages.words import shown
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
@@ -74,7 +75,7 @@ def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None]
         ],
         "score": found.gain,
         "threshold": found.threshold,
-        "significance_sigma": np.sqrt(max(found.gain, 0.0)),
+        "significance_sigma": as_sigmas(found.gain, len(c.quantities)),
         "held_out_gain": found.held_out_gain,
     }
 

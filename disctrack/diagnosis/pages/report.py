@@ -10,6 +10,7 @@ from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.disc.free_runs import Evidence
 from disctrack.diagnosis.engine.search import Found
+from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages.figures import all_figures
 from disctrack.diagnosis.pages.words import effect_text, law_text, quantity_text
 from disctrack.files.whole import write_whole
@@ -47,7 +48,7 @@ def _said(note: str) -> str:
 def _effects(result: DiscDiagnosis) -> str:
     items = [
         f"{effect_text(f, result.diagnosis)}. Without it chi-square rises by {f.gain:.5g}, "
-        f"{np.sqrt(max(f.gain, 0.0)):.4g} sigmas (noise alone: {f.threshold:.3g}); on held-out data it gains "
+        f"{as_sigmas(f.gain, len(f.candidate.quantities)):.4g} sigmas (noise alone: {f.threshold:.3g}); held out it gains "
         f"{f.held_out_gain:.4g}. {_class_text(f, result)}"
         for f in result.diagnosis.found
     ]
