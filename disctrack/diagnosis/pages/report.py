@@ -48,8 +48,8 @@ def _said(note: str) -> str:
 def _effects(result: DiscDiagnosis) -> str:
     items = [
         f"{effect_text(f, result.diagnosis)}. Without it chi-square rises by {f.gain:.5g}, "
-        f"{as_sigmas(f.gain, len(f.candidate.quantities)):.4g} sigmas (noise alone: {f.threshold:.3g}); held out it gains "
-        f"{f.held_out_gain:.4g}. {_class_text(f, result)}"
+        f"{as_sigmas(f.gain, len(f.candidate.quantities)):.4g} sigmas (noise alone: {f.threshold:.3g}); "
+        f"on held-out data it gains {f.held_out_gain:.4g}. {_class_text(f, result)}"
         for f in result.diagnosis.found
     ]
     if result.learned is not None:
