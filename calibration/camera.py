@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.brief import Brief
+from calibration.splines import LensField
 
 Array = NDArray[np.float64]
 
@@ -150,6 +151,8 @@ class StereoRig(Brief):
     t_left_world: Array = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
     covariance: Array = field(default_factory=lambda: np.zeros((N_RIG, N_RIG)))  # (30, 30)
     world_is_table: bool = False
+    # What the lenses do beyond the polynomial: measured points are corrected by it before anything else (`splines`)
+    lens_field: LensField | None = None
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from calibration.board import Board
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Array, Camera, StereoRig
 from calibration.errors import RigFileError
+from calibration.splines import LensField
 from calibration.stereo import StereoCalibration
 from calibration.stereo_model import Observations
 
@@ -183,6 +184,12 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
         "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
     )
     group["covariance"].attrs["parameters"] = ", ".join(RIG_PARAMETERS)
+    if rig.lens_field is not None:
+        told = (
+            "coefficients of cubic B-splines (camera, axis, y, x): displacement of image points beyond the polynomial"
+        )
+        _put(group, "lens_field", rig.lens_field.coefficients, "px", told)
+        _put(group, "lens_field_spacing", rig.lens_field.spacing, "px", "of the splines' grid")
 
 
 def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
@@ -300,7 +307,15 @@ def read_rig_group(group: h5py.Group) -> StereoRig:
         t_left_world=_get(group, "t_left_world", (3,)),
         covariance=covariance,
         world_is_table=bool(group.attrs.get("world_is_table", 0)),
+        lens_field=_lens_field(group) if "lens_field" in group else None,
     )
+
+
+def _lens_field(group: h5py.Group) -> LensField:
+    coefficients, spacing = _get(group, "lens_field", (2, 2, None, None)), float(_get(group, "lens_field_spacing", ()))
+    if min(coefficients.shape[2:]) < 4 or not spacing > 0:
+        raise RigFileError(f"{group.name}/lens_field of shape {coefficients.shape}, spacing {spacing} is not a field")
+    return LensField(coefficients, spacing)
 
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from calibration.brief import Brief
 from calibration.camera import Array, StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
 from calibration.errors import CalibrationError
+from calibration.lens_field import FieldFit, fit_lens_field
 from calibration.model_choice import Candidate, choose_terms
 from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
@@ -62,6 +63,7 @@ class StereoCalibration(Brief):
     candidates: tuple[Candidate, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
+    lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
@@ -228,10 +230,20 @@ def calibrate_from_corners(
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
         raise CalibrationError(f"only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}")
+    report("trying a field of the lenses")
+    lens = fit_lens_field(refinement, board.points)
+    if lens is not None:
+        refinement = lens.refinement
     report("judging")
     inflation = max(consistency_factor(refinement), 1.0)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation)
-    with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances)
+    with_board = with_tolerances(
+        replace(rig, lens_field=lens.field if lens else None),
+        board.points,
+        table_view,
+        board_thickness,
+        settings.tolerances,
+    )
     halves = half_set_differences(refinement, inflation)
     assessment = assess(refinement, candidates, rig, table_view, inflation, halves)
     return StereoCalibration(
@@ -248,6 +260,7 @@ def calibrate_from_corners(
         candidates=candidates,
         assessment=assessment,
         warnings=(*warnings, *assessment.warnings),
+        lens=lens,
     )
 
 

@@ -335,7 +335,12 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
 def _markers(trajectory: Trajectory) -> dict[str, Variable]:
     dims = ("time", "camera", "marker", "axis")
     return {
-        "centre_px": Variable(trajectory.markers_px, dims, "px", "image of the dot's centre (not the ellipse's)"),
+        "centre_px": Variable(
+            trajectory.markers_px,
+            dims,
+            "px",
+            "image of the dot's centre (not the ellipse's), corrected by the lens field of the rig if it has one",
+        ),
         "centre_covariance_px2": Variable(
             trajectory.markers_covariance_px2, (*dims, "axis_2"), "px2", "covariance of centre_px"
         ),

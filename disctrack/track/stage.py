@@ -270,6 +270,8 @@ def rig_sha256(rig: StereoRig) -> str:
     for part in (rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance):
         digest.update(np.ascontiguousarray(part, float).tobytes())
     digest.update(bytes([rig.world_is_table]))
+    if rig.lens_field is not None:
+        digest.update(np.ascontiguousarray(rig.lens_field.coefficients).tobytes())
     return digest.hexdigest()
 
 

@@ -30,6 +30,10 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
         ),
         _line("", assessment.verdict),
     ]
+    if found.lens is not None:
+        (left, right), gain = found.lens.rms_px, found.lens.gain
+        told = f"the lenses depart from their polynomial by {left:.3f} and {right:.3f} px rms per axis: corrected"
+        lines.append(_line("", f"{told} (views left out: squared misfit {100 * gain:.0f} % less)"))
     corners = len(found.rejected_corners())
     if corners:
         lines.append(_line("", f"{corners} corners were found but not used"))

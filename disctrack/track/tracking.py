@@ -580,6 +580,9 @@ def _assemble(
     pairs: range,
 ) -> Tracking:
     first = next((follower for follower in followers if follower.measured), followers[0])
+    field = first.rig.lens_field
+    if field is not None:
+        tables.pixels = field.corrected(tables.pixels)
     as_built = refine_as_built(
         tables.pixels,
         tables.covariance_px2,
@@ -604,7 +607,7 @@ def _assemble(
     fits.covariance[...] *= noise_factor
     fits = replace(fits, chi_square=fits.chi_square / factor)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
-    as_built = replace(as_built, rig=rig)
+    as_built = replace(as_built, rig=replace(rig, lens_field=None))  # what the dots have been corrected by
     trajectory = _trajectory(fits, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     return Tracking(
         trajectory=trajectory,

@@ -1,0 +1,89 @@
+"""A lens beyond its polynomial: found from chessboards where it is, and not where it is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.interpolate import BSpline
+
+from calibration import StereoRig, Terms, refine_stereo, triangulate
+from calibration.lens_field import fit_lens_field
+from calibration.rig_file import read_rig, write_rig
+from calibration.splines import LensField, spline_weights
+
+SIGMA = 0.004  # [px] of good corners
+TERMS = Terms("k1 k2 p1 p2", "flat")
+
+
+def field_of(pixels, camera):
+    """0.02 px rms per axis, beyond any radial polynomial."""
+    x, y = np.moveaxis(pixels / 512 * 2 * np.pi, -1, 0)
+    waves = np.stack([np.sin(1.1 * x + 0.7 * y + camera), np.cos(0.8 * x - 1.2 * y + 2 * camera)], axis=-1)
+    return 0.02 * np.sqrt(2) * waves
+
+
+@pytest.fixture(scope="module")
+def refined(scene_maker):
+    """Refinements of sixteen views, through plain lenses and through such a field."""
+    scene = scene_maker(n_views=16)
+    o = scene.observations(SIGMA, np.random.default_rng(3))
+    moved = np.where((o.camera == 0)[:, None], field_of(o.pixels, 0), field_of(o.pixels, 1))
+    bent = replace(o, pixels=o.pixels + moved)
+    return scene, [refine_stereo(seen, scene.model, scene.board.points, TERMS) for seen in (o, bent)]
+
+
+def test_weights_are_those_of_cubic_splines(rng):
+    pixels, spacing, shape = rng.uniform(0, 300, (20, 2)), 100.0, (6, 6)
+    index, weight = spline_weights(pixels, spacing, shape)
+    b = BSpline.basis_element(np.arange(5.0), extrapolate=False)
+    for point, k, w in zip(pixels, index, weight, strict=True):
+        x, y = (point / spacing)[:, None] - np.stack([k % shape[1], k // shape[1]]) + 3
+        assert_allclose(w, np.nan_to_num(b(x)) * np.nan_to_num(b(y)), atol=1e-12)
+    assert_allclose(weight.sum(axis=1), 1.0)
+
+
+def test_field_is_found_and_the_geometry_is_better_for_it(refined):
+    scene, (_, bent) = refined
+    fit = fit_lens_field(bent, scene.board.points)
+    assert fit is not None
+    # all that is left is the corners' own noise: 0.5 to 2 times SIGMA, unequal on the axes
+    assert bent.chi_square > 3
+    assert fit.refinement.chi_square < 1.25
+    assert fit.gain > 0.5
+
+    def length_error(model, field):
+        """Of the distances between neighbouring corners, triangulated from noiseless images [m]."""
+        rig = StereoRig(*model.cameras, model.R_right_left, model.t_right_left)
+        errors = []
+        for v in range(16):
+            seen = np.stack([p + field_of(p, c) for c, p in enumerate((scene.pixels(0)[v], scene.pixels(1)[v]))])
+            points = triangulate(field.corrected(seen) if field else seen, rig)
+            errors.append(np.linalg.norm(np.diff(points, axis=0), axis=1)[:8] - scene.board.square)
+        return np.std(errors)
+
+    plain = length_error(bent.model, None)
+    assert length_error(fit.refinement.model, fit.field) < 0.4 * plain
+
+
+def test_plain_lenses_get_no_field(refined):
+    scene, (plain, _) = refined
+    assert fit_lens_field(plain, scene.board.points) is None
+
+
+def test_few_views_get_no_field(refined):
+    scene, (_, bent) = refined
+    few = bent.observations[bent.observations.view < 6]
+    assert fit_lens_field(refine_stereo(few, bent.model, scene.board.points, TERMS), scene.board.points) is None
+
+
+def test_field_is_kept_in_the_rig_file(tmp_path, rng, refined):
+    m = refined[0].model
+    field = LensField(rng.normal(size=(2, 2, 8, 8)), 102.4)
+    rig = StereoRig(*m.cameras, m.R_right_left, m.t_right_left, lens_field=field)
+    write_rig(tmp_path / "rig.h5", rig)
+    read = read_rig(tmp_path / "rig.h5").lens_field
+    assert_allclose(read.coefficients, field.coefficients, atol=0)
+    assert read.spacing == field.spacing
+    lost = np.full((2, 3, 2), np.nan)
+    assert np.isnan(read.corrected(lost)).all()
