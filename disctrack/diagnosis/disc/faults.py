@@ -180,7 +180,7 @@ class TimeOffset(Fault):
     family, unit, step, parts = "time_offset", "s", 1e-5, ("delay",)
     title = "the right camera exposes later than the left"
     source, meaning = "synchronisation of the cameras", "right minus left"
-    bounds = (-5e-3, 5e-3)
+    bounds = (-0.05, 0.05)
 
     def alter(self, setup: Setup, v: Array) -> None:
         setup.delay = float(v[0])

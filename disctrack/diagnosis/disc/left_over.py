@@ -18,7 +18,7 @@ from disctrack.diagnosis.engine.whiteness import ljung_box, whiteness
 
 Array = NDArray[np.float64]
 
-LEVEL = 1e-3  # probability with which noise alone is called more than noise, over all tests of a residual
+LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
 MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks
 LIKE = 2.0  # times the excess of the numbers that no pose takes, up to which that of the poses is no motion's
 

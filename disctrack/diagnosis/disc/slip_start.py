@@ -14,6 +14,7 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
+from disctrack.diagnosis.disc.large_faults import Assumed, find_clock, find_large, in_words, with_large
 from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, slip_candidate
 from disctrack.diagnosis.disc.start import first_slip
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
@@ -56,13 +57,21 @@ def diagnose_motion(
 ) -> Answer:
     """Diagnose the motion, rolling or slipping at its start. Raises AnalysisError."""
     settings = settings or Settings()
+    as_tracked = trajectory
     trajectory, noise = with_noise_of_frames(trajectory)
     stretch = free_stretch(trajectory)
     rolling = DiscSystem(trajectory, model, stretch=stretch)
     systematic = find_systematic(rolling, noise)
+    assumed = find_large(as_tracked, model, systematic, faults)
+    if assumed is not None:
+        return _with_large(assumed, settings)
     if systematic != rolling.systematic:
         rolling = DiscSystem(trajectory, model, stretch=stretch, systematic=systematic)
     base = fit(rolling, rolling.base, rolling.start(faults))
+    if not base.converged:
+        assumed = find_clock(rolling, faults)
+        if assumed is not None:
+            return _with_large(assumed, settings)
     may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
@@ -73,6 +82,11 @@ def diagnose_motion(
         if _at_noise(slipping, alone, settings):
             return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     return Answer(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
+
+
+def _with_large(assumed: Assumed, settings: Settings) -> Answer:
+    diagnosis = with_large(diagnose(assumed.system, assumed.base.values, settings), assumed)
+    return Answer(assumed.system, diagnosis, notes=(*assumed.system.stretch.notes, in_words(assumed)))
 
 
 def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:

@@ -72,11 +72,12 @@ def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
     """Values of state and declared effects from which the fit of the whole recording converges; `known` are kept."""
     q = system.trajectory.q[system.rows]
     names = {quantity.name for quantity in system.base}
-    values = dict(known) | {k: v for k, v in first_state(system.time, q).items() if k in names}
+    times = system.instants(known)
+    values = dict(known) | {k: v for k, v in first_state(times, q).items() if k in names}
     laws = model_quantities(system.model)
     values |= {law.name: system.model.values[law.name] for law in laws}
     if SLIP in names:
-        values[SLIP] = 1.0 / first_friction(system.time, q, system.model.gravity)
+        values[SLIP] = 1.0 / first_friction(times, q, system.model.gravity)
     state = tuple(quantity for quantity in system.base if quantity.name.startswith("state.") or quantity.name == SLIP)
     for stretch in STRETCHES:
         if stretch >= system.time[-1] - system.time[0]:

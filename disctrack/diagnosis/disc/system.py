@@ -57,6 +57,7 @@ class StaticView:
     rig: Array  # (k, 4 m, r) by directions of the calibration's covariance, in their sigmas, whitened
     dots: Array  # (k, 4 m, 2 m) by the dots' places on the face [m], whitened
     faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by faults of the measurement, in their typical sizes
+    sizes: dict[str, dict[str, float]]  # the typical sizes of their quantities
     places: Array  # (k, 2, m, 2) [px]
     used: NDArray[np.bool_]  # (k, 2, m)
     whiten: Array  # (k, 2, m, 2, 2)
@@ -74,12 +75,14 @@ class DiscSystem:
         stretch: Stretch | None = None,
         starts_in_slip: bool = False,
         systematic: Systematic | None = None,
+        freed: tuple[Candidate, ...] = (),
     ) -> None:
         """Model : declared disc, gravity and effects; the parameters of its effects are fitted along.
 
         candidates : all of the catalogue and of the measurement, if not given
         stretch : frames to take; those of `free_stretch` if not given
         starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
+        freed : faults that are known to be there: every fit moves their quantities
         systematic : sizes of the dots' systematic errors, that are fitted along as fields with these sizes as priors
         Raises AnalysisError.
         """
@@ -105,11 +108,12 @@ class DiscSystem:
         of_slip = slipping_start_quantities(model) if starts_in_slip else ()
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
-        in_base = {q.name for q in of_slip}
+        of_faults = tuple(q for c in freed for q in c.quantities)
+        in_base = {q.name for q in (*of_slip, *of_faults)}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
-        self.base = (*state_quantities(), *of_slip, *model_quantities(model), *nuisances)
+        self.base = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults, *nuisances)
 
     def _nuisances(self) -> tuple[tuple[Quantity, ...], Array]:
         """Errors common to all frames, with priors, and their whitened columns (n, 4 m, k).
@@ -161,27 +165,35 @@ class DiscSystem:
         q[~known] = q[np.argmax(known)]
         return rotation_from_euler(*q[:, 3:].T), q[:, :3]
 
-    def static_view(self, rows: NDArray[np.intp]) -> StaticView:
-        """The dots of these rows about their measured poses."""
+    def static_view(self, rows: NDArray[np.intp], known: Values) -> StaticView:
+        """The dots of these rows about their measured poses. known : faults that the poses were found with."""
         R, t = (np.stack([part] * 2) for part in self._measured_poses())
-        images = predict(R, t, self.rig, self.disc, {})
+        images = predict(R, t, self.rig, self.disc, known)
         pixels, by_pose = images.pixels, images.by_pose
-        sight = Sight(self.time, R, t, np.zeros((*t.shape[:2], 6)), self.rig, self.disc, {}, images)
-        faults = {}
+        delay = setup_of(self.disc, known).delay
+        by_time = np.gradient(pixels[:, 1], self.time, axis=0)
+        if delay:  # the right camera saw a pose earlier, or later
+            rows = rows[(self.time[rows] + delay > self.time[0]) & (self.time[rows] + delay < self.time[-1])]
+            late = CubicHermiteSpline(self.time, pixels[:, 1], by_time)
+            pixels = pixels.copy()
+            pixels[:, 1] = late(self.time + delay)
+        sight = Sight(self.time, R, t, np.zeros((*t.shape[:2], 6)), self.rig, self.disc, known, images)
+        faults, sizes = {}, {}
         for fault in self.faults:
             if fault.of_poses_alone:
                 shifts = [fault.column(part, sight)[rows] for part in fault.parts]
                 if fault.name == "time_offset":  # at the speed that the dots are seen to have
-                    shifts[0][:, 1] = np.gradient(pixels[:, 1], self.time, axis=0)[rows]
-                sizes = [q.typical for q in fault.candidate().quantities]
-                faults[fault.name] = np.stack([x * size for x, size in zip(shifts, sizes, strict=True)], axis=-1)
+                    shifts[0][:, 1] = by_time[rows]
+                sizes[fault.name] = {q.name: q.typical for q in fault.candidate().quantities}
+                units = sizes[fault.name].values()
+                faults[fault.name] = np.stack([x * size for x, size in zip(shifts, units, strict=True)], axis=-1)
         nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
         n_rig = sum(name.startswith("rig.") for name in self._nuisance_column)
         whitened = (self._whiten[rows] @ by_pose[rows]).reshape(len(rows), -1, 6)
-        residual = np.asarray((self._whiten @ (self._observed - pixels)[..., None]).reshape(len(self.time), -1), float)
+        residual = self._rows_of(self._observed - pixels)
         return StaticView(
             residual[rows], whitened, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
-            pixels[rows], self.used[rows], self._whiten[rows],
+            sizes, pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 
     def start(self, known: Values | None = None) -> dict[str, float]:

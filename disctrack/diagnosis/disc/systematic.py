@@ -9,7 +9,7 @@ with these sizes as priors, then stand beside the motion, and take from it what 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,8 @@ from scipy.linalg import solve_triangular
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.disc.system import DiscSystem
+    from disctrack.diagnosis.disc.system import DiscSystem, StaticView
+    from disctrack.diagnosis.engine.system import Values
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,6 +36,7 @@ MIN_FRAMES, MAX_FRAMES = 30, 200  # that are looked at: fields move slowly
 ROUNDS = 3  # over the sizes
 WORTH = 20.0  # of twice the log likelihood, that a fault or a field must gain: odds of 2e4
 MOST_FAULTS = 2
+WIDE = 100.0  # times its typical size, that a fault which is known to be there may have
 SEEN = 0.2  # a mode of a field that moves all dots together by less than this many sigmas is left out
 
 
@@ -93,7 +95,9 @@ class Systematic:
     print_m: float = 0.0  # rms of the dots' places on the face, per coordinate
     noise: float = 1.0  # variance from frame to frame over that stated by the tracking
     gain: float = 0.0  # of twice the log likelihood, over noise alone
-    beside: tuple[str, ...] = field(default=())  # faults of the measurement that were fitted along
+    beside: tuple[str, ...] = ()  # faults of the measurement that were fitted along
+    beside_px: float = 0.0  # rms of what they do to the dots about free poses
+    amounts: dict[str, float] = field(default_factory=dict)  # of their quantities
 
     @property
     def present(self) -> bool:
@@ -198,14 +202,24 @@ class Evidence:
 
         Groups without a size do not act.
         """
+        root, known, _, _ = self._solved(sizes)
+        return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
+
+    def amounts(self, sizes: Mapping[str, float], name: str) -> Array:
+        """Most probable numbers of one group's columns, in the units that the columns are given in."""
+        root, known, index, scaled = self._solved(sizes)
+        values = np.zeros(len(self._inner))
+        values[index] = scaled * solve_triangular(root, known, lower=True, trans=1)
+        return values[self._slices[name]]
+
+    def _solved(self, sizes: Mapping[str, float]) -> tuple[Array, Array, NDArray[np.intp], Array]:
         scaled = np.zeros(len(self._inner))
         for name, size in sizes.items():
             scaled[self._slices[name]] = size
         index = np.flatnonzero(scaled > 0)
         scaled = scaled[index]
         root = np.linalg.cholesky(self._gram[np.ix_(index, index)] * np.outer(scaled, scaled) + np.eye(len(index)))
-        known = solve_triangular(root, scaled * self._inner[index], lower=True)
-        return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
+        return root, solve_triangular(root, scaled * self._inner[index], lower=True), index, scaled
 
 
 Sizes = dict[str, float]
@@ -242,23 +256,42 @@ def _with_faults(
     chosen: tuple[str, ...] = ()
     while len(chosen) < most:
         trials = {name: evidence.twice_log(sizes | {name: size}) for name, size in faults.items() if name not in sizes}
-        name = max(trials, key=lambda n: trials[n])
-        if trials[name] < best + WORTH:
+        name = max(trials, key=lambda n: trials[n], default="")
+        if not name or trials[name] < best + WORTH:
             break
         best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
     return best, sizes, chosen
 
 
-def find_systematic(system: DiscSystem, noise: float = 1.0) -> Systematic:
+def _with_amounts(
+    found: Systematic, evidence: Evidence, sizes: Sizes, names: tuple[str, ...], view: StaticView
+) -> Systematic:
+    """With the faults fitted along, their most probable amounts, and what these do to the dots."""
+    amounts: dict[str, float] = {}
+    powers = 0.0
+    for name in names:
+        values = evidence.amounts(sizes, name)
+        shifts = (view.faults[name] @ values)[view.used]
+        powers += float(np.mean(shifts**2))
+        units = view.sizes[name]
+        amounts |= {key: float(v * unit) for (key, unit), v in zip(units.items(), values, strict=True)}
+    return replace(found, beside=names, beside_px=float(np.sqrt(powers)), amounts=amounts)
+
+
+def find_systematic(
+    system: DiscSystem, noise: float = 1.0, known: Values | None = None, beside: Sequence[str] | None = None
+) -> Systematic:
     """Sizes of the systematic errors of the dots, next to whatever fault of the measurement explains them better.
 
     noise : variance from frame to frame over that stated, to be kept in the answer
+    known : values of faults that the poses were found with
+    beside : fit these faults along, and no others
     """
     rows = np.flatnonzero(system.weights >= np.max(system.weights))
     if len(rows) < MIN_FRAMES:
         return Systematic(noise=noise)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_FRAMES, len(rows))).astype(int))]
-    view = system.static_view(rows)
+    view = system.static_view(rows, known or {})
     across = np.eye(view.residual.shape[1]) - view.by_pose @ np.linalg.pinv(view.by_pose)
     free = lambda columns: (across @ columns.reshape(*view.residual.shape, -1)).reshape(view.residual.size, -1)  # noqa: E731
     whitened = lambda shifts: free(np.einsum("ncmab,ncmbk->ncmak", view.whiten, shifts))  # noqa: E731
@@ -276,7 +309,9 @@ def find_systematic(system: DiscSystem, noise: float = 1.0) -> Systematic:
     steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     prints: Array = DOT_SIGMA * 2.0 ** np.arange(7.0)
     grids = {"print": prints, "lens": steps, "dot": steps}
-    amounts = dict.fromkeys(faults, 1.0)
+    given = tuple(name for name in beside or () if name in faults)
+    start |= dict.fromkeys(given, WIDE)
+    amounts = dict.fromkeys(faults, 1.0) if beside is None else {}
     best: Systematic | None = None
     nothing = 0.0
     for share in LENS_LENGTHS:
@@ -284,19 +319,22 @@ def find_systematic(system: DiscSystem, noise: float = 1.0) -> Systematic:
         evidence = Evidence(data, groups)
         if best is None:
             nothing = evidence.twice_log(start)
-            value, _, chosen = _with_faults(evidence, start, amounts, MOST_FAULTS)
-            best = Systematic(noise=noise, gain=value - nothing, beside=chosen)
+            value, sizes, chosen = _with_faults(evidence, start, amounts, MOST_FAULTS)
+            best = _with_amounts(
+                Systematic(noise=noise, gain=value - nothing), evidence, sizes, (*given, *chosen), view
+            )
         trial, sizes = _best_sizes(evidence, dict(start), grids)
         if trial < nothing + best.gain - 4 * WORTH and share != LENS_LENGTHS[0]:
             continue
         value, sizes, chosen = _with_faults(evidence, sizes, amounts, MOST_FAULTS)
         if chosen:  # what a fault explains is no field
-            refitted = dict(start) | dict.fromkeys(chosen, 1.0)
+            refitted = start | dict.fromkeys(chosen, 1.0)
             value, sizes = _best_sizes(evidence, refitted, grids)
         found = Systematic(
             sizes.get("lens", 0.0), share * extent, sizes.get("dot", 0.0), DOT_LENGTH * extent,
-            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, noise, value - nothing, chosen,
+            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, noise, value - nothing,
         )  # fmt: skip
+        found = _with_amounts(found, evidence, sizes, (*given, *chosen), view)
         if found.present and found.gain > best.gain + WORTH:
             best = found
     assert best is not None

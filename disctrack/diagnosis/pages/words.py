@@ -118,7 +118,9 @@ def sentence(
         of_the_measurement = f"Nothing {is_need} missing in the motion; wrong in the measurement"
         first = "Missing in the model" if motion else of_the_measurement
         rest = f"what is left is noise: {level}" if white else f"{level} are left"
-        return f"{first}: {effects}. With {it} chi-square per degree of freedom falls from {fall}, and {rest}.{ending}"
+        fell = diagnosis.before.reduced_chi_square > after.reduced_chi_square + 1e-9
+        falls = f"With {it} chi-square per degree of freedom falls from {fall}, and {rest}" if fell else rest
+        return f"{first}: {effects}. {falls[:1].upper()}{falls[1:]}.{ending}"
     if effects:
         nearest = f"the nearest description is {effects}, which leaves {level}"
         return f"Something is missing that the catalogue does not name; {nearest}.{ending}"

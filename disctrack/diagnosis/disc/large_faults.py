@@ -1,0 +1,224 @@
+"""Faults of the measurement too large for a search that begins at null: cameras knocked by degrees, frames out of step.
+
+Two cameras that disagree about a rigid pattern tell by how much one of them turned, moved or lags before anything is
+known of the motion: poses and fault are found in turn, from the dots alone. Which of the two cameras it was, the motion
+on its table decides. A clock that is wrong by a good part shows in the precession, which gravity sets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from calibration.camera import StereoRig
+from disctrack.diagnosis.disc.faults import Setup, faults_of, setup_of
+from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, with_noise_of_frames
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
+from disctrack.diagnosis.engine.system import Candidate, Values
+from disctrack.errors import AnalysisError
+from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, rotation_from_vector, unwrap_euler
+from disctrack.rolling import Model
+from disctrack.track.pose import fit_poses
+from disctrack.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+LARGE_PX = 1.0  # rms in the dots, from which a fault is sought without the linear approximation
+ITERATIONS = 6
+WORSE = 4.0  # times the misfit of the best explanation, from which another is not pursued
+ENOUGH = 1.5  # reduced chi-square, up to which no second fault is looked for
+SINGLE = (("time_offset",), *((f"{camera}_{family}",) for family in ("turned", "shifted") for camera in CAMERAS))
+DOUBLE = (
+    *((f"{camera}_turned", f"{camera}_shifted") for camera in CAMERAS),
+    *(("time_offset", f"{camera}_turned") for camera in CAMERAS),
+)
+STEADY = (0.8, 1.25)  # of psidot^2 sin(theta) / (4 g / r) that nutation and spin of a rolling disc leave it within
+
+
+@dataclass(frozen=True)
+class Assumed:
+    """A recording with large faults as they were found: the system that has them among what every fit moves."""
+
+    system: DiscSystem
+    base: Fit
+    candidates: tuple[Candidate, ...]
+    gain: float  # of twice the log likelihood of the dots about free poses
+
+    @property
+    def price(self) -> float:
+        """Cost of the fit, and of the numbers that it moves (Bayesian information criterion)."""
+        free = sum(not np.isfinite(q.prior_sigma) for q in self.base.quantities)
+        return self.base.cost + free * float(np.log(max(self.base.n_data, 2)))
+
+
+def rig_as_it_is(rig: StereoRig, setup: Setup) -> StereoRig:
+    """The rig with what became of its cameras after the calibration."""
+    poses = []
+    for (R, t), change in zip(rig.camera_poses(), setup.cameras, strict=True):
+        turn = rotation_from_vector(change.rotation).T
+        poses.append((turn @ R, turn @ (t - change.translation)))
+    (R_left, t_left), (R_right, t_right) = poses
+    R = R_right @ R_left.T
+    left, right = (change.lens(camera) for camera, change in zip(rig.cameras, setup.cameras, strict=True))
+    return replace(
+        rig, left=left, right=right, R_right_left=R, t_right_left=t_right - R @ t_left,
+        R_left_world=R_left, t_left_world=t_left,
+    )  # fmt: skip
+
+
+def in_step(trajectory: Trajectory, delay: float) -> Array:
+    """Dots (n, 2, m, 2) with those of the right camera at the left one's instants, by a cubic in time."""
+    pixels = trajectory.markers_px.copy()
+    if not delay:
+        return pixels
+    for dot in range(pixels.shape[2]):
+        seen = np.asarray(np.isfinite(pixels[:, 1, dot]).all(axis=1))
+        if seen.sum() < 8:
+            pixels[:, 1, dot] = np.nan
+            continue
+        time = trajectory.time[seen]
+        moved = CubicSpline(time, pixels[seen, 1, dot])(trajectory.time - delay, extrapolate=False)
+        pixels[:, 1, dot] = np.where(seen[:, None], moved, np.nan)
+    return pixels
+
+
+def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
+    """The trajectory with poses, and what they leave of the dots, as they are if these faults are true.
+
+    Dots and rig stay as measured and as calibrated.
+    """
+    setup = setup_of(trajectory.disc, values)
+    fits = fit_poses(
+        in_step(trajectory, setup.delay),
+        trajectory.markers_covariance_px2,
+        rig_as_it_is(trajectory.rig, setup),
+        setup.centres(trajectory.disc),
+        rotation_from_euler(*trajectory.q[:, 3:].T),
+        trajectory.q[:, :3],
+        reject_outliers=False,
+        with_sensitivity=False,
+    )
+    angles = np.full((len(trajectory), 3), np.nan)
+    good = fits.converged
+    angles[good] = unwrap_euler(euler_from_rotation(fits.R_world_body[good]))
+    return replace(
+        trajectory,
+        q=np.column_stack([fits.t_world_body, angles]),
+        pose_covariance=fits.covariance,
+        markers_residual_px=fits.residuals_px,
+        reduced_chi_square=fits.reduced_chi_square,
+    )
+
+
+def find_large(trajectory: Trajectory, model: Model, first: Systematic, known: Values) -> Assumed | None:
+    """Faults that the dots alone show to be large, with the camera that the motion speaks for; None if there are none.
+
+    first : what `find_systematic` finds in the trajectory as it is
+    """
+    if max(first.beside_px, first.lens_px, first.dot_px) < LARGE_PX:
+        return None
+    best: Assumed | None = None
+    for hypotheses in (SINGLE, DOUBLE):
+        seen = {names: _found_statically(trajectory, model, names, known) for names in hypotheses}
+        least = min(s.left for s in seen.values())
+        for names, static in seen.items():
+            found = _assumed(trajectory, model, names, static) if static.left < WORSE * least else None
+            if found is not None and (best is None or found.price < best.price):
+                best = found
+        if best is not None and best.base.reduced_chi_square < ENOUGH:
+            break
+    return best
+
+
+@dataclass(frozen=True)
+class _Static:
+    values: dict[str, float]  # of the faults
+    left: float  # median reduced chi-square of the poses that they leave
+    gain: float
+
+
+def _found_statically(trajectory: Trajectory, model: Model, names: tuple[str, ...], known: Values) -> _Static:
+    """Amounts of these faults from the dots about free poses, which are found with them in turn."""
+    candidates = [f.candidate() for f in faults_of(trajectory.disc) if f.name in names]
+    values, gain = dict(known), 0.0
+    for _ in range(ITERATIONS):
+        seen, _ = with_noise_of_frames(poses_with(trajectory, values))
+        system = DiscSystem(seen, model, stretch=_all_frames(seen))
+        found = find_systematic(system, 1.0, values, beside=names)
+        gain = max(gain, found.gain)
+        for c in candidates:
+            for q in c.quantities:
+                moved = values.get(q.name, 0.0) + found.amounts.get(q.name, 0.0)
+                values[q.name] = float(np.clip(moved, 0.99 * q.lower, 0.99 * q.upper))
+        if all(abs(found.amounts.get(q.name, 0.0)) < 0.1 * q.scale for c in candidates for q in c.quantities):
+            break
+    left = float(np.nanmedian(poses_with(trajectory, values).reduced_chi_square))
+    return _Static(values, left if np.isfinite(left) else np.inf, gain)
+
+
+def _all_frames(trajectory: Trajectory) -> Stretch:
+    """Poses that are wrong by degrees tell no rest from motion."""
+    good = np.flatnonzero(trajectory.measured)
+    return Stretch(slice(int(good[0]), int(good[-1]) + 1))
+
+
+def _assumed(trajectory: Trajectory, model: Model, names: tuple[str, ...], static: _Static) -> Assumed | None:
+    """The motion fitted with these faults among what moves; None where that fails."""
+    candidates = tuple(f.candidate() for f in faults_of(trajectory.disc) if f.name in names)
+    seen, noise = with_noise_of_frames(poses_with(trajectory, static.values))
+    try:
+        stretch = free_stretch(seen)
+    except AnalysisError:
+        return None
+    systematic = find_systematic(DiscSystem(seen, model, stretch=stretch), noise, static.values, beside=names)
+    system = DiscSystem(seen, model, stretch=stretch, systematic=systematic, freed=candidates)
+    base = fit(system, system.base, system.start(static.values))
+    return Assumed(system, base, candidates, static.gain) if np.isfinite(base.cost) else None
+
+
+def find_clock(system: DiscSystem, known: Values) -> Assumed | None:
+    """The same with the frame rate that the precession asks for; None where it is the declared one."""
+    speed = precession_over_steady(system)
+    if STEADY[0] < speed < STEADY[1]:
+        return None
+    (candidate,) = (f.candidate() for f in faults_of(system.disc) if f.name == "frame_rate")
+    (q,) = candidate.quantities
+    change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q.lower, q.upper))
+    freed = DiscSystem(
+        system.trajectory, system.model, stretch=system.stretch, systematic=system.systematic, freed=(candidate,)
+    )
+    base = fit(freed, freed.base, freed.start(dict(known) | {q.name: change}))
+    return Assumed(freed, base, (candidate,), np.inf) if base.converged else None
+
+
+def precession_over_steady(system: DiscSystem) -> float:
+    """Median of psidot^2 sin(theta) over 4 g / r, which it has in the steady rolling of a thin disc."""
+    q = system.trajectory.q[system.rows]
+    good = np.isfinite(q).all(axis=1)
+    psidot = np.gradient(q[good, 3], system.time[good])
+    ratio = psidot**2 * np.sin(q[good, 4]) * system.disc.radius / (4 * system.model.gravity)
+    return float(np.median(ratio))
+
+
+def with_large(diagnosis: Diagnosis, assumed: Assumed) -> Diagnosis:
+    """The diagnosis with the large faults among what was found."""
+    found, tried = [], []
+    for candidate in assumed.candidates:
+        gain = assumed.gain
+        found.append(Found(candidate, gain, gain, 0.0, ()))
+        tried.append(Tried(candidate, gain, gain, gain, "chosen, from the dots about free poses"))
+    verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
+    return replace(diagnosis, verdict=verdict, found=(*found, *diagnosis.found), tried=(*tried, *diagnosis.tried))
+
+
+def in_words(assumed: Assumed) -> str:
+    """A remark for people."""
+    said = " and ".join(c.title for c in assumed.candidates)
+    how = "the precession, which gravity sets" if np.isinf(assumed.gain) else "the dots alone"
+    return f"{said}: so much that it was found from {how}, and before and after are both with it"
