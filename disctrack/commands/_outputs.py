@@ -178,10 +178,10 @@ def _write_video(path: Path, trajectory: Trajectory, pairs: ImagePairs) -> None:
 
     rows = shown_rows(pairs.start, pairs.stop)
     with progress_bar("video", len(rows), "frame") as advance:
-        write_overlay(path, ((row, _pair(pairs, row)) for row in rows), trajectory, advance)
+        write_overlay(path, ((row, pair_of(pairs, row)) for row in rows), trajectory, advance)
 
 
-def _pair(pairs: ImagePairs, row: int) -> NDArray:
+def pair_of(pairs: ImagePairs, row: int) -> NDArray:
     """Both images of a frame; one that cannot be read is black."""
     width, height = pairs.left.image_size
     images = np.zeros((2, height, width), np.uint8 if pairs.left.bit_depth == 8 else np.uint16)

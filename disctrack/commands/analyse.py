@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from disctrack.analyse.analysis import Analysis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rerun",
         action="store_true",
         help="also write motion.rrd for the 3-D viewer (needs rerun-sdk)",
+    )
+    parser.add_argument(
+        "--recording",
+        type=Path,
+        metavar="FOLDER",
+        help="where the images for motion.html are (default: the folder that holds results/)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an older report")
 
@@ -58,9 +69,43 @@ def run(arguments: argparse.Namespace) -> int:
     with stage("analyse"):
         outcome = run_analyse(path, folder, window=arguments.window, circle_duration=arguments.circle, overwrite=again)
     lines = outcome.lines()
+    page = folder / "motion.html"
+    with stage("motion.html"):
+        _write_motion_page(page, outcome.analysis, path, arguments.recording)
+    lines.append(f"              {page}")
     if arguments.rerun:
         write_rerun(motion, outcome.analysis)
         lines.append(f"              {motion}")
-    remember(folder, origin, lines, (outcome.report, *outcome.figures))
+    remember(folder, origin, lines, (outcome.report, page, *outcome.figures))
     print("\n".join(lines))
     return DONE
+
+
+def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
+    """The interactive page, with pictures where the images of this trajectory are at hand."""
+    from disctrack.analyse.motion_page import write_motion_page
+    from disctrack.commands._outputs import pair_of
+    from disctrack.errors import RecordingError
+    from disctrack.files.trajectory_file import read_provenance
+    from disctrack.recording.declaration import FILE_NAME, read_recording
+    from disctrack.track.stage import open_pairs
+
+    folder = recording or next(
+        (place for place in (trajectory.parent, trajectory.parent.parent) if (place / FILE_NAME).is_file()), None
+    )
+    pairs = None
+    if folder is not None:
+        try:
+            pairs = open_pairs(read_recording(folder))
+        except RecordingError:
+            if recording is not None:
+                raise
+    if pairs is not None and len(pairs) != len(analysis.trajectory):
+        if recording is not None:
+            raise RecordingError(
+                f"{recording}: {len(pairs)} pairs, but {trajectory} has {len(analysis.trajectory)} frames: it was "
+                "measured from another recording."
+            )
+        pairs = None
+    take = None if pairs is None else partial(pair_of, pairs)
+    write_motion_page(page, analysis, read_provenance(trajectory).recording, take)

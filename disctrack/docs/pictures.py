@@ -61,7 +61,8 @@ def make(clip: Path, secret: Path, folder: Path) -> list[Path]:
         picture = cv2.imread(str(source))
         scale = min(1.0, WIDTH / picture.shape[1])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(folder / name), small, [cv2.IMWRITE_JPEG_QUALITY, 82, cv2.IMWRITE_PNG_COMPRESSION, 9])
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 82] if name.endswith("jpg") else [cv2.IMWRITE_PNG_COMPRESSION, 9]
+        cv2.imwrite(str(folder / name), small, quality)
         written.append(folder / name)
     return written
 

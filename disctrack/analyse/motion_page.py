@@ -1,0 +1,180 @@
+"""The motion to play with: one HTML file that needs neither server nor network.
+
+Disc in 3-D with the path of its contact, camera pictures with the fit drawn on them, nutation, precession rate and
+energy with a common cursor, and the residuals of the frame under it. The drawing is in `pages/motion.js`.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from disctrack.analyse.analysis import Analysis
+from disctrack.files.whole import write_whole
+from disctrack.pages.html import Markup, page, paragraph
+from disctrack.pages.palette import RED
+from disctrack.track.overlay import draw_pair
+from disctrack.trajectory import FrameStatus
+
+Array = NDArray[np.float64]
+Pairs = Callable[[int], NDArray | None]  # frame -> images (2, height, width), None where they cannot be read
+
+MOST_ROWS = 1500  # frames on the page: every second, third, ... of longer recordings
+MOST_PICTURES = 80
+PICTURE_HEIGHT = 300  # [px] of one camera's picture
+JPEG_QUALITY = 72
+
+
+def write_motion_page(path: Path, analysis: Analysis, name: str, pairs: Pairs | None = None) -> Path:
+    """Write the page. pairs : gives the images of a frame, where they are at hand. Raises OutputError."""
+    write_whole(path, motion_html(analysis, name, pairs).encode())
+    return path
+
+
+def motion_html(analysis: Analysis, name: str, pairs: Pairs | None = None) -> str:
+    """The whole page."""
+    content = page_data(analysis, pairs)
+    data = json.dumps(content, separators=(",", ":")).replace("</", "<\\/")
+    script = files("disctrack.pages").joinpath("motion.js").read_text(encoding="utf-8")
+    curves = "".join(
+        f'<canvas id="curve-{k}" class="curve" role="img" aria-label="{series["name"]} over time"></canvas>'
+        for k, series in enumerate(content["series"])
+    )
+    picture = (
+        '<figure><img id="picture" alt="left and right camera"><figcaption id="picture-caption"></figcaption></figure>'
+        if content["pictures"]
+        else "<p>The images were not at hand when this page was made.</p>"
+    )
+    body = Markup(
+        '<div class="bar"><button id="play" type="button">▶ play</button>'
+        '<label>slower by <select id="speed"><option>1</option><option selected>10</option><option>100</option>'
+        '</select></label><input id="slider" type="range" min="0" value="0" aria-label="time">'
+        '<button id="whole" type="button">whole time</button></div><p id="told" role="status"></p>'
+        '<div class="two"><section><h2>Disc and path of its contact</h2><canvas id="space" role="img" '
+        'aria-label="disc in three dimensions"></canvas><p class="hint">Drag to turn, wheel to zoom.</p></section>'
+        f"<section><h2>Cameras</h2>{picture}<h2>Residuals of this frame</h2>"
+        '<canvas id="residuals" role="img" aria-label="residuals of the dots"></canvas></section></div>'
+        f'<section><h2>Curves (band: ± 3 σ by noise)</h2>{curves}<p class="hint">Click to go to a time, drag over a '
+        "part to zoom, double click for the whole.</p></section>"
+        f'<script type="application/json" id="motion-data">{data}</script><script>{script}</script>'
+    )
+    return page(f"{name}: the motion", [paragraph(_said(analysis)), body], head=f"<style>{_STYLE}</style>")
+
+
+def page_data(analysis: Analysis, pairs: Pairs | None = None) -> dict[str, Any]:
+    """What the page draws, of JSON's types; lengths in mm, angles in degrees, None where nothing is known."""
+    trajectory, motion = analysis.trajectory, analysis.motion
+    rows = np.arange(0, len(trajectory), max(1, -(-len(trajectory) // MOST_ROWS)))
+    energy, psidot = analysis.series("total"), analysis.series("psidot")
+    contact = [1e3 * analysis.contact.series[i].value for i in (0, 1)]
+    at = {name: _by_time(motion.time, values, trajectory.time[rows]) for name, values in (
+        ("x", contact[0]), ("y", contact[1]), ("energy", 1e3 * energy.value), ("energy_sigma", 1e3 * energy.sigma),
+        ("psidot", psidot.value), ("psidot_sigma", psidot.sigma),
+    )}  # fmt: skip
+    q, disc = trajectory.q[rows], trajectory.disc
+    theta_sigma = np.degrees(trajectory.coordinate_sigma[rows, 4])
+    residual = trajectory.markers_residual_px[rows]
+    finite = np.abs(residual[np.isfinite(residual)])
+    middle = np.nanmean(1e3 * q[:, :2], axis=0) if trajectory.measured[rows].any() else np.zeros(2)
+
+    def series(name: str, unit: str, digits: int, value: Array, sigma: Array) -> dict[str, Any]:
+        return {"name": name, "unit": unit, "digits": digits, "value": _plain(value, 6), "sigma": _plain(sigma, 7)}
+
+    return {
+        "time": _plain(trajectory.time[rows], 7),
+        "frame": trajectory.frame[rows].tolist(),
+        "status": [FrameStatus(int(status)).sentence for status in trajectory.frame_status[rows]],
+        "words": [_in_words(row) for row in q],
+        "xyz": _plain(1e3 * q[:, :3], 4),
+        "quaternion": _plain(trajectory.quaternion[rows], 6),
+        "contact": _plain(np.column_stack([at["x"], at["y"]]), 4),
+        "middle": _plain(middle, 3),
+        "disc": {
+            "radius_mm": 1e3 * disc.radius,
+            "thickness_mm": 2e3 * disc.half_thickness,
+            "dot_mm": 1e3 * disc.marker_diameter,
+            "dots_mm": _plain(1e3 * disc.marker_centres_body[:, :2], 4),
+        },
+        "series": [
+            series("nutation θ", "deg", 4, np.degrees(q[:, 4]), theta_sigma),
+            series("precession rate", "rad/s", 3, at["psidot"], at["psidot_sigma"]),
+            series("energy", "mJ", 4, at["energy"], at["energy_sigma"]),
+        ],
+        "residual_px": _plain(residual, 5),
+        "residual_reach_px": float(1.2 * np.percentile(finite, 99.5)) if finite.size else 1.0,
+        "rms_px": _plain(trajectory.reprojection_rms_px[rows], 5),
+        "pictures": [] if pairs is None else _pictures(analysis, rows, pairs),
+    }
+
+
+def _said(analysis: Analysis) -> str:
+    trajectory = analysis.trajectory
+    shown = max(1, -(-len(trajectory) // MOST_ROWS))
+    every = "" if shown == 1 else f" Every {shown}th frame is shown."
+    return (
+        f"{int(trajectory.measured.sum())} of {len(trajectory)} frames have a pose, at {trajectory.frame_rate:g} pairs "
+        f"per second.{every}"
+    )
+
+
+def _in_words(q: Array) -> str:
+    if not np.isfinite(q).all():
+        return ""
+    (x, y, z), (psi, theta, phi) = 1e3 * q[:3], np.degrees(q[3:])
+    return f"x {x:.3f}  y {y:.3f}  z {z:.3f} mm   ψ {psi:.2f}  θ {theta:.3f}  φ {phi:.2f}°"
+
+
+def _by_time(time: Array, values: Array, wanted: Array) -> Array:
+    """Values at the wanted times; NaN outside, and where they are."""
+    index = np.clip(np.searchsorted(time, wanted - 1e-9), 0, len(time) - 1)
+    return np.where(np.abs(time[index] - wanted) < 1e-6, values[index], np.nan)
+
+
+def _plain(values: Array, digits: int) -> Any:
+    """Nested lists, rounded; None for NaN."""
+    rounded = np.round(np.asarray(values, float), digits).astype(object)
+    rounded[~np.isfinite(rounded.astype(float))] = None
+    return rounded.tolist()
+
+
+def _pictures(analysis: Analysis, rows: NDArray[np.intp], pairs: Pairs) -> list[dict[str, Any]]:
+    chosen = np.unique(np.linspace(0, len(rows) - 1, min(MOST_PICTURES, len(rows))).round().astype(int))
+    found = []
+    for k in chosen:
+        row = int(rows[k])
+        images = pairs(row)
+        if images is None:
+            continue
+        drawn = draw_pair(images, analysis.trajectory, row)[: images.shape[1]]
+        scale = min(1.0, PICTURE_HEIGHT / drawn.shape[0])
+        small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if good:
+            uri = f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"
+            found.append({"row": int(k), "uri": uri})
+    return found
+
+
+_STYLE = f"""
+:root{{--second:{RED}}}@media (prefers-color-scheme:dark){{:root{{--second:#ff9a5c}}}}
+.bar{{display:flex;gap:.8rem;align-items:center;flex-wrap:wrap;position:sticky;top:0;background:var(--back);
+padding:.6rem 0;z-index:1}}.bar input{{flex:1 1 12rem}}
+button,select{{font:inherit;color:var(--ink);background:var(--card);border:1px solid var(--line);border-radius:6px;
+padding:.3rem .8rem}}button{{min-width:6.5rem}}
+#told{{font-variant-numeric:tabular-nums;white-space:pre-wrap;margin:.2rem 0;min-height:1.6em}}
+.two{{display:grid;grid-template-columns:minmax(0,1fr) minmax(0,1fr);gap:1.2rem}}.two section{{margin:.6rem 0}}
+canvas{{display:block;width:100%}}#space{{height:29rem;touch-action:none;cursor:grab}}#residuals{{height:15rem}}
+.curve{{height:9rem;touch-action:pan-y;cursor:crosshair}}.curve:last-of-type{{height:10.5rem}}
+.hint{{color:var(--soft);font-size:.85rem;margin:.4rem 0 0}}
+@media (max-width:56rem){{.two{{grid-template-columns:minmax(0,1fr);gap:0}}#space{{height:19rem}}}}
+@media print{{.bar,.hint{{display:none}}section{{break-inside:avoid}}canvas{{object-fit:contain}}
+.two{{grid-template-columns:minmax(0,1fr) minmax(0,1fr);gap:1.2rem}}#space{{height:16rem}}}}
+"""
