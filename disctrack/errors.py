@@ -42,3 +42,7 @@ class OutputError(DiscTrackError):
 
 class TrajectoryFileError(DiscTrackError):
     """A trajectory file cannot be read, or holds something else."""
+
+
+class ModelError(DiscTrackError):
+    """A model of the motion cannot be built: unknown effect or parameter, a value out of bounds, no such motion."""

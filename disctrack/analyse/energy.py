@@ -6,6 +6,7 @@ the end is not possible.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import Motion
 from disctrack.analyse.propagation import Propagated, Series, State, propagate
 from disctrack.disc import Disc
+from disctrack.errors import ModelError
+from disctrack.regular_precession import precession_rate
 
 Array = NDArray[np.float64]
 
@@ -75,22 +78,12 @@ def analyse_energy(motion: Motion) -> Energy:
     steady = float("nan")
     if theta.size:
         typical = float(np.median(theta))
-        steady = steady_precession_rate(typical, motion.disc, motion.gravity) ** 2 * np.sin(typical)
-        steady = float(steady / (4 * motion.gravity / motion.disc.radius))
+        with contextlib.suppress(
+            ModelError
+        ):  # a disc that stands nearly upright does not precess with its centre at rest
+            steady = precession_rate(typical, motion.disc, motion.gravity)[0] ** 2 * np.sin(typical)
+            steady = float(steady / (4 * motion.gravity / motion.disc.radius))
     return Energy(found.series(ENERGY), found, loss, noise, common, ratio, ratio_sigma, steady)
-
-
-def steady_precession_rate(theta: float, disc: Disc, gravity: float) -> float:
-    """Precession rate [rad/s] at constant nutation theta [rad] with the centre at rest: omega_3 = h psidot s / r.
-
-    First of equations (2.9) with all rates constant: (2.11) with I2 in place of J1 and one sin theta less in its
-    mixed term than printed.
-    """
-    m, r, h = disc.mass, disc.radius, disc.half_thickness
-    I2, I3 = disc.moment_diametral + m * h * h, disc.moment_axial + m * r * r
-    s, c = np.sin(theta), np.cos(theta)
-    stiffness = I2 * s * c - (I3 * s + m * r * h * c) * h * s / r + m * r * h * s * s
-    return float(np.sqrt(m * gravity * (r * c - h * s) / stiffness))
 
 
 def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:

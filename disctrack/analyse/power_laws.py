@@ -17,8 +17,9 @@ from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 from scipy.stats import t as student_t
 
-from disctrack.analyse.energy import steady_precession_rate
 from disctrack.disc import Disc
+from disctrack.errors import ModelError
+from disctrack.regular_precession import nutation_frequency, precession_rate
 
 Array = NDArray[np.float64]
 
@@ -374,22 +375,10 @@ def _parabola_top(x: Array, y: Array) -> float:
 def nutation_ratio(theta: float, disc: Disc) -> float:
     """Frequency of small nutations over that of the precession, about steady precession with the centre at rest.
 
-    Linearised equations (2.9): omega_2 and omega_3 follow theta (two conserved quantities), which leaves one
-    oscillator. sqrt(3/5) for a thin disc at small theta, eq. (2.15). Gravity sets the rates, not their ratio.
+    sqrt(3/5) for a thin disc at small theta, eq. (2.15). Gravity sets the rates, not their ratio; NaN where a disc
+    cannot precess so.
     """
-    m, r, h, J1, J3 = disc.mass, disc.radius, disc.half_thickness, disc.moment_diametral, disc.moment_axial
-    I1, I2, I3 = J1 + m * (r * r + h * h), J1 + m * h * h, J3 + m * r * r
-    s, c = np.sin(theta), np.cos(theta)
-    L2 = r * s + h * c
-    coupling = I3 + m * r * h * c / s
-    psidot = steady_precession_rate(theta, disc, 1.0)
-    w2 = psidot * s
-    w3 = h * w2 / r
-    follow = np.linalg.solve(
-        [[I2, -m * h * r], [-m * h * r, I3]],
-        [-J1 * psidot * c + J3 * w3 - m * h * psidot * L2, m * r * psidot * L2],
-    )
-    by_theta = -I2 * w2**2 / s**2 + m * r * h * w2 * w3 / s**2 + m * L2
-    by_w2 = 2 * I2 * w2 * c / s - coupling * w3 + 2 * m * r * h * w2
-    by_w3 = -coupling * w2
-    return float(np.sqrt(-(by_theta + by_w2 * follow[0] + by_w3 * follow[1]) / I1) / psidot)
+    try:
+        return nutation_frequency(theta, disc) / precession_rate(theta, disc)[0]
+    except ModelError:
+        return float("nan")

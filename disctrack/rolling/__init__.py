@@ -5,6 +5,7 @@ Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `str
 elsewhere, `run` writes a scene's motion to a file.
 """
 
+from disctrack.regular_precession import nutation_frequency, precession_rate
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, ModelError, Parameter
 from disctrack.rolling.impact import struck_disc
@@ -13,7 +14,7 @@ from disctrack.rolling.motion import EndReason, Motion, Regime, Switch
 from disctrack.rolling.sensitivities import Sensitivities, sensitivities
 from disctrack.rolling.simulate import simulate, time_grid
 from disctrack.rolling.state import State
-from disctrack.rolling.steady import nutation_frequency, precession_rate, steady_precession
+from disctrack.rolling.steady import steady_precession
 
 __all__ = [
     "CATALOGUE",

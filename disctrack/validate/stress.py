@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
+from disctrack.regular_precession import precession_rate
 from disctrack.render import render_disc
-from disctrack.rolling import precession_rate
 from disctrack.scene.description import GlareSettings, Occluder, Scene
 from disctrack.validate.comparison import compare
 from disctrack.validate.poses import cameras_in_sight, centre_height

@@ -68,11 +68,12 @@ def test_every_public_name_is_there():
 STAIRS = (
     ("__version__", "frames", "disc", "published", "progress"),  # words shared by all
     ("errors", "trajectory"),
-    ("files", "rolling"),
+    ("files", "regular_precession"),
+    ("rolling",),
     ("readers", "recording", "pages", "scene"),
     ("track", "analyse", "render"),  # the measurement; the same physics forwards
     ("calibrate", "repeats", "diagnosis"),
-    ("first_look", "examples", "validate", "batch"),
+    ("first_look", "examples", "validate", "batch", "docs"),
     ("commands",),
     ("cli",),
     ("__main__",),

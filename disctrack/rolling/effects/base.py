@@ -23,13 +23,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from disctrack.errors import DiscTrackError
+from disctrack.errors import ModelError
 
 CATALOGUE: dict[str, type[Effect]] = {}
-
-
-class ModelError(DiscTrackError):
-    """A model of the motion cannot be built: unknown effect or parameter, or a value outside its bounds."""
 
 
 @dataclass(frozen=True)
