@@ -28,6 +28,9 @@ class FrameStatus(IntEnum):
     UNREADABLE = 5
     NOT_PROCESSED = 6
     STILL = 7
+    REPEATED = 8
+    CONTRADICTED = 9
+    JUMPED = 10
 
     @property
     def has_pose(self) -> bool:
@@ -53,6 +56,10 @@ _FRAME_SENTENCES = {
     FrameStatus.NOT_CONVERGED: "no pose fits the dots: two exchanged, or the rig does not belong to this recording",
     FrameStatus.UNREADABLE: "image file could not be read",
     FrameStatus.NOT_PROCESSED: "not processed",
+    FrameStatus.REPEATED: "both images are copies of earlier ones, while the disc moves: the recorder lost this frame",
+    FrameStatus.CONTRADICTED: "refused: the dots contradict each other by more than their noise explains (a gleam, "
+    "a hand, a repeated or exchanged image)",
+    FrameStatus.JUMPED: "refused: no motion leads from the frames before or after to this pose (exchanged frames?)",
     FrameStatus.STILL: "left out: nothing moves before the start or after the end; --all measures them, too",
 }
 

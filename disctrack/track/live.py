@@ -16,7 +16,8 @@ from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.track import tracking as tracker
-from disctrack.track.dots import dot_centres
+from disctrack.track.dots import dot_centres, normalised_maps
+from disctrack.track.following import Follower, Heading, Pose, Rows, Setup, empty_rows, recover, run
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
@@ -66,20 +67,17 @@ class Tracker:
         self.rig, self.disc = rig, disc
         self.frame = -1
         self._settings = settings or tracker.TrackingSettings()
-        maps = [tracker.normalised_maps(camera) for camera in rig.cameras]
-        maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
-        here = (np.eye(3), np.zeros(3))
-        self._follower = tracker._Follower(
-            rig, disc, self._settings.limits, maps_x, maps_y,
-            [tracker.NoiseModel(1.0, 0.02)] * 2, [tracker.TYPICAL_BLUR_PX] * 2, here, here,
-        )  # fmt: skip
+        maps_x, maps_y = (
+            np.stack(part) for part in zip(*(normalised_maps(camera) for camera in rig.cameras), strict=True)
+        )
+        self._follower = Follower(Setup(rig, disc, self._settings.limits, maps_x, maps_y))
         self._readable = np.ones((1, 2), bool)
         self._angles: Array | None = None  # of the last pose
-        self._found: tuple[Array, Array] | None = None  # in the pair before, by a search
+        self._found: Pose | None = None  # in the pair before, by a search
         self._pair: NDArray = np.empty((1, 2, 0, 0), np.uint8)
 
     def __repr__(self) -> str:
-        state = "following the disc" if self._follower.tracking else "searching"
+        state = "following the disc" if self._follower.lost is None else "searching"
         return f"Tracker({self.disc.n_markers} dots, {self.frame + 1} pairs seen, {state})"
 
     def next(self, left: Image, right: Image) -> LivePose:
@@ -90,37 +88,49 @@ class Tracker:
         self.frame += 1
         images = self._as_block(left, right)
         follower, m = self._follower, self.disc.n_markers
-        rows = tracker._empty_rows(1, m)
-        done = follower.run(images, self._readable, rows) if follower.tracking else 0
+        rows = empty_rows(1, m)
+        done = self._run(images, rows) if follower.lost is None else 0
         if not done:
             done = self._search(images, rows)
-        follower.tracking = bool(done)
+        follower.search = follower.search.frames_later(1)
         if not done:
+            follower.lost = (follower.lost or 0) + 1
             self._angles = None
             return self._without_pose(FrameStatus.MARKERS_NOT_FOUND)
+        follower.lost = None
         return self._pose(rows)
+
+    def _run(self, images: NDArray, rows: Rows) -> int:
+        follower = self._follower
+        assert follower.heading is not None
+        done, follower.heading = run(
+            follower.setup, follower.law, follower.heading, images, self._readable, rows
+        )  # fmt: skip
+        return done
 
     def _as_block(self, left: Image, right: Image) -> NDArray:
         if self._pair.shape[2:] != left.shape or self._pair.dtype != left.dtype:
             self._pair = np.empty((1, 2, *left.shape), left.dtype)
-            tracker._check_images(self._pair, self.rig)
+            tracker.check_images(self._pair, self.rig)
         self._pair[0, 0], self._pair[0, 1] = left, right
         return self._pair
 
-    def _search(self, images: NDArray, rows: tracker._Rows) -> int:
-        """Search without a prior; the velocity comes from the pair before, if that was searched too."""
+    def _search(self, images: NDArray, rows: Rows) -> int:
+        """Search the disc; the velocity comes from the pair before, if that was searched too."""
         follower, before = self._follower, self._found
         self._found = None
-        if not tracker._acquire(follower, images, self._readable):
+        follower.lost = follower.lost or 0
+        if not recover(follower, images, self._readable):
             return 0
-        if before is not None:
-            follower.before = before
-        done = follower.run(images, self._readable, rows)
+        if before is not None and follower.heading is not None:
+            (R, t), (R_now, t_now) = before, follower.heading.last
+            follower.heading = Heading((R, t), (R @ R_now.T @ R, 2 * t - t_now))
+        done = self._run(images, rows)
         if done:
             self._found = (rows.R[0].copy(), rows.t[0].copy())
         return done
 
-    def _pose(self, rows: tracker._Rows) -> LivePose:
+    def _pose(self, rows: Rows) -> LivePose:
         dots = dot_centres(rows.results, rows.status)
         pixels, covariances = dots.pixels, dots.covariance_px2
         R, t, covariance, residuals, chi_square, used = _refined(

@@ -18,7 +18,7 @@ from disctrack.track.least_squares import BatchFit, State, levenberg_marquardt
 Array = NDArray[np.float64]
 
 MIN_DOTS = 3  # six unknowns, two numbers per dot
-# A dot is refused when its squared distance from the fit exceeds this many times the typical reduced chi-square:
+# A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
 # chance alone does it once in 3e5 dots.
 OUTLIER_CHI_SQUARE = 25.0
 MAX_REJECTED = 4
@@ -172,18 +172,33 @@ def _worst_dot(
     rows: NDArray[np.intp],
 ) -> NDArray[np.intp]:
     """Strike the worst outlier of each of the rows from `used`; returns the rows that must be fitted again."""
-    pixels, _ = marker_pixels(R[rows], t[rows], rig, centres)
-    distance2 = np.sum(((W[rows] @ (observed[rows] - pixels)[..., None])[..., 0]) ** 2, axis=-1)
-    distance2 = np.where(used[rows], distance2, 0.0)
+    pixels, J = marker_pixels(R[rows], t[rows], rig, centres)
     count = used[rows].sum((1, 2))
-    # what is usual in this recording (two numbers per dot): a rig that is off by a little must not strike good dots
-    usual = max(1.0, 0.5 * float(np.median(distance2[used[rows]]) / np.log(2.0))) if count.any() else 1.0
-    flat = distance2.reshape(len(rows), -1)
-    worst = flat.argmax(axis=1)
-    strike = (flat.max(axis=1) > 2 * OUTLIER_CHI_SQUARE * usual) & (count > MIN_DOTS + 1)
-    struck = rows[strike]
-    used.reshape(len(used), -1)[struck, worst[strike]] = False
-    return struck
+    residual = np.where(used[rows][..., None], (W[rows] @ (observed[rows] - pixels)[..., None])[..., 0], 0.0)
+    chi_square = np.sum(residual**2, axis=(1, 2, 3))
+    # a dot's part is at most the whole: of other frames none can be an outlier
+    far = np.flatnonzero((chi_square > 2 * OUTLIER_CHI_SQUARE) & (count > MIN_DOTS + 1))
+    if not len(far):
+        return rows[far]
+    rows, chi_square, count = rows[far], chi_square[far], count[far]
+    residual = residual[far].reshape(len(far), -1, 2)
+    JW = np.where(used[rows][..., None, None], W[rows] @ J[far], 0.0).reshape(len(rows), -1, 2, 6)
+    normal = np.einsum("ndij,ndik->njk", JW, JW)
+    possible = np.linalg.cond(normal) < 1e16
+    inverse = np.linalg.inv(np.where(possible[:, None, None], normal, np.eye(6)))
+    leverage = JW @ inverse[:, None] @ np.swapaxes(JW, 2, 3)
+    # by what chi-square falls without the dot: its residual, freed of its own pull on the pose (two numbers)
+    left_out = np.eye(2) - leverage
+    left_out[np.linalg.det(left_out) < 1e-9] = 1e300 * np.eye(2)  # nothing but this dot fixes the pose there
+    drop = np.einsum("ndi,ndi->nd", residual, np.linalg.solve(left_out, residual[..., None])[..., 0])
+    worst = drop.argmax(axis=1)
+    largest = drop[np.arange(len(rows)), worst]
+    # what is usual for the frame's other dots: a rig that is off by a little must not strike good ones, and no pose may
+    # depend on which other frames are in the run
+    usual = np.maximum(1.0, (chi_square - largest) / np.maximum(2 * count - 8, 1))
+    struck = possible & (largest > 2 * OUTLIER_CHI_SQUARE * usual)
+    used.reshape(len(used), -1)[rows[struck], worst[struck]] = False
+    return rows[struck]
 
 
 def _safe_rotation(R: Array, possible: NDArray[np.bool_]) -> Array:

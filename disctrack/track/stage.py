@@ -169,8 +169,8 @@ def measure(
     findings = {
         **findings_of(tracking),
         "notes": list(pairs.notes),
-        "warnings": [*pairs.warnings, *pairs.doubts, *tracking.warnings],
-        "doubts": [*pairs.doubts],
+        "warnings": list(dict.fromkeys([*pairs.warnings, *pairs.doubts, *tracking.doubts, *tracking.warnings])),
+        "doubts": [*pairs.doubts, *tracking.doubts],
         "unreadable": [image.reason for image in unreadable],
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),

@@ -10,8 +10,8 @@ from numpy.testing import assert_array_equal
 from disctrack import frames
 from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.track.as_printed import AsBuilt
-from disctrack.track.tracking import MOST_STRETCHES, _fit_all, _Tables, stretch_edges
-from disctrack.trajectory import FrameStatus
+from disctrack.track.following import empty_tables
+from disctrack.track.tracking import MOST_STRETCHES, _fit_all, stretch_edges
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
         k = np.arange(n) % len(R)
         covariance = np.broadcast_to(1e-4 * np.eye(2), (n, 2, m, 2, 2)).copy()
         status = np.zeros((n, 2, m), np.uint8)
-        tables = _Tables(pixels[k], covariance, status, R[k], t[k], np.full(n, FrameStatus.MEASURED, np.uint8))
+        tables = replace(empty_tables(n, m), pixels=pixels[k], covariance_px2=covariance, status=status, R=R[k], t=t[k])
         tracemalloc.start()
         fits = _fit_all(tables, built, reject_outliers=True)
         peak = tracemalloc.get_traced_memory()[1]
