@@ -97,11 +97,15 @@ class Search:
             since=self.since + n,
         )  # fmt: skip
 
-    def is_due(self, pair: Images, readable: NDArray[np.bool_]) -> bool:
-        """True where there is credit, and the pair (2, height, width) shows something new or it was long ago."""
-        if self.credit == 0 or (self.failures and self.since < self.failures):  # a hand stays for some frames
+    def is_due(self, pair: Images, readable: NDArray[np.bool_], seen: bool) -> bool:
+        """True where there is credit, and reason to hope.
+
+        A disc that was seen before comes out from behind a hand after some frames: the wait grows by one with every
+        failure. Where none was seen yet, the pair (2, height, width) must show something new, or the wait doubles.
+        """
+        if self.credit == 0 or (self.failures and self.since < self.failures):
             return False
-        if self.scenes is None or self.since >= FRAMES_PER_SEARCH or not readable.all():
+        if seen or self.scenes is None or self.since >= min(2**self.failures, FRAMES_PER_SEARCH) or not readable.all():
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
@@ -343,7 +347,7 @@ def recover(follower: Follower, images: Images, readable: NDArray[np.bool_]) -> 
         if _holds(follower, carried, images, readable):
             follower.heading = carried
             return True
-    if not follower.search.is_due(images[0], readable[0]):
+    if not follower.search.is_due(images[0], readable[0], follower.heading is not None):
         return False
     if _search(follower, images, readable):
         follower.acquisitions += 1
