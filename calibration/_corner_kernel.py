@@ -31,8 +31,12 @@ _X, _W = np.polynomial.legendre.leggauss(8)
 _N_NODES = 8
 _SQRT_HALF = math.sqrt(0.5)
 
+# What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices
+# assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop.
+_part = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
-@numba.njit(cache=True, nogil=True)
+
+@_part
 def nodes(rho):  # type: ignore[no-untyped-def]
     """Quadrature over the angle 0..asin(rho): weight, sine and 1 / (2 cos^2) at each node."""
     table = np.empty((_N_NODES, 3))
@@ -45,7 +49,7 @@ def nodes(rho):  # type: ignore[no-untyped-def]
     return table
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
     """S and its derivatives with respect to h, k and rho, into out (4,); table from `nodes(rho)`."""
     near_h, near_k = abs(h) < _FAR, abs(k) < _FAR
@@ -66,7 +70,7 @@ def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
     out[0], out[1], out[2], out[3] = S, S_h, S_k, S_rho
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def normal_equations(image, window, p, curvature, noise, weights, first_pass, H, g):  # type: ignore[no-untyped-def]
     """Weighted sums of one corner; H (9, 9) and g (9,) are filled. Returns chi-square, and sums over pixels.
 
@@ -151,7 +155,7 @@ def normal_equations(image, window, p, curvature, noise, weights, first_pass, H,
     return sums
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def cholesky_solve(H, damping, rhs, L):  # type: ignore[no-untyped-def]
     """Solve (H + damping diag H) x = rhs in place, H given by its lower triangle; False if not positive definite."""
     n = H.shape[0]
@@ -177,7 +181,7 @@ def cholesky_solve(H, damping, rhs, L):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@_part
 def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covariance):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt on p (9,) in place; covariance (2, 2) of x, y is filled. Returns sums and success."""
     H, g = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
@@ -198,7 +202,9 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
             if damping > 1e8:
                 break
             continue
-        trial = p + step
+        trial = np.empty(N_CORNER)
+        for i in range(N_CORNER):
+            trial[i] = p[i] + step[i]
         trial[4] = min(max(trial[4], 0.5 * p[4], MIN_BLUR), 2.0 * p[4])
         reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
         accepted = reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
@@ -207,7 +213,9 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
             accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
         if accepted:
             blur_step = trial[4] - p[4]  # as clamped: edges sharper than the pixel hold it at its lower bound
-            p[:], sums = trial, sums_new
+            for i in range(N_CORNER):
+                p[i] = trial[i]
+            sums = sums_new
             H, H_new = H_new, H
             g, g_new = g_new, g
             damping = max(damping * 0.1, 1e-9)
@@ -241,7 +249,9 @@ def fit_corners(image, windows, starts, curvatures, noise, iterations, tolerance
     sums = np.empty((n, 9))
     converged = np.empty(n, np.bool_)
     for i in range(n):
-        sums[i], converged[i] = fit_corner(
+        own, converged[i] = fit_corner(
             image, windows[i], found[i], curvatures[i], noise, iterations, tolerance, covariance[i]
         )
+        for k in range(own.shape[0]):
+            sums[i, k] = own[k]
     return found, covariance, sums, converged

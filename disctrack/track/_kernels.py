@@ -1,7 +1,12 @@
 """Compiled inner loops of marker location and tracking (numba); their meaning is told in `dots` and `tracking`.
 
-They are compiled because a recording needs about 12 fits of 500 pixels per pair at the camera's own rate of 1000
-pairs/s: the same sums written with numpy calls per dot are some fifty times slower.
+They are compiled because a recording needs about 12 fits of 700 pixels per pair at the camera's own rate of 1000
+pairs/s. What is done per pixel is written so that the compiler makes vector code of it: loops over rows of single
+precision without a branch, in pixels as the unit of length (rounding moves a centre by less than 1e-6 px).
+
+What compiling costs grows with every function and with every level of calls, for each level is optimised anew with all
+that it calls. So there are few of them; whole slices are not assigned (the text of the error that numba prepares for
+unequal shapes takes longer to compile than the loop); and only what Python calls has a way in from Python.
 """
 
 from __future__ import annotations
@@ -10,10 +15,11 @@ import math
 
 import numpy as np
 from numba import njit
-from scipy.special import erfc
 
 # No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
-_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
+_RULES = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
+_entry = njit(cache=True, **_RULES)  # called from Python
+_part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called from compiled code
 
 # Status codes: the values of trajectory.MarkerStatus, which a test keeps equal.
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED = 0, 1, 2, 3, 4, 5
@@ -25,13 +31,19 @@ A, B, RADIUS, SIGMA, LEVEL, SLOPE_X, SLOPE_Y, CONTRAST = range(8)
 # Columns of a dot's result: pixel centre, its covariance, and what is needed to judge the fit.
 U, V, VAR_U, VAR_V, COV_UV, CHI_SQUARE, FIT_SIGMA, FIT_RADIUS, FIT_LEVEL, FIT_CONTRAST, CLIPPED, N_PIXELS = range(12)
 N_RESULT = 12
-SCRATCH_ROWS = 15
 
-# Edge profile and its slope, tabulated: linear interpolation errs by 1.2e-7, and costs a tenth of erfc and exp.
-_Z_MAX, _PER_UNIT = 6.0, 512
-_z_nodes = np.arange(-_Z_MAX, _Z_MAX + 2.0 / _PER_UNIT, 1.0 / _PER_UNIT)
-_EDGE = 0.5 * erfc(_z_nodes / math.sqrt(2.0))
-_BELL = np.exp(-0.5 * _z_nodes**2) / math.sqrt(2.0 * math.pi)
+# Rows of what is kept of every pixel: place on the plane from the expected centre [px], place in the image from the
+# expected centre [10 px], grey value, distance from the edge and then weight; derivatives by the eight parameters
+# (from _JACOBIAN on) and residual, over the pixel's sigma.
+_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _WEIGHT, _JACOBIAN = range(7)
+_RESIDUAL = _JACOBIAN + 8
+_PIXEL_ROWS = _RESIDUAL + 1
+_PIXELS = (
+    4096 + 64
+)  # of a dot of 60 px; more are made room for. No power of two: rows would fall on one another's cache
+# Rows of eight for the normal equations: matrix, right-hand side, step, parameters before it.
+_RHS, _STEP, _BEFORE, _WORK_ROWS = 8, 9, 10, 11
+
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
@@ -41,9 +53,26 @@ _MIN_SEMI_MINOR = 3.7
 _MIN_SEMI_MINOR_PX = 3.5  # in fewer pixels the edge distance itself is too coarse, however sharp the image
 _ATTITUDE_TOLERANCE = 1.5e-3  # [rad] farther from the expected attitude a pair is looked at once more
 
+# numba takes a literal for double precision, and with it all that it touches
+_f = np.float32
+_0, _1, _2, _HALF, _TINY = _f(0), _f(1), _f(2), _f(0.5), _f(1e-15)
+_LEAST_BEND = _f(-0.3)
+_INV_SQRT_2PI = _f(1.0 / math.sqrt(2.0 * math.pi))
+# Abramowitz & Stegun 7.1.26: erfc(x) = (a1 t + ... + a5 t^5) exp(-x^2), t = 1 / (1 + p x), to 1.5e-7
+_T = _f(0.3275911 / math.sqrt(2.0))
+_A1, _A2, _A3, _A4, _A5 = (_f(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
+# exp(-z^2 / 2) = e^16, e = exp(-z^2 / 32) a polynomial: 6e-8 for |z| < 6
+_Z2_MAX, _PER_Z2 = _f(36.0), _f(1.0 / 32.0)
+_E0, _E1, _E2, _E3, _E4, _E5, _E6 = (
+    _f(c)
+    for c in np.polynomial.Chebyshev.interpolate(lambda t: np.exp(-t), 6, domain=[0.0, 36.0 / 32.0])
+    .convert(kind=np.polynomial.Polynomial)
+    .coef
+)
 
-@_compiled
-def project_point(camera, X, Y, Z):
+
+@_part
+def _project_point(camera, X, Y, Z):
     """Pixel (u, v) of one point in camera axes; camera = the nine INTRINSIC_PARAMETERS. Twin of camera.project."""
     a, b = X / Z, Y / Z
     r2 = a * a + b * b
@@ -53,8 +82,8 @@ def project_point(camera, X, Y, Z):
     return camera[0] * xd + camera[2], camera[1] * yd + camera[3]
 
 
-@_compiled
-def project_point_jacobian(camera, X, Y, Z, J):
+@_part
+def _project_point_jacobian(camera, X, Y, Z, J):
     """Pixel of one point in camera axes and J (2, 3) = d pixel / d point."""
     iz = 1.0 / Z
     a, b = X * iz, Y * iz
@@ -72,9 +101,10 @@ def project_point_jacobian(camera, X, Y, Z, J):
     return camera[0] * xd + camera[2], camera[1] * yd + camera[3]
 
 
-@_compiled
-def _substitute(L, x, n):
+@_part
+def _substitute(L, x):
     """Replace x by the solution of L L^T x = x for a Cholesky factor L (lower triangle)."""
+    n = L.shape[0]
     for i in range(n):
         s = x[i]
         for k in range(i):
@@ -87,10 +117,10 @@ def _substitute(L, x, n):
         x[i] = s / L[i, i]
 
 
-@_compiled
-def solve_in_place(M, x, n):
-    """Solve the symmetric positive definite M[:n, :n] x = x by Cholesky; False where M is not positive definite."""
-    for i in range(n):
+@_part
+def _solve_in_place(M, x):
+    """Solve the symmetric positive definite M x = x by Cholesky; False where M (lower triangle) is not so."""
+    for i in range(M.shape[0]):
         for j in range(i + 1):
             s = M[i, j]
             for k in range(j):
@@ -101,268 +131,278 @@ def solve_in_place(M, x, n):
                 M[i, i] = math.sqrt(s)
             else:
                 M[i, j] = s / M[j, j]
-    _substitute(M, x, n)
+    _substitute(M, x)
     return True
 
 
-@_compiled
-def _plane_point(P, xn, yn):
-    """Coordinates on the target plane of the normalised image point; P (3, 3) maps image to plane homogeneously."""
-    w = 1.0 / (P[2, 0] * xn + P[2, 1] * yn + P[2, 2])
-    return (P[0, 0] * xn + P[0, 1] * yn + P[0, 2]) * w, (P[1, 0] * xn + P[1, 1] * yn + P[1, 2]) * w
-
-
-@_compiled
+@_part
 def _plane_gradient(map_x, map_y, P, iu, iv, G):
     """Derivatives of the exact map at the pixel (iu, iv) by central differences; returns the determinant.
 
     G (3, 2): rows 0 and 1 are d plane point / d pixel; row 2 is the relative change per 10 px of the length that a
     pixel spans along the direction moved: -2 d log w, w the denominator of the projective map.
     """
-    x1, y1 = _plane_point(P, map_x[iv, iu + 1], map_y[iv, iu + 1])
-    x0, y0 = _plane_point(P, map_x[iv, iu - 1], map_y[iv, iu - 1])
-    G[0, 0], G[1, 0] = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
-    x1, y1 = _plane_point(P, map_x[iv + 1, iu], map_y[iv + 1, iu])
-    x0, y0 = _plane_point(P, map_x[iv - 1, iu], map_y[iv - 1, iu])
-    G[0, 1], G[1, 1] = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
-    xn, yn = map_x[iv, iu], map_y[iv, iu]
-    w = P[2, 0] * xn + P[2, 1] * yn + P[2, 2]
-    G[2, 0] = (
-        10.0
-        * (P[2, 0] * (map_x[iv, iu + 1] - map_x[iv, iu - 1]) + P[2, 1] * (map_y[iv, iu + 1] - map_y[iv, iu - 1]))
-        / w
-    )
-    G[2, 1] = (
-        10.0
-        * (P[2, 0] * (map_x[iv + 1, iu] - map_x[iv - 1, iu]) + P[2, 1] * (map_y[iv + 1, iu] - map_y[iv - 1, iu]))
-        / w
-    )
+    w = P[2, 0] * map_x[iv, iu] + P[2, 1] * map_y[iv, iu] + P[2, 2]
+    for axis in range(2):
+        u, v = (iu + 1, iv) if axis == 0 else (iu, iv + 1)
+        x1, y1 = map_x[v, u], map_y[v, u]
+        x0, y0 = map_x[2 * iv - v, 2 * iu - u], map_y[2 * iv - v, 2 * iu - u]
+        w1, w0 = P[2, 0] * x1 + P[2, 1] * y1 + P[2, 2], P[2, 0] * x0 + P[2, 1] * y0 + P[2, 2]
+        for i in range(2):
+            first, last = P[i, 0] * x0 + P[i, 1] * y0 + P[i, 2], P[i, 0] * x1 + P[i, 1] * y1 + P[i, 2]
+            G[i, axis] = 0.5 * (last / w1 - first / w0)
+        G[2, axis] = 10.0 * (w1 - w0) / w
     return G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]
 
 
-@_compiled
-def _edge_distance(dx, dy, radius, G, det):
+@_part
+def _edge_distance(dx, dy, radius, g00, g01, g10, g11, det2):
     """Signed distance [px] of a pixel from the dot's edge (positive outside), with what its derivatives need.
 
     rho = |(dx, dy)| on the plane, F = rho - radius, g = |grad_u F|. To second order the foot point lies at
     d = F/g (1 + t), t = h F/(2 g^2); inside, 1/(1 - t) has the same order and keeps its sign in slender ellipses.
-    Returns d, dd/drho, the unit radius (nx, ny), g and the curvature of the level line in the image, det^2/(rho g^3).
+    Returns d, dd/drho, the unit radius (nx, ny), 1/g and the curvature of the level line in the image, det^2/(rho g^3).
     """
-    rho = math.sqrt(dx * dx + dy * dy) + 1e-15
-    inv_rho = 1.0 / rho
+    inv_rho = _1 / (math.sqrt(dx * dx + dy * dy) + _TINY)
+    rho = (dx * dx + dy * dy) * inv_rho
     nx, ny = dx * inv_rho, dy * inv_rho
-    gx, gy = G[0, 0] * nx + G[1, 0] * ny, G[0, 1] * nx + G[1, 1] * ny
-    g2 = gx * gx + gy * gy
-    g = math.sqrt(g2)
-    inv_g = 1.0 / g
-    inv_g2 = inv_g * inv_g
+    gx, gy = g00 * nx + g10 * ny, g01 * nx + g11 * ny
+    inv_g2 = _1 / (gx * gx + gy * gy)
+    inv_g = math.sqrt(inv_g2)
     # h = (m . G ghat)^2 / rho with m perpendicular to n
-    along = -ny * (G[0, 0] * gx + G[0, 1] * gy) + nx * (G[1, 0] * gx + G[1, 1] * gy)
+    along = nx * (g10 * gx + g11 * gy) - ny * (g00 * gx + g01 * gy)
     F = rho - radius
-    bend = 0.5 * along * along * F * inv_rho * inv_g2 * inv_g2
-    curvature = det * det * inv_rho * inv_g2 * inv_g
-    if F > 0.0:
-        return F * inv_g * (1.0 + bend), (1.0 + 2.0 * bend) * inv_g, nx, ny, g, curvature
-    shrink = 1.0 / (1.0 - max(bend, -0.3))  # the expansion ends well before the dot's own centre, where rho = 0
-    return F * inv_g * shrink, inv_g * shrink * shrink, nx, ny, g, curvature
+    bend = _HALF * along * along * F * inv_rho * inv_g2 * inv_g2
+    curvature = det2 * inv_rho * inv_g2 * inv_g
+    shrink = _1 / (_1 - max(bend, _LEAST_BEND))  # the expansion ends well before the dot's own centre, where rho = 0
+    outside = rho > radius
+    factor = _1 + bend if outside else shrink
+    slope = _1 + _2 * bend if outside else shrink * shrink
+    return F * inv_g * factor, inv_g * slope, nx, ny, inv_g, curvature
 
 
-@_compiled
-def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, det, steepest, p, u0, v0, scratch):
-    """Fill scratch with the pixels in a band round the edge; return their number and the mean grey in and outside."""
+@_part
+def _edge_profile(z):
+    """Fraction of the dot seen z sigmas outside its edge, and the bell that is minus its slope; both to 5e-7."""
+    z2 = min(z * z, _Z2_MAX)
+    e = z2 * _PER_Z2
+    e = _E0 + e * (_E1 + e * (_E2 + e * (_E3 + e * (_E4 + e * (_E5 + e * _E6)))))
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    t = _1 / (_1 + _T * abs(z))
+    tail = t * (_A1 + t * (_A2 + t * (_A3 + t * (_A4 + t * _A5)))) * e
+    return tail if z > _0 else _1 - tail, _INV_SQRT_2PI * e
+
+
+@_part
+def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, unit, steepest, p, u0, v0, pixels):
+    """Fill the first rows of pixels with those in a band round the edge; returns number, mean grey in and outside.
+
+    unit: plane units per pixel; steepest: the longest step that one pixel can mean on the plane, in those units.
+    """
     x_lo, x_hi, y_lo, y_hi = window
+    width = x_hi - x_lo + 1
     band = 3.0 * p[SIGMA] + 1.0
-    n = 0
-    inside_sum, inside_n, outside_sum, outside_n = 0.0, 0, 0.0, 0
+    shift_x, shift_y, radius = _f(p[A]), _f(p[B]), _f(p[RADIUS])
     # bounds on the distance from the centre that need no square root: most pixels of the window are decided by them
     outer = p[RADIUS] + band * steepest
     inner = max(p[RADIUS] - 1.4 * (band + 1.0) * steepest, 0.0)
+    outer2, inner2 = _f(outer * outer), _f(inner * inner)
+    x_from, y_from = start[0] / unit, start[1] / unit
+    n = 0
     for y in range(y_lo, y_hi + 1):
-        for x in range(x_lo, x_hi + 1):
-            X, Y = _plane_point(P, map_x[y, x], map_y[y, x])
-            dx, dy = X - start[0] - p[A], Y - start[1] - p[B]
+        for k in range(width):
+            xn, yn = map_x[y, x_lo + k], map_y[y, x_lo + k]
+            w = 1.0 / (unit * (P[2, 0] * xn + P[2, 1] * yn + P[2, 2]))
+            pixels[_JACOBIAN, k] = (P[0, 0] * xn + P[0, 1] * yn + P[0, 2]) * w - x_from
+            pixels[_JACOBIAN + 1, k] = (P[1, 0] * xn + P[1, 1] * yn + P[1, 2]) * w - y_from
+        for k in range(width):
+            X, Y = pixels[_JACOBIAN, k], pixels[_JACOBIAN + 1, k]
+            dx, dy = X - shift_x, Y - shift_y
             rho2 = dx * dx + dy * dy
-            if not inner * inner < rho2 < outer * outer:  # also NaN: a pixel without a ray
-                continue
-            d, slope, nx, ny, g, curvature = _edge_distance(dx, dy, p[RADIUS], G, det)
-            if not -band - 1.0 < d < band or n >= scratch.shape[1]:
-                continue
-            near = math.hypot(X, Y) > rim - 2.5 * p[SIGMA] * g
-            for k in range(neighbours.shape[0]):
-                if math.hypot(X - neighbours[k, 0], Y - neighbours[k, 1]) - start[2] < 3.0 * p[SIGMA] * g:
-                    near = True
+            pixels[_X, n], pixels[_Y, n], pixels[_GREY, n] = X, Y, image[y, x_lo + k]
+            pixels[_OFFSET_X, n], pixels[_OFFSET_Y, n] = 0.1 * (x_lo + k - u0), 0.1 * (y - v0)
+            if inner2 < rho2 < outer2:  # also NaN: a pixel without a ray
+                n += 1
+    # which of the dot's surroundings can come near any pixel at all
+    reach = unit * (outer + math.hypot(p[A], p[B]))
+    blur = p[SIGMA] * steepest * unit
+    crowded = math.hypot(start[0], start[1]) + reach > rim - 2.5 * blur
+    for j in range(neighbours.shape[0]):
+        apart = math.hypot(start[0] - neighbours[j, 0], start[1] - neighbours[j, 1])
+        crowded |= apart - reach - start[2] < 3.0 * blur
+    g00, g01, g10, g11 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1])
+    for i in range(n):
+        d, slope, nx, ny, inv_g, curvature = _edge_distance(
+            pixels[_X, i] - shift_x, pixels[_Y, i] - shift_y, radius, g00, g01, g10, g11, _0
+        )
+        pixels[_WEIGHT, i], pixels[_JACOBIAN, i] = d, inv_g
+    kept = 0
+    inside_sum, inside_n, outside_sum, outside_n = 0.0, 0, 0.0, 0
+    for i in range(n):
+        d = pixels[_WEIGHT, i]
+        if not -band - 1.0 < d < band:
+            continue
+        if crowded:
+            X, Y = start[0] + unit * pixels[_X, i], start[1] + unit * pixels[_Y, i]
+            blur = p[SIGMA] * unit / pixels[_JACOBIAN, i]
+            near = math.hypot(X, Y) > rim - 2.5 * blur
+            for j in range(neighbours.shape[0]):
+                near |= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] < 3.0 * blur
             if near:
                 continue
-            grey = float(image[y, x])
-            scratch[0, n], scratch[1, n], scratch[2, n] = X - start[0], Y - start[1], grey
-            scratch[3, n], scratch[4, n], scratch[5, n] = 0.1 * (x - u0), 0.1 * (y - v0), d
-            n += 1
-            if d < -1.2 * p[SIGMA]:
-                inside_sum += grey
-                inside_n += 1
-            elif d > 1.2 * p[SIGMA]:
-                outside_sum += grey
-                outside_n += 1
+        grey = pixels[_GREY, i]
+        for row in range(_JACOBIAN):
+            pixels[row, kept] = pixels[row, i]
+        kept += 1
+        if d < -1.2 * p[SIGMA]:
+            inside_sum += grey
+            inside_n += 1
+        elif d > 1.2 * p[SIGMA]:
+            outside_sum += grey
+            outside_n += 1
     inside = inside_sum / inside_n if inside_n >= 3 else np.nan
     outside = outside_sum / outside_n if outside_n >= 8 else np.nan
-    return n, inside, outside
+    return kept, inside, outside
 
 
-@_compiled
-def _edge_profile(z):
-    """Fraction of the dot seen z sigmas outside its edge, and the bell that is minus its slope."""
-    if z >= _Z_MAX:
-        return 0.0, 0.0
-    if z <= -_Z_MAX:
-        return 1.0, 0.0
-    place = (z + _Z_MAX) * _PER_UNIT
-    i = int(place)
-    f = place - i
-    return _EDGE[i] + f * (_EDGE[i + 1] - _EDGE[i]), _BELL[i] + f * (_BELL[i + 1] - _BELL[i])
-
-
-@_compiled
-def _whitened_model(scratch, n, p, G, det, clip):
-    """Fill scratch rows 6-13 with d model / d p and row 14 with the residual, each over the pixel's sigma.
+@_part
+def _whitened_model(pixels, n, p, G, det, clip):
+    """Fill the pixels' rows of d model / d p and of the residual, each over the pixel's sigma.
 
     model = (level + slopes . offset) * (1 - contrast * S(z)), S the blurred edge: erfc of the distance over sigma.
     Pixels whose squared whitened residual exceeds clip get zeros. Returns chi-square (clipped pixels count as clip),
-    their number and the largest squared residual.
+    and their number.
     """
-    chi2, n_clipped, largest = 0.0, 0, 0.0
-    sigma, inv_sigma, contrast = p[SIGMA], 1.0 / p[SIGMA], p[CONTRAST]
-    near_x, near_y = G[2, 0], G[2, 1]
+    g00, g01, g10, g11, det2 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1]), _f(det * det)
+    near_x, near_y = _f(G[2, 0]), _f(G[2, 1])
+    a, b, radius, contrast = _f(p[A]), _f(p[B]), _f(p[RADIUS]), _f(p[CONTRAST])
+    inv_sigma, sigma, half_sigma = _f(1.0 / p[SIGMA]), _f(p[SIGMA]), _f(0.5 * p[SIGMA])
+    level, slope_x, slope_y, limit = _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y]), _f(clip)
+    half_step = _f(0.05)
+    chi2, n_clipped = _0, _0
     for i in range(n):
-        d, slope, nx, ny, g, curvature = _edge_distance(scratch[0, i] - p[A], scratch[1, i] - p[B], p[RADIUS], G, det)
+        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
+        d, slope, nx, ny, inv_g, curvature = _edge_distance(
+            pixels[_X, i] - a, pixels[_Y, i] - b, radius, g00, g01, g10, g11, det2
+        )
         # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
         # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
-        half = 0.05 * d / g
-        mid_x = scratch[3, i] - half * (G[0, 0] * nx + G[1, 0] * ny)
-        mid_y = scratch[4, i] - half * (G[0, 1] * nx + G[1, 1] * ny)
-        d *= 1.0 + near_x * mid_x + near_y * mid_y
+        half = half_step * d * inv_g
+        mid_x, mid_y = x - half * (g00 * nx + g10 * ny), y - half * (g01 * nx + g11 * ny)
+        d *= _1 + near_x * mid_x + near_y * mid_y
         # a curved edge blurred by sigma looks shifted inwards by sigma^2 / (2 radius of curvature)
-        z = d * inv_sigma + 0.5 * curvature * sigma
+        z = d * inv_sigma + half_sigma * curvature
         s, bell = _edge_profile(z)
-        light = p[LEVEL] + p[SLOPE_X] * scratch[3, i] + p[SLOPE_Y] * scratch[4, i]
-        weight = scratch[5, i]
-        seen = (1.0 - contrast * s) * weight
-        r = scratch[2, i] * weight - light * seen
+        light = level + slope_x * x + slope_y * y
+        weight = pixels[_WEIGHT, i]
+        r = weight * (pixels[_GREY, i] - light * (_1 - contrast * s))
         squared = r * r
-        largest = max(largest, squared)
-        if squared > clip:
-            n_clipped += 1
-            chi2 += clip
-            for row in range(6, 15):
-                scratch[row, i] = 0.0
-            continue
-        chi2 += squared
+        fits = _1 if squared <= limit else _0
+        chi2 += min(squared, limit)
+        n_clipped += _1 - fits
+        weight *= fits
+        seen = (_1 - contrast * s) * weight
         edge = -light * contrast * bell * inv_sigma * weight  # - d model / d distance
-        scratch[6, i], scratch[7, i], scratch[8, i] = edge * nx * slope, edge * ny * slope, edge * slope
-        scratch[9, i] = edge * (z - curvature * sigma)
-        scratch[10, i], scratch[11, i], scratch[12, i] = seen, seen * scratch[3, i], seen * scratch[4, i]
-        scratch[13, i] = -light * s * weight
-        scratch[14, i] = r
-    return chi2, n_clipped, largest
+        pixels[_JACOBIAN + A, i], pixels[_JACOBIAN + B, i] = edge * nx * slope, edge * ny * slope
+        pixels[_JACOBIAN + RADIUS, i] = edge * slope
+        pixels[_JACOBIAN + SIGMA, i] = edge * (z - curvature * sigma)
+        pixels[_JACOBIAN + LEVEL, i] = seen
+        pixels[_JACOBIAN + SLOPE_X, i], pixels[_JACOBIAN + SLOPE_Y, i] = seen * x, seen * y
+        pixels[_JACOBIAN + CONTRAST, i] = -light * s * weight
+        pixels[_RESIDUAL, i] = r * fits
+    return float(chi2), float(n_clipped)
 
 
-@_compiled
-def _normal_equations(scratch, n, p, G, det, clip, M, rhs):
-    """Fill M = J^T W J (lower triangle) and rhs = J^T W r; returns as `_whitened_model`."""
-    chi2, n_clipped, largest = _whitened_model(scratch, n, p, G, det, clip)
-    for j in range(8):
-        for k in range(j + 1):
-            total = 0.0
-            for i in range(n):  # contiguous: the compiler makes vector code of it
-                total += scratch[6 + j, i] * scratch[6 + k, i]
-            M[j, k] = total
-        total = 0.0
-        for i in range(n):
-            total += scratch[6 + j, i] * scratch[14, i]
-        rhs[j] = total
-    return chi2, n_clipped, largest
+@_part
+def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work):
+    """Levenberg-Marquardt on the eight template parameters; returns converged, chi-square, clipped.
 
-
-@_compiled
-def _descend(scratch, n, p, G, det, px_per_unit, radius, clip, M, rhs):
-    """Levenberg-Marquardt on the eight template parameters; returns converged, chi-square, clipped, largest residual.
-
-    On convergence M holds the Cholesky factor of J^T W J at the minimum.
+    On convergence the first rows of work hold the Cholesky factor of J^T W J at the minimum.
     """
-    previous, step = p.copy(), np.empty(8)
+    M, rhs, step, previous = work[:8], work[_RHS], work[_STEP], work[_BEFORE]
     damping, last, rejected = 1e-7, np.inf, False
     before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
+    chi2, n_clipped = 0.0, 0.0
+    for i in range(8):
+        previous[i] = p[i]
     for _ in range(_MAX_ITERATIONS):
-        chi2, n_clipped, largest = _normal_equations(scratch, n, p, G, det, clip, M, rhs)
+        chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
         # the Jacobian leaves out how the curvature moves, so chi-square may creep by a trifle at the minimum
         if chi2 > 1.001 * last + 0.01 and not rejected:
-            p[:] = previous
+            for i in range(8):
+                p[i] = previous[i]
             damping, rejected = max(1e-2, damping * 30.0), True
             if damping > 1e6:
-                return False, chi2, n_clipped, largest
+                return False, chi2, n_clipped
             continue
         if not rejected:
             damping = max(0.03 * damping, 1e-9)
         last, rejected = chi2, False
-        previous[:] = p
+        for j in range(9):  # the last row is the right-hand side, J^T W r
+            for k in range(min(j + 1, 8)):
+                total = _0
+                for i in range(n):
+                    total += pixels[_JACOBIAN + j, i] * pixels[_JACOBIAN + k, i]
+                work[j, k] = total
         for i in range(8):
-            step[i] = rhs[i]
+            previous[i], step[i] = p[i], rhs[i]
             M[i, i] *= 1.0 + damping
-        if not solve_in_place(M, step, 8):
-            return False, chi2, n_clipped, largest
+        if not _solve_in_place(M, step):
+            return False, chi2, n_clipped
         length = math.hypot(step[A], step[B])
         scale = min(1.0, 0.4 * radius / max(length, 1e-30))
+        gain = 0.0
         for i in range(8):
             p[i] += scale * step[i]
+            gain += step[i] * rhs[i]
         p[SIGMA] = min(max(p[SIGMA], 0.4 * previous[SIGMA], 0.2), 2.0 * previous[SIGMA])
         if not (0.5 * radius < p[RADIUS] < 1.6 * radius and p[SIGMA] < 20.0):
-            return False, chi2, n_clipped, largest
+            return False, chi2, n_clipped
         length *= px_per_unit
         contraction = min(length / before, 1.0) if before < np.inf else 1.0
         if length * contraction < _CONVERGED_PX and damping < 1e-3 and length < 0.1:
-            gain = 0.0
-            for i in range(8):
-                gain += step[i] * rhs[i]
             if gain > 0.5:  # the sums were taken before a step that mattered to them
-                chi2, n_clipped, largest = _whitened_model(scratch, n, p, G, det, clip)
-            return True, chi2, n_clipped, largest
+                chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
+            return True, chi2, n_clipped
         before = length
-    return False, last, 0, np.inf
+    return False, last, 0.0
 
 
-@_compiled
-def _inverse_corner(L, n, out):
-    """Leading 2 x 2 block of (L L^T)^-1 for a Cholesky factor L (n, n)."""
-    x = np.empty(n)
-    for column in range(2):
-        for i in range(n):
-            x[i] = 1.0 if i == column else 0.0
-        _substitute(L, x, n)
-        out[0, column], out[1, column] = x[0], x[1]
-
-
-@_compiled
-def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratch, p, result):
+@_part
+def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixels, work, p, result):
     """Fit the image of one circular dot to the grey values round its edge. Returns a MarkerStatus code.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
     noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
     about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
-    centres; scratch (SCRATCH_ROWS, N).
+    centres; pixels and work: `scratch()`.
     p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (12,) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
     height, width = image.shape
-    G, plane_covariance = np.empty((3, 2)), np.empty((2, 2))
-    M, rhs = np.zeros((8, 8)), np.empty(8)
-    u0, v0, radius = start[3], start[4], start[2]
-    p[A], p[B], p[RADIUS], p[SIGMA] = 0.0, 0.0, radius, sigma
-    n, n_clipped, det, chi2, worst = 0, 0, 0.0, 0.0, 0.0
+    G = np.empty((3, 2))
+    u0, v0, radius, unit = start[3], start[4], start[2], 0.0
+    for i in range(8):
+        p[i] = 0.0
+    p[SIGMA] = sigma
+    n, n_clipped, det, chi2, largest, light = 0, 0.0, 0.0, 0.0, 0.0, 1.0
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
-        det = _plane_gradient(map_x, map_y, P, int(round(u0)), int(round(v0)), G)
-        norm2 = G[0, 0] ** 2 + G[0, 1] ** 2 + G[1, 0] ** 2 + G[1, 1] ** 2
+        det = _plane_gradient(map_x, map_y, P, int(u0 + 0.5), int(v0 + 0.5), G)
+        if selection == 0:
+            unit = math.sqrt(abs(det)) if det != 0.0 else 1.0
+            radius /= unit
+            p[RADIUS] = radius
+        for i in range(2):
+            for j in range(2):
+                G[i, j] /= unit
+        det /= unit * unit
+        norm2 = G[0, 0] * G[0, 0] + G[0, 1] * G[0, 1] + G[1, 0] * G[1, 0] + G[1, 1] * G[1, 1]
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
@@ -379,24 +419,30 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
         )
         if window[0] < 1 or window[2] < 1 or window[1] > width - 2 or window[3] > height - 2:
             return OUTSIDE
+        room = (window[1] - window[0] + 1) * (window[3] - window[2] + 1) + 1
+        if room > pixels.shape[1]:
+            pixels = np.empty((_PIXEL_ROWS, room), np.float32)
         n, inside, outside = _select_pixels(
-            image, map_x, map_y, P, start, window, rim, neighbours, G, det, largest, p, u0, v0, scratch
+            image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
         )
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
-            p[LEVEL], p[SLOPE_X], p[SLOPE_Y] = outside, 0.0, 0.0
-            p[CONTRAST] = 1.0 - inside / max(outside, 1e-6)
+            light = max(inside, outside, 1e-6)  # the unit of grey from here on: no result depends on the file's own
+            p[LEVEL], p[CONTRAST] = outside / light, 1.0 - inside / max(outside, 1e-6)
         dark = p[LEVEL] * (1.0 - p[CONTRAST])
-        if abs(p[LEVEL] - dark) < 4.0 * math.sqrt(max(noise[0] + noise[1] * max(p[LEVEL], dark), 0.1 * noise[2])):
+        read, gain, step2 = noise[0] / (light * light), noise[1] / light, noise[2] / (light * light)
+        if abs(p[LEVEL] - dark) < 4.0 * math.sqrt(max(read + gain * max(p[LEVEL], dark), 0.1 * step2)):
             return LOW_CONTRAST
+        in_light = 1.0 / light
+        read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
+        level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
-            s, bell = _edge_profile(scratch[5, i] / p[SIGMA])
-            expected = p[LEVEL] + (dark - p[LEVEL]) * s
-            scratch[5, i] = 1.0 / math.sqrt(max(noise[0] + noise[1] * expected, noise[2] / 12.0))
-        px_per_unit = largest / abs(det)
-        converged, chi2, n_clipped, worst = _descend(scratch, n, p, G, det, px_per_unit, radius, np.inf, M, rhs)
+            s, bell = _edge_profile(pixels[_WEIGHT, i] * inv_sigma)
+            pixels[_WEIGHT, i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
+            pixels[_GREY, i] *= in_light  # a product in double precision, rounded once
+        converged, chi2, n_clipped = _descend(pixels, n, p, G, det, largest / abs(det), radius, np.inf, work)
         if not converged:
             return NOT_CONVERGED
         moved_u = start[3] + (G[1, 1] * p[A] - G[0, 1] * p[B]) / det - u0
@@ -406,95 +452,35 @@ def fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratc
         if math.hypot(moved_u, moved_v) < 0.7:
             break
     # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows
-    limit = _CLIP_SIGMA**2 * max(1.0, chi2 / n)
-    if worst > limit:
-        converged, chi2, n_clipped, worst = _descend(scratch, n, p, G, det, largest / abs(det), radius, limit, M, rhs)
+    limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
+    worst = _0
+    for i in range(n):
+        worst = max(worst, abs(pixels[_RESIDUAL, i]))
+    if worst * worst > limit:
+        converged, chi2, n_clipped = _descend(pixels, n, p, G, det, largest / abs(det), radius, limit, work)
         if not converged:
             return NOT_CONVERGED
         chi2 -= n_clipped * limit
-    _inverse_corner(M, 8, plane_covariance)
+    # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
+    M, x, y = work[:8], work[_RHS], work[_STEP]
+    for i in range(8):
+        x[i], y[i] = 1.0 if i == A else 0.0, 1.0 if i == B else 0.0
+    _substitute(M, x)
+    _substitute(M, y)
     a, b, c, d = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
-    Q = plane_covariance
-    result[VAR_U] = a * a * Q[0, 0] + 2 * a * b * Q[0, 1] + b * b * Q[1, 1]
-    result[VAR_V] = c * c * Q[0, 0] + 2 * c * d * Q[0, 1] + d * d * Q[1, 1]
-    result[COV_UV] = a * c * Q[0, 0] + (a * d + b * c) * Q[0, 1] + b * d * Q[1, 1]
+    result[VAR_U] = a * a * x[A] + 2 * a * b * x[B] + b * b * y[B]
+    result[VAR_V] = c * c * x[A] + 2 * c * d * x[B] + d * d * y[B]
+    result[COV_UV] = a * c * x[A] + (a * d + b * c) * x[B] + b * d * y[B]
+    p[A], p[B], p[RADIUS] = unit * p[A], unit * p[B], unit * p[RADIUS]
     result[CHI_SQUARE] = chi2 / max(n - n_clipped - 8, 1)
     result[FIT_SIGMA], result[FIT_RADIUS] = p[SIGMA], p[RADIUS]
-    result[FIT_LEVEL], result[FIT_CONTRAST] = p[LEVEL], p[CONTRAST]
+    result[FIT_LEVEL], result[FIT_CONTRAST] = light * p[LEVEL], p[CONTRAST]
     result[CLIPPED], result[N_PIXELS] = n_clipped / n, n
     return MEASURED
 
 
-@_compiled
-def _invert3(M, out):
-    """Inverse of a 3 x 3 matrix by cofactors."""
-    for i in range(3):
-        for j in range(3):
-            a, b, c, d = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3
-            out[i, j] = M[a, c] * M[b, d] - M[a, d] * M[b, c]
-    det = M[0, 0] * out[0, 0] + M[0, 1] * out[1, 0] + M[0, 2] * out[2, 0]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] /= det
-
-
-@_compiled
-def locate_dots(
-    image,
-    map_x,
-    map_y,
-    camera,
-    R_camera_body,
-    t_camera_body,
-    centres,
-    radius,
-    rim,
-    sigma,
-    noise,
-    scratch,
-    results,
-    status,
-):
-    """Fit every dot of the disc in one image, the disc's pose being known to a few pixels.
-
-    centres (m, 3) on the body; results (m, 12) and status (m,) are filled; U, V are the image of the dot's own centre,
-    not the centre of its elliptical image.
-    """
-    m = centres.shape[0]
-    M, P, start, p = np.empty((3, 3)), np.empty((3, 3)), np.empty(5), np.empty(8)
-    R, t = R_camera_body, t_camera_body
-    neighbours = np.empty((max(m - 1, 0), 2))
-    for i in range(m):
-        results[i, :] = np.nan
-        x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
-        point = np.empty(3)
-        for k in range(3):
-            M[k, 0], M[k, 1], M[k, 2] = R[k, 0], R[k, 1], R[k, 2] * z + t[k]
-            point[k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + t[k]
-        facing = -(R[0, 2] * point[0] + R[1, 2] * point[1] + R[2, 2] * point[2])
-        if point[2] <= 0.0:
-            status[i] = OUTSIDE
-            continue
-        if facing <= 0.0:  # the camera sees the other face
-            status[i] = OCCLUDED
-            continue
-        _invert3(M, P)
-        start[0], start[1], start[2] = x, y, radius
-        start[3], start[4] = project_point(camera, point[0], point[1], point[2])
-        count = 0
-        for k in range(m):
-            if k != i:
-                neighbours[count, 0], neighbours[count, 1] = centres[k, 0], centres[k, 1]
-                count += 1
-        status[i] = fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, scratch, p, results[i])
-        if status[i] == MEASURED:
-            for k in range(3):
-                point[k] += R[k, 0] * p[A] + R[k, 1] * p[B]
-            results[i, U], results[i, V] = project_point(camera, point[0], point[1], point[2])
-
-
-@_compiled
-def judge_dot(result, radius, typical_sigma, noise, limits):
+@_part
+def _judge_dot(result, radius, typical_sigma, noise, limits):
     """Refuse a converged fit that does not look like the dot: limits = misfit, share, clipped, radius, blur.
 
     A misfit counts when it is large beside the noise and beside the contrast: the template's own small errors must not
@@ -513,7 +499,65 @@ def judge_dot(result, radius, typical_sigma, noise, limits):
     return MEASURED
 
 
-@_compiled
+@_part
+def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits, R, t,
+          pixels, work, results, status):  # fmt: skip
+    """Locate and judge the dots in the images (cameras, H, W) of one instant, the disc being near the pose R, t.
+
+    centres (m, 3) on the body; results (cameras, m, 12) and status (cameras, m) are filled; U, V are the image of the
+    dot's own centre, not the centre of its elliptical image.
+    """
+    m = centres.shape[0]
+    R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    point, start, p = np.empty(3), np.empty(5), np.empty(8)
+    neighbours = np.empty((max(m - 1, 0), 2))
+    for c in range(images.shape[0]):
+        for i in range(3):
+            for j in range(3):
+                R_cb[i, j] = R_cw[c, i, 0] * R[0, j] + R_cw[c, i, 1] * R[1, j] + R_cw[c, i, 2] * R[2, j]
+        for i in range(m):
+            result = results[c, i]
+            for k in range(N_RESULT):
+                result[k] = np.nan
+            if not readable[c]:
+                status[c, i] = NOT_LOOKED_FOR
+                continue
+            x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
+            facing = 0.0
+            for k in range(3):
+                shift = t_cw[c, k] + R_cw[c, k, 0] * t[0] + R_cw[c, k, 1] * t[1] + R_cw[c, k, 2] * t[2]
+                M[k, 0], M[k, 1], M[k, 2] = R_cb[k, 0], R_cb[k, 1], R_cb[k, 2] * z + shift
+                point[k] = M[k, 0] * x + M[k, 1] * y + M[k, 2]
+                facing -= R_cb[k, 2] * point[k]
+            if point[2] <= 0.0:
+                status[c, i] = OUTSIDE
+                continue
+            if facing <= 0.0:  # the camera sees the other face
+                status[c, i] = OCCLUDED
+                continue
+            for k in range(3):  # P = M^-1 by cofactors
+                for j in range(3):
+                    a, b, d, e = (j + 1) % 3, (j + 2) % 3, (k + 1) % 3, (k + 2) % 3
+                    P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
+            det = M[0, 0] * P[0, 0] + M[0, 1] * P[1, 0] + M[0, 2] * P[2, 0]
+            for k in range(3):
+                for j in range(3):
+                    P[k, j] /= det
+            start[0], start[1], start[2] = x, y, radius
+            start[3], start[4] = _project_point(cameras[c], point[0], point[1], point[2])
+            for k in range(m - 1):
+                other = k + 1 if k >= i else k
+                neighbours[k, 0], neighbours[k, 1] = centres[other, 0], centres[other, 1]
+            status[c, i] = _fit_dot(images[c], map_x[c], map_y[c], P, start, sigma[c], noise[c], rim, neighbours,
+                                    pixels, work, p, result)  # fmt: skip
+            if status[c, i] == MEASURED:
+                for k in range(3):
+                    point[k] += R_cb[k, 0] * p[A] + R_cb[k, 1] * p[B]
+                result[U], result[V] = _project_point(cameras[c], point[0], point[1], point[2])
+                status[c, i] = _judge_dot(result, radius, sigma[c], noise[c], limits)
+
+
+@_part
 def _rotate_from_left(v, R, out):
     """Out = exp([v]x) R by Rodrigues' formula."""
     angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -530,7 +574,7 @@ def _rotate_from_left(v, R, out):
         out[2, j] = z + a * cz + b * (v[0] * cy - v[1] * cx)
 
 
-@_compiled
+@_part
 def _orthonormalise(R):
     """Gram-Schmidt on the rows; without it R R_before^T R would treble any departure in every frame."""
     for i in range(2):
@@ -538,7 +582,7 @@ def _orthonormalise(R):
             dot = R[i, 0] * R[k, 0] + R[i, 1] * R[k, 1] + R[i, 2] * R[k, 2]
             for j in range(3):
                 R[i, j] -= dot * R[k, j]
-        length = math.sqrt(R[i, 0] ** 2 + R[i, 1] ** 2 + R[i, 2] ** 2)
+        length = math.sqrt(R[i, 0] * R[i, 0] + R[i, 1] * R[i, 1] + R[i, 2] * R[i, 2])
         for j in range(3):
             R[i, j] /= length
     R[2, 0] = R[0, 1] * R[1, 2] - R[0, 2] * R[1, 1]
@@ -546,7 +590,7 @@ def _orthonormalise(R):
     R[2, 2] = R[0, 0] * R[1, 1] - R[0, 1] * R[1, 0]
 
 
-@_compiled
+@_part
 def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
     """One Gauss-Newton step (translation, world rotation vector) of the disc's pose from the dots of one pair.
 
@@ -571,7 +615,7 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
                     point[i] += R_cw[c, i, j] * (arm[j] + t[j])
             if point[2] <= 0.0:
                 return -1.0
-            u, v = project_point_jacobian(cameras[c], point[0], point[1], point[2], J)
+            u, v = _project_point_jacobian(cameras[c], point[0], point[1], point[2], J)
             du, dv = results[c, m, U] - u, results[c, m, V] - v
             distance = math.hypot(du, dv)
             total += distance * distance
@@ -593,12 +637,12 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
                     step[i] += w * row[i] * r
                     for j in range(i + 1):
                         M[i, j] += w * row[i] * row[j]
-    if count < 3 or not solve_in_place(M, step, 6):
+    if count < 3 or not _solve_in_place(M, step):
         return -1.0
     return math.sqrt(total / count)
 
 
-@_compiled
+@_part
 def _predict(R_last, t_last, R_before, t_before, R, t):
     """The next pose if the last turn and the last shift are made once more: R = (R_last R_before^T) R_last."""
     for i in range(3):
@@ -612,31 +656,15 @@ def _predict(R_last, t_last, R_before, t_before, R, t):
                 R[i, j] += turn * R_last[k, j]
 
 
-@_compiled
-def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits, R, t,
-          scratch, results, status):  # fmt: skip
-    """Locate and judge the dots of one pair (2, H, W), the disc being near the pose R, t."""
-    R_cb, t_cb = np.empty((3, 3)), np.empty(3)
-    for c in range(2):
-        if not readable[c]:
-            results[c, :, :] = np.nan
-            status[c, :] = NOT_LOOKED_FOR
-            continue
-        for i in range(3):
-            t_cb[i] = t_cw[c, i]
-            for j in range(3):
-                t_cb[i] += R_cw[c, i, j] * t[j]
-                R_cb[i, j] = 0.0
-                for k in range(3):
-                    R_cb[i, j] += R_cw[c, i, k] * R[k, j]
-        locate_dots(images[c], map_x[c], map_y[c], cameras[c], R_cb, t_cb, centres, radius, rim, sigma[c], noise[c],
-                    scratch, results[c], status[c])  # fmt: skip
-        for i in range(centres.shape[0]):
-            if status[c, i] == MEASURED:
-                status[c, i] = judge_dot(results[c, i], radius, sigma[c], noise[c], limits)
+@_part
+def _copy(out, values):
+    """Copy a matrix."""
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            out[i, j] = values[i, j]
 
 
-@_compiled
+@_part
 def _settle(results, status, cameras, R_cw, t_cw, centres, R, t):
     """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer."""
     step, R_new = np.empty(6), np.empty((3, 3))
@@ -648,16 +676,14 @@ def _settle(results, status, cameras, R_cw, t_cw, centres, R, t):
         for i in range(3):
             t[i] += step[i]
         _rotate_from_left(step[3:], R, R_new)
-        R[:] = R_new
-        if (
-            math.fabs(step[0]) + math.fabs(step[1]) + math.fabs(step[2]) < 1e-6
-        ):  # a micrometre: a prediction needs no more
+        _copy(R, R_new)
+        if abs(step[0]) + abs(step[1]) + abs(step[2]) < 1e-6:  # a micrometre: a prediction needs no more
             break
     _orthonormalise(R)
     return rms
 
 
-@_compiled
+@_entry
 def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
                  R_last, t_last, R_before, t_before, results, status, R_out, t_out, max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the two before by constant velocity and turn.
@@ -667,22 +693,41 @@ def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, r
     (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was
     lost at that frame.
     """
-    scratch = np.empty((SCRATCH_ROWS, 40000))
+    pixels, work = np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
         _predict(R_last, t_last, R_before, t_before, R, t)
         rms = -1.0
         for _ in range(3):
-            R_expected[:] = R
+            _copy(R_expected, R)
             _look(images[f], readable[f], map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
-                  R, t, scratch, results[f], status[f])  # fmt: skip
+                  R, t, pixels, work, results[f], status[f])  # fmt: skip
             rms = _settle(results[f], status[f], cameras, R_cw, t_cw, centres, R, t)
+            turned = 0.0
+            for i in range(3):
+                for j in range(3):
+                    turned += (R[i, j] - R_expected[i, j]) * (R[i, j] - R_expected[i, j])
             # the template's shape follows the expected attitude: an error of 3 mrad moves centres by 1e-3 px
-            if rms < 0.0 or np.sum((R - R_expected) ** 2) < 2.0 * _ATTITUDE_TOLERANCE**2:
+            if rms < 0.0 or turned < 2.0 * _ATTITUDE_TOLERANCE * _ATTITUDE_TOLERANCE:
                 break
         if not 0.0 <= rms < max_rms:
             return f
-        R_out[f], t_out[f] = R, t
-        R_before[:], t_before[:] = R_last, t_last
-        R_last[:], t_last[:] = R, t
+        _copy(R_before, R_last)
+        _copy(R_last, R)
+        _copy(R_out[f], R)
+        for i in range(3):
+            t_before[i], t_last[i], t_out[f, i] = t_last[i], t[i], t[i]
     return images.shape[0]
+
+
+# The same where Python calls them: compiled on their own, the first time that they are called.
+project_point = _entry(_project_point.py_func)
+project_point_jacobian = _entry(_project_point_jacobian.py_func)
+fit_dot = _entry(_fit_dot.py_func)
+judge_dot = _entry(_judge_dot.py_func)
+look = _entry(_look.py_func)
+
+
+def scratch() -> tuple[np.ndarray, np.ndarray]:
+    """Working memory of one thread: rows of pixels, and of the normal equations."""
+    return np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))

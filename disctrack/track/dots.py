@@ -121,29 +121,30 @@ def locate_on_disc(
     image (height, width) uint8 or uint16; R_camera_body (3, 3), t_camera_body (3,) [m].
     """
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
-    results = np.full((disc.n_markers, kernels.N_RESULT), np.nan)
-    status = np.zeros(disc.n_markers, np.uint8)
+    results = np.full((1, disc.n_markers, kernels.N_RESULT), np.nan)
+    status = np.zeros((1, disc.n_markers), np.uint8)
     noise = noise or typical_noise(image)
-    kernels.locate_dots(
-        np.ascontiguousarray(image),
-        map_x,
-        map_y,
-        camera.parameters,
-        np.ascontiguousarray(R_camera_body),
-        np.ascontiguousarray(t_camera_body),
+    kernels.look(
+        np.ascontiguousarray(image)[None],
+        np.ones(1, bool),
+        map_x[None],
+        map_y[None],
+        camera.parameters[None],
+        np.eye(3)[None],
+        np.zeros((1, 3)),
         np.ascontiguousarray(disc.marker_centres_body),
         0.5 * disc.marker_diameter,
         face_edge(disc),
-        blur_px,
-        noise.parameters,
-        np.empty((kernels.SCRATCH_ROWS, 40000)),
+        np.array([blur_px]),
+        noise.parameters[None],
+        (limits or TemplateLimits()).array(),
+        np.ascontiguousarray(R_camera_body),
+        np.ascontiguousarray(t_camera_body),
+        *kernels.scratch(),
         results,
         status,
     )
-    limits = limits or TemplateLimits()
-    for i in np.flatnonzero(status == MarkerStatus.MEASURED):
-        status[i] = kernels.judge_dot(results[i], 0.5 * disc.marker_diameter, blur_px, noise.parameters, limits.array())
-    return dot_centres(results, status)
+    return dot_centres(results[0], status[0])
 
 
 def locate_on_plane(
@@ -169,7 +170,7 @@ def locate_on_plane(
     limits = limits or TemplateLimits()
     results = np.full((len(centres), kernels.N_RESULT), np.nan)
     status = np.zeros(len(centres), np.uint8)
-    scratch = np.empty((kernels.SCRATCH_ROWS, 40000))
+    scratch = kernels.scratch()
     contiguous = np.ascontiguousarray(image)
     for i, (x, y) in enumerate(centres):  # the body is one compiled call
         p = np.empty(8)
@@ -178,7 +179,7 @@ def locate_on_plane(
         others = np.delete(centres, i, axis=0)
         near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
         status[i] = kernels.fit_dot(
-            contiguous, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, scratch, p,
+            contiguous, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, *scratch, p,
             results[i],
         )  # fmt: skip
         if status[i] == MarkerStatus.MEASURED:

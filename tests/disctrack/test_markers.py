@@ -221,3 +221,22 @@ def test_dots_of_a_flat_target_need_only_a_homography(rng):
     true = (H @ np.column_stack([centres, np.ones(4)]).T).T
     # 12 x 12 samples of an edge already softened over one sample err by less than 1e-3 px
     assert_allclose(found.pixels, true[:, :2] / true[:, 2:], atol=2e-3)
+
+
+def test_a_dot_wider_than_the_rows_kept_for_it_loses_no_pixel():
+    from scipy.ndimage import gaussian_filter
+
+    v, u = np.mgrid[:300, :300].astype(float)
+    centre, radius, blur = np.array([148.3, 151.6]), 90.0, 12.0
+    ink = np.clip(0.5 + radius - np.hypot(u - centre[0], v - centre[1]), 0, 1)
+    image = np.round(256 * 200 * (1 - 0.8 * gaussian_filter(ink, blur))).astype(np.uint16)
+    result, p = np.empty(kernels.N_RESULT), np.empty(8)
+    start = np.array([148.0, 152.0, radius, 148.0, 152.0])
+    status = kernels.fit_dot(
+        image, u, v, np.eye(3), start, blur, np.array([1e4, 0, 1]), np.inf, np.empty((0, 2)), *kernels.scratch(), p, result
+    )  # fmt: skip
+    assert status == MarkerStatus.MEASURED
+    # the band of pixels reaches from 3 blurs and 2 px inside the edge to 3 and 1 px outside
+    outer, inner = radius + 3 * blur + 1, radius - 3 * blur - 2
+    assert_allclose(result[kernels.N_PIXELS], np.pi * (outer**2 - inner**2), rtol=0.01)
+    assert_allclose(start[:2] + p[:2], centre, atol=2e-3)

@@ -89,7 +89,8 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     change = np.abs(errors(one.trajectory, whole.trajectory.q)) / sigma
     # after a start the attitude that shapes the templates is another one within its tolerance: 1e-3 px of 4e-3 px
     assert change[30:35].max() < 0.5
-    assert np.delete(change, range(30, 35), axis=0).max() < 1e-4
+    # elsewhere predictions differ in their last digits, and with them the rounding of single precision: 1e-6 px of 4e-3
+    assert np.delete(change, range(30, 35), axis=0).max() < 1e-3
 
 
 def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
