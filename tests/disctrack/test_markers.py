@@ -232,11 +232,12 @@ def test_a_dot_wider_than_the_rows_kept_for_it_loses_no_pixel():
     image = np.round(256 * 200 * (1 - 0.8 * gaussian_filter(ink, blur))).astype(np.uint16)
     result, p = np.empty(kernels.N_RESULT), np.empty(8)
     start = np.array([148.0, 152.0, radius, 148.0, 152.0])
-    status = kernels.fit_dot(
-        image, u, v, np.eye(3), start, blur, np.array([1e4, 0, 1]), np.inf, np.empty((0, 2)), *kernels.scratch(), p, result
-    )  # fmt: skip
+    noise, others = np.array([1e4, 0, 1]), np.empty((0, 2))
+    status = kernels.fit_dot(image, u, v, np.eye(3), start, blur, noise, np.inf, others, *kernels.scratch(), p, result)
     assert status == MarkerStatus.MEASURED
     # the band of pixels reaches from 3 blurs and 2 px inside the edge to 3 and 1 px outside
     outer, inner = radius + 3 * blur + 1, radius - 3 * blur - 2
     assert_allclose(result[kernels.N_PIXELS], np.pi * (outer**2 - inner**2), rtol=0.01)
-    assert_allclose(start[:2] + p[:2], centre, atol=2e-3)
+    # the blur of a curved edge is modelled to first order in blur over radius, which errs by their ratio's square of the
+    # 0.3 px by which the band is not centred
+    assert_allclose(start[:2] + p[:2], centre, atol=0.3 * (blur / radius) ** 2)
