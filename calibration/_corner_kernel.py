@@ -16,6 +16,7 @@ numba, because one view is some 10^6 evaluations of this model: 0.05 s compiled.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -33,7 +34,8 @@ _SQRT_HALF = math.sqrt(0.5)
 
 # What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices
 # assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop.
-_part = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_OPTIONS: dict[str, Any] = {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_part = numba.njit(**_OPTIONS)
 
 
 @_part

@@ -12,14 +12,15 @@ unequal shapes takes longer to compile than the loop); and only what Python call
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 # No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
-_RULES = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
+_RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
 _entry = njit(cache=True, **_RULES)  # called from Python
-_part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called from compiled code
+_part = njit(**_RULES | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})  # called from compiled code
 
 # Status codes: the values of trajectory.MarkerStatus, which a test keeps equal.
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED = 0, 1, 2, 3, 4, 5

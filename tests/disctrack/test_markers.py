@@ -238,6 +238,6 @@ def test_a_dot_wider_than_the_rows_kept_for_it_loses_no_pixel():
     # the band of pixels reaches from 3 blurs and 2 px inside the edge to 3 and 1 px outside
     outer, inner = radius + 3 * blur + 1, radius - 3 * blur - 2
     assert_allclose(result[kernels.N_PIXELS], np.pi * (outer**2 - inner**2), rtol=0.01)
-    # the blur of a curved edge is modelled to first order in blur over radius, which errs by their ratio's square of the
-    # 0.3 px by which the band is not centred
+    # a curved edge's blur is modelled to first order in blur over radius: an error of their ratio squared
+    # of the 0.3 px by which the band of pixels is not centred
     assert_allclose(start[:2] + p[:2], centre, atol=0.3 * (blur / radius) ** 2)
