@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,24 @@ class Answer:
         """Every stretch with what its sensors should show (n, w); NaN where the motion cannot be followed."""
         stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
         return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
+
+    def forecast(self, run: Run, *, before: bool = False) -> dict[str, Array]:
+        """What the sensors should show (n,) at the instants of a run, by channel: a free run of the model.
+
+        A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
+        begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
+        before : by the equations as declared (and fitted)
+        """
+        from disctrack.diagnosis.equations.declared import checked
+
+        (samples,) = checked(self.equations, [run])
+        if not run.name:
+            samples = replace(samples, run=self.system.runs[0])
+        fit = self.diagnosis.before if before else self.diagnosis.after
+        (found,) = self.system.with_(stretches=[samples]).predictions(fit.values)
+        shape = (len(samples.time), len(self.system.formulas.channels))
+        seen = np.full(shape, np.nan) if found is None else found.seen
+        return dict(zip(self.system.formulas.channels, seen.T, strict=True))
 
     def _errors(self, fit: Fit, held: Any) -> dict[str, ChannelErrors]:
         names = self.system.formulas.channels

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from disctrack.diagnosis.engine.fit import compress, fit
+from disctrack.diagnosis.engine.fit import Fit, compress, fit
 from disctrack.diagnosis.engine.held_out import held_out
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.shape import refine_shapes
@@ -36,6 +36,7 @@ REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below
 MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
+NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
@@ -61,6 +62,7 @@ def ask(
     stretch : [s] after which every run begins anew with a state of its own; None: as far as the model follows
     """
     runs = [runs] if isinstance(runs, Run) else list(runs)
+    settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
     channels = equations.channels(runs[0])
     offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
@@ -93,12 +95,12 @@ def ask(
         notes += more
     judged: System = diagnosis.judged or system
     memory = None
-    if settings is None or settings.noise is None:
+    if settings.noise is None:
         again, memory, remark = _with_memory(system, diagnosis, settings)
         if again is not None:
             diagnosis, judged = again, again.judged or judged
             notes.append(remark)
-    if diagnosis.found:
+    if diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
         diagnosis, shapes = refine_shapes(judged, diagnosis)
         notes += list(shapes)
     return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory)
@@ -210,7 +212,7 @@ def _in_stretches(
 
 
 def _joined(
-    system: EquationSystem, samples: Sequence[Samples], diagnosis: Diagnosis, settings: Settings | None
+    system: EquationSystem, samples: Sequence[Samples], diagnosis: Diagnosis, settings: Settings
 ) -> tuple[EquationSystem, Diagnosis, list[str]]:
     """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
     names = tuple(f.candidate.name for f in diagnosis.found)
@@ -243,7 +245,7 @@ def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, flo
 
 
 def _with_memory(
-    system: EquationSystem, diagnosis: Diagnosis, settings: Settings | None
+    system: EquationSystem, diagnosis: Diagnosis, settings: Settings
 ) -> tuple[Diagnosis | None, Array | None, str]:
     """Search again with noise that remembers, where what is left of the best model does."""
     if diagnosis.held_out_before is None:
@@ -256,24 +258,92 @@ def _with_memory(
     if not coefficients.any():
         return None, None, ""
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
+    lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
+    shortest_turn = min(turn(s) for s in system.stretches)
+    if diagnosis.verdict == "unexplained" and lasting > SLOW * shortest_turn:
+        # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
+        block = max(2 * shortest_turn, 5 * lasting)
+        reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
+        spread = replace(_certain(system, diagnosis, block), reason=reason)
+        text = (
+            f"sigmas are those that what is left brings about from one {block:.2g} s to the next, not the noise alone"
+        )
+        return spread, None, text
     remembering = Remembering(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values)
     if not base.converged:
         return None, None, ""
-    noise = share * size**2
-    again = diagnose(remembering, base.values, replace(settings or Settings(), noise=float(noise)), system.training)
+    noise = float(share * size**2)
+    again = diagnose(remembering, base.values, replace(settings, noise=noise), system.training)
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
-    lasting = persistence(residual, system.rows)
-    spacing = float(np.median(np.diff(system.stretches[0].time)))
-    again = replace(again, judged=again.judged or remembering)
-    if diagnosis.verdict == "unexplained" and lasting * spacing > SLOW * min(turn(s) for s in system.stretches):
-        # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
-        reason = (
-            f"what is left is {size:.3g} times the noise and lasts for {lasting * spacing:.2g} s: no sensor's noise"
-        )
-        again = replace(again, verdict="unexplained", reason=reason)
-    return again, coefficients, text
+    return replace(again, judged=again.judged or remembering), coefficients, text
+
+
+def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diagnosis:
+    """Sigmas as what is left makes them, and of what was found only what stands out from them (Wald's test)."""
+    found, after = diagnosis.found, robust(system, diagnosis.after, block)
+    while found:
+        gains = {f.candidate.name: _wald(f.candidate.names, after) for f in found}
+        certain = tuple(f for f in found if gains[f.candidate.name] > f.threshold)
+        if len(certain) == len(found):
+            found = tuple(replace(f, gain=gains[f.candidate.name]) for f in found)
+            break
+        found = certain
+        kept = {n for f in found for n in f.candidate.names}
+        start = {k: v for k, v in after.values.items() if k in kept or "." not in k or k.startswith("state.")}
+        quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
+        after = robust(system, fit(system, quantities, start), block)
+    names = {f.candidate.name for f in found}
+    tried = tuple(
+        replace(t, reason="does not stand out from what is left")
+        if t.reason == "chosen" and t.candidate.name not in names
+        else t
+        for t in diagnosis.tried
+    )
+    return replace(
+        diagnosis,
+        found=found,
+        before=robust(system, diagnosis.before, block),
+        after=after,
+        held_out_after=held_out(system, after.quantities, after.values, system.training),
+        tried=tried,
+    )
+
+
+def _wald(names: Sequence[str], fitted: Fit) -> float:
+    """Square of the distance from nought in standard deviations, of numbers that move together."""
+    here = [fitted.names.index(n) for n in names]
+    sigma = np.sqrt(np.diag(fitted.covariance)[here])
+    safe = np.where(sigma > 0, sigma, np.inf)  # a number at its bound tells nothing
+    values = np.array([fitted.values[n] for n in names]) / safe
+    correlation = fitted.covariance[np.ix_(here, here)] / np.outer(safe, safe)
+    return float(values @ np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) @ values)
+
+
+def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
+    """The fit with the covariance that its own residual brings about, errors within `block` [s] taken together.
+
+    The sandwich of Huber and White over blocks: what is left need be neither white nor as large as stated.
+    """
+    names = fitted.names
+    residual, derivative = system.linearise(fitted.values, names)
+    length = np.linalg.norm(derivative.reshape(-1, len(names)), axis=0)
+    scale = np.where(length > 0, length, 1.0)
+    J = derivative / scale
+    normal = np.einsum("nwi,nwj->ij", J, J)
+    scores = []
+    for rows in system.rows:
+        number = (system.time[rows] / block).astype(int)
+        for b in np.unique(number):
+            here = np.flatnonzero(number == b) + rows.start
+            scores.append(np.einsum("nwi,nw->i", J[here], residual[here]))
+    S = np.array(scores)
+    few = len(S) / max(len(S) - len(names), 1)  # blocks that the fit has bent towards nought
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    spread = few * inverse @ (S.T @ S) @ inverse / np.outer(scale, scale)
+    free = np.diag(fitted.covariance) > 0
+    return replace(fitted, covariance=np.where(np.outer(free, free), spread, 0.0))
 
 
 def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
