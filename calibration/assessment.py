@@ -10,6 +10,7 @@ from calibration.camera import N_INTRINSIC, Array, StereoRig
 from calibration.errors import CalibrationError
 from calibration.model_choice import Candidate
 from calibration.normal_equations import Problem, minimise
+from calibration.pairs import Motion
 from calibration.refinement import Refinement
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
@@ -44,6 +45,9 @@ class Assessment:
     half_sets: HalfSets | None  # None with fewer than six views
     projection_sigma_px: tuple[float, float]  # root mean square and greatest, over the table view's volume
     triangulation_sigma: tuple[float, float]  # the same for points [m], all of the calibration's uncertainty
+    length_sigma: tuple[float, float]  # relative, of a length or displacement: by the views; and with the board's size
+    pairs: int  # views that both cameras saw and the fit uses
+    motion: Motion | None  # of the board between the exposures of a pair
     verdict: str
     warnings: tuple[str, ...]
 
@@ -55,19 +59,49 @@ def consistency_factor(refinement: Refinement) -> float:
     common minimum. Noise alone gives E[g_v g_v^T] = H_v - H_v H^-1 H_v, so the ratio of the sum of g_v^T H^-1 g_v to
     its expectation is 1 for a right model, and more where errors are common to the corners of a view.
     """
+    shift, spread, covariance = _shifts_by_views(refinement)
+    # the board's own shape is nuisance: compare the stereo parameters' shifts only
+    metric = np.linalg.inv(covariance[: covariance.shape[1]])
+    seen = float(np.einsum("vi,ij,vj->", shift, metric, shift))
+    expected = float(np.sum(metric * (covariance.T @ spread.sum(0) @ covariance)))
+    return seen / expected if expected > 0 else float("nan")
+
+
+def _shifts_by_views(refinement: Refinement) -> tuple[Array, Array, Array]:
+    """Shift of the stereo parameters by each view (v, s1), its gradients' expected (v, s, s), covariance (s, s1)."""
     s1 = refinement.problem.stereo_basis.shape[1]
     information, gradient = refinement.normal.view_information()
     scale = 1.0 / np.sqrt(np.diag(information.sum(0)))  # the parameters' units differ by 10^6
     information, gradient = information * scale[:, None] * scale, gradient * scale
     inverse = np.linalg.inv(information.sum(0))
-    covariance = inverse[:, :s1]
-    # the board's own shape is nuisance: compare the stereo parameters' shifts only
-    metric = np.linalg.inv(covariance[:s1])
-    shift = gradient @ covariance
-    seen = float(np.einsum("vi,ij,vj->", shift, metric, shift))
-    spread = information - information @ inverse @ information
-    expected = float(np.einsum("si,ij,vst,tj->", covariance, metric, spread, covariance))
-    return seen / expected if expected > 0 else float("nan")
+    covariance: Array = inverse[:, :s1]
+    return gradient @ covariance, information - information @ inverse @ information, covariance
+
+
+def stereo_covariance(refinement: Refinement) -> Array:
+    """Covariance (s1, s1) of the free stereo parameters, from the corners' noise and from how the views disagree.
+
+    Errors that are common to a view weigh more in some directions than in others: a board that moves between the two
+    exposures spoils the pair's pose, not the focal lengths. The views' shifts, whitened by what noise would make of
+    them, are shrunk towards equal directions as far as so few views scatter (Ledoit and Wolf 2004); nothing gets
+    smaller than by the corners' noise.
+    """
+    shift, spread, inverse = _shifts_by_views(refinement)
+    s1, views = shift.shape[1], len(np.unique(refinement.problem.observations.view))
+    expected = inverse.T @ spread.sum(0) @ inverse
+    values, vectors = np.linalg.eigh(expected)
+    root = vectors * np.sqrt(np.maximum(values, 1e-12 * values.max()))  # expected = root root^T
+    white = np.linalg.solve(root, shift.T)
+    seen = white @ white.T
+    mean = float(np.trace(seen)) / s1
+    by_chance = mean**2 * (s1**2 + s1) / views
+    kept = max(0.0, 1.0 - by_chance / max(float(np.sum((seen - mean * np.eye(s1)) ** 2)), 1e-300))
+    factor, directions = np.linalg.eigh(kept * seen + (1 - kept) * mean * np.eye(s1))
+    beyond = root @ directions * np.sqrt(np.maximum(factor - 1.0, 0.0))
+    share = s1 / max(float(np.trace(np.linalg.solve(inverse[:s1], expected))), 1e-12)  # noise moves fewer than all
+    scale = 1.0 / np.sqrt(np.diag(refinement.normal.view_information()[0].sum(0)))[:s1]
+    result: Array = (inverse[:s1] + share * beyond @ beyond.T) * scale[:, None] * scale
+    return result
 
 
 def half_set_differences(refinement: Refinement, inflation: float) -> HalfSets | None:
@@ -161,18 +195,30 @@ def assess(
     refinement: Refinement,
     candidates: tuple[Candidate, ...],
     rig: StereoRig,
+    rig_with_board: StereoRig,
     table_view: int | None,
     inflation: float,
     halves: HalfSets | None,
+    motion: Motion | None,
 ) -> Assessment:
-    """Collect the figures and judge them."""
+    """Collect the figures and judge them; the second rig has the tolerances of the board in its covariance."""
     kept = refinement.observations[refinement.kept]
     share = (coverage(refinement, 0), coverage(refinement, 1))
     tilt, spread = tilts(refinement)
-    pixel_sigma, point_sigma = point_uncertainty(rig, measurement_volume(refinement, rig, table_view))
+    volume = measurement_volume(refinement, rig, table_view)
+    pixel_sigma, point_sigma = point_uncertainty(rig, volume)
+    lengths = (length_uncertainty(rig, volume), length_uncertainty(rig_with_board, volume))
+    pairs = len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1]))
     chosen = next((c for c in reversed(candidates) if c.terms == refinement.terms), None)
     n_views = len(np.unique(kept.view))
     warnings = _warnings(refinement, share, tilt, spread, n_views, inflation, halves, chosen)
+    if motion is not None and motion.is_seen:
+        warnings = (
+            f"the pairs are not synchronised: between its two exposures the board moved by {motion.distance * 1e3:.2g} "
+            f"mm ({motion.pixels:.2g} px; corners scatter by {motion.scatter:.2g} px). Trigger both cameras at once, "
+            "or hold the board still; the sigmas of the pair allow for it",
+            *warnings,
+        )
     point_length = np.linalg.norm(point_sigma, axis=-1)
     pixel_length = np.linalg.norm(pixel_sigma, axis=-1)
     triangulation = (float(np.sqrt(np.mean(point_length**2))), float(point_length.max()))
@@ -187,7 +233,10 @@ def assess(
         half_sets=halves,
         projection_sigma_px=(float(np.sqrt(np.mean(pixel_length**2))), float(pixel_length.max())),
         triangulation_sigma=triangulation,
-        verdict=_verdict(refinement, triangulation, chosen, len(warnings)),
+        length_sigma=lengths,
+        pairs=pairs,
+        motion=motion,
+        verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, motion, chosen),
         warnings=warnings,
     )
 
@@ -235,23 +284,59 @@ def _warnings(
     return tuple(found)
 
 
+def length_uncertainty(rig: StereoRig, points_world: Array) -> float:
+    """Relative standard deviation of a length across the points (n, 3) [m], from the calibration alone.
+
+    The mean over the three axes of space, of a length as long as the points' scatter; displacements have the same.
+    """
+    middle, size = points_world.mean(0), float(np.sqrt(np.mean(np.var(points_world, axis=0)) * 3))
+    ends = middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)])
+    _, d_world, d_rig = rig.project_with_jacobians(ends)
+    J = np.moveaxis(d_world, 0, 1).reshape(6, 4, 3)
+    K = np.moveaxis(d_rig, 0, 1).reshape(6, 4, -1)
+    shift = -np.linalg.solve(np.swapaxes(J, 1, 2) @ J, np.swapaxes(J, 1, 2) @ K)
+    along = np.stack([shift[axis, axis] - shift[axis + 3, axis] for axis in range(3)]) / size
+    return float(np.sqrt(np.mean(np.einsum("ap,pq,aq->a", along, rig.covariance, along))))
+
+
+def _range(rig: StereoRig, points_world: Array) -> float:
+    """Distance [m] from the left camera to the middle of the points."""
+    return float(np.linalg.norm(rig.R_left_world @ points_world.mean(0) + rig.t_left_world))
+
+
+_GRADES = ("excellent", "good", "usable", "poor")
+
+
 def _verdict(
-    refinement: Refinement, triangulation: tuple[float, float], chosen: Candidate | None, n_warnings: int
+    refinement: Refinement,
+    triangulation: tuple[float, float],
+    distance: float,
+    lengths: tuple[float, float],
+    pairs: int,
+    halves: HalfSets | None,
+    motion: Motion | None,
+    chosen: Candidate | None,
 ) -> str:
+    """The worst of what the figures say, with the reason, then the figures."""
     rms = refinement.rms()
-    if rms <= 0.05:
-        word = "excellent: rendered views or an etched target reach 0.002 to 0.05 px"
-    elif rms <= GOOD_RMS_PX:
-        word = f"good: printed boards usually give 0.1 to {GOOD_RMS_PX} px"
-    elif rms <= POOR_RMS_PX:
-        word = f"usable: printed boards usually give 0.1 to {GOOD_RMS_PX} px; look at the residual plots for a pattern"
-    else:
-        word = f"poor: above {POOR_RMS_PX} px something is wrong (declared square, blur, board moved, images exchanged)"
-    text = f"RMS {rms:.4f} px is {word}."
-    if chosen is not None and np.isfinite(chosen.held_out_rms_px):
-        text += f" Views left out of the fit give {chosen.held_out_rms_px:.4f} px."
-    text += (
-        f" Through this calibration a point comes out within {1e3 * triangulation[0]:.4f} mm (1 sigma, 3-D; at most "
-        f"{1e3 * triangulation[1]:.4f} mm)."
+    held_out = chosen.held_out_rms_px if chosen is not None and np.isfinite(chosen.held_out_rms_px) else rms
+    limits = (0.05, GOOD_RMS_PX, POOR_RMS_PX)
+    judged = [(int(np.searchsorted(limits, held_out)), f"views left out of the fit give {held_out:.4f} px")]
+    if pairs < MIN_GOOD_VIEWS:
+        judged.append((2 if pairs > 3 else 3, f"only {pairs} views were seen by both cameras"))
+    if held_out > 2 * rms:
+        judged.append((2, f"views left out give {held_out:.3f} px where those fitted give {rms:.3f} px"))
+    if halves is not None and halves.sigmas > 2:
+        judged.append((2, f"odd and even views differ by {halves.sigmas:.1f} of their sigmas"))
+    if motion is not None and motion.is_seen:
+        judged.append((2, "the two images of a pair do not show the board in one place"))
+    if triangulation[0] > 1e-3 * distance:
+        share = 100 * triangulation[0] / distance
+        judged.append((2 if share < 1 else 3, f"a point is uncertain by {share:.2g} % of its distance"))
+    grade, why = max(judged, key=lambda item: item[0])
+    return (
+        f"{_GRADES[grade].capitalize()}: {why}. RMS {rms:.4f} px, views left out {held_out:.4f} px. Through this "
+        f"calibration a point comes out within {1e3 * triangulation[0]:.4f} mm (1 sigma, 3-D; at most "
+        f"{1e3 * triangulation[1]:.4f} mm), a length or displacement within {100 * lengths[0]:.2g} %, or "
+        f"{100 * lengths[1]:.2g} % with the declared size of the board."
     )
-    return text + (" No warnings." if not n_warnings else f" {n_warnings} warning(s), see there.")

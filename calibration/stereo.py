@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.assessment import Assessment, assess, consistency_factor, half_set_differences
+from calibration.assessment import Assessment, assess, consistency_factor, half_set_differences, stereo_covariance
 from calibration.board import Board
 from calibration.brief import Brief
 from calibration.camera import Array, StereoRig
@@ -17,6 +17,7 @@ from calibration.chessboard import BoardNotFound, CornerView, board_orders, find
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
 from calibration.model_choice import Candidate, choose_terms
+from calibration.pairs import motion_between_exposures, readmitted
 from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
@@ -198,11 +199,11 @@ def calibrate_from_corners(
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
     observations = _observations(views)
     start, agrees = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
+    start, agrees = readmitted(observations, start, board.points, agrees, MAX_VIEW_RATIO)
     for v in np.flatnonzero(~agrees):
         if int(v) not in rejected:
             rejected[int(v)] = (
-                f"views {names[v][0]} and {names[v][1]}: the two cameras disagree with the other views about where "
-                "they stand: the board moved between the exposures, or the images are not a pair"
+                f"{names[v][0]}, {names[v][1]}: the board moved between the exposures, or the images are not a pair"
             )
     observations = observations[~np.isin(observations.view, list(rejected))]
 
@@ -236,7 +237,7 @@ def calibrate_from_corners(
         refinement = lens.refinement
     report("judging")
     inflation = max(consistency_factor(refinement), 1.0)
-    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation)
+    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, stereo_covariance(refinement))
     with_board = with_tolerances(
         replace(rig, lens_field=lens.field if lens else None),
         board.points,
@@ -245,7 +246,8 @@ def calibrate_from_corners(
         settings.tolerances,
     )
     halves = half_set_differences(refinement, inflation)
-    assessment = assess(refinement, candidates, rig, table_view, inflation, halves)
+    motion = motion_between_exposures(refinement)
+    assessment = assess(refinement, candidates, rig, with_board, table_view, inflation, halves, motion)
     return StereoCalibration(
         rig=with_board,
         refinement=refinement,
@@ -387,8 +389,8 @@ def _misfitting_views(refinement: Refinement, names: Sequence[tuple[str, str]]) 
         share = max(float(np.mean(part)) for part in lost)
         if share > MAX_LOST:
             bad[int(v)] = (
-                f"{names[v][0]}, {names[v][1]}: {100 * share:.0f} % of the corners in one image do not fit the other "
-                "views: the board moved between the exposures, or bent"
+                f"{names[v][0]}, {names[v][1]}: {100 * share:.0f} % of one image's corners do not fit the other "
+                "views: the board moved between the exposures"
             )
         elif value > MAX_VIEW_RATIO * typical:
             bad[int(v)] = (

@@ -18,18 +18,29 @@ def table_pose(R_left_board: Array, t_left_board: Array, board_thickness: float)
 
 
 def rig_with_covariance(
-    refinement: Refinement, table_view: int | None, board_thickness: float, inflation: float
+    refinement: Refinement,
+    table_view: int | None,
+    board_thickness: float,
+    inflation: float,
+    stereo: Array | None = None,
 ) -> StereoRig:
     """The rig at the minimum, its world on the table of one view, with the covariance of all RIG_PARAMETERS.
 
     inflation : factor on the covariance that follows from the points' noise
+    stereo : covariance of the free stereo parameters where it is known better, see `assessment.stereo_covariance`
     """
     model, normal = refinement.model, refinement.normal
     basis = refinement.problem.stereo_basis
     n_free = basis.shape[1]
     shared, poses, cross = normal.covariances()
+    free, cross = inflation * shared[:n_free, :n_free], inflation * cross[:, :n_free]
+    poses = inflation * poses
+    if stereo is not None:
+        carried = np.swapaxes(np.linalg.solve(free, cross), 1, 2)  # how far a pose follows the stereo parameters
+        poses = poses + carried @ (stereo - free) @ np.swapaxes(carried, 1, 2)
+        free, cross = stereo, stereo @ np.swapaxes(carried, 1, 2)
     covariance = np.zeros((N_RIG, N_RIG))
-    covariance[:N_STEREO, :N_STEREO] = basis @ shared[:n_free, :n_free] @ basis.T
+    covariance[:N_STEREO, :N_STEREO] = basis @ free @ basis.T
     R_left_world, t_left_world = np.eye(3), np.zeros(3)
     if table_view is not None:
         R, t = model.R_left_board[table_view], model.t_left_board[table_view]
@@ -39,9 +50,9 @@ def rig_with_covariance(
         M = np.eye(6)
         M[3:, :3] = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
         covariance[N_STEREO:, N_STEREO:] = M @ poses[table_view] @ M.T
-        covariance[:N_STEREO, N_STEREO:] = basis @ cross[table_view][:n_free] @ M.T
+        covariance[:N_STEREO, N_STEREO:] = basis @ cross[table_view] @ M.T
         covariance[N_STEREO:, :N_STEREO] = covariance[:N_STEREO, N_STEREO:].T
-    covariance = 0.5 * inflation * (covariance + covariance.T)
+    covariance = 0.5 * (covariance + covariance.T)
     return StereoRig(
         left=model.cameras[0],
         right=model.cameras[1],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import StereoCalibration
+from calibration import StereoCalibration, StereoRig
 from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -25,9 +25,11 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
     lines = [
         _line(
             "calibration",
-            f"{used} of {n} views, rms {found.rms_px:.4f} px (left {left:.4f}, right {right:.4f}), "
-            f"baseline {found.rig.baseline * 1e3:.3f} mm",
+            f"{used} of {n} views ({assessment.pairs} by both cameras), rms {found.rms_px:.4f} px (left {left:.4f}, "
+            f"right {right:.4f}), baseline {found.rig.baseline * 1e3:.3f} mm",
         ),
+        _line("rig", _rig_text(found.rig)),
+        _line("model", _model_text(found)),
         _line("", assessment.verdict),
     ]
     if found.lens is not None:
@@ -37,9 +39,50 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
     corners = len(found.rejected_corners())
     if corners:
         lines.append(_line("", f"{corners} corners were found but not used"))
-    lines += [_line("", f"view {view} is not used: {why}") for view, why in found.rejected_views.items()]
+    lines += [_line("", text) for text in _left_out(found.rejected_views)]
     lines += [_line("warning", text) for text in (*problems, *found.warnings)]
     return lines
+
+
+def _rig_text(rig: StereoRig) -> str:
+    """Baseline, angle between the cameras and focal lengths, with their sigmas."""
+    C, t = rig.covariance, rig.t_right_left / rig.baseline
+    baseline = 1e3 * float(np.sqrt(t @ C[21:24, 21:24] @ t))
+    R = rig.R_right_left
+    angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(R) - 1), -1, 1))))
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
+    turn = float(np.degrees(np.sqrt(axis @ C[18:21, 18:21] @ axis)))
+    focal = [
+        f"{name} {camera.fx:.1f} x {camera.fy:.1f} (± {np.sqrt(C[i, i]):.2g})"
+        for name, camera, i in (("left", rig.left, 0), ("right", rig.right, 9))
+    ]
+    return (
+        f"baseline {rig.baseline * 1e3:.3f} ± {baseline:.2g} mm, cameras turned by {angle:.3f} ± {turn:.2g} deg, "
+        f"focal lengths [px] {', '.join(focal)}"
+    )
+
+
+def _model_text(found: StereoCalibration) -> str:
+    """Which distortion and which board, and what the others give on views left out."""
+    chosen = found.refinement.terms
+    text = f"distortion {chosen.distortion}, {chosen.board} board"
+    rows = {(c.terms.distortion, c.terms.board): c.held_out_rms_px for c in found.candidates}
+    own = rows.pop((chosen.distortion, chosen.board), float("nan"))
+    others = sorted(rows.items(), key=lambda item: item[1])[:3]
+    if not others:
+        return text + " (as told)"
+    listed = ", ".join(f"{distortion} {board} {rms:.4f}" for (distortion, board), rms in others)
+    return f"{text}: views left out fit at {own:.4f} px ({listed}); the simplest that is not clearly worse is taken"
+
+
+def _left_out(rejected: Mapping[int, str]) -> list[str]:
+    """One line for each reason, with the views that it holds for."""
+    groups: dict[str, list[str]] = {}
+    for view, why in rejected.items():
+        where, _, reason = why.partition(": ")
+        groups.setdefault(reason or where, []).append(str(view))
+    return [f"view{'s' if len(views) > 1 else ''} {', '.join(views)} not used: {why}" for why, views in groups.items()]
 
 
 def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ from calibration import (
 )
 from calibration.camera import rotation_from_vector, triangulate
 from calibration.images import calibrate_files, find_pairs
+from calibration.pairs import readmitted
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.table_frame import table_pose
 from calibration.tolerances import BoardTolerances
@@ -190,6 +191,54 @@ def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng)
     found = calibrate_from_corners(left, right, BOARD, FLAT)
     assert list(found.rejected_views) == [4]
     assert found.rms_px < 0.05
+
+
+def unsynchronised(scene, rng, step):
+    """The right views of boards that moved by `step` [m, rms of each axis] after the left exposure."""
+    m = scene.model
+    moved = replace(m, t_left_board=m.t_left_board + rng.normal(size=m.t_left_board.shape) * step)
+    return corner_views(scene, rng)[0], corner_views(replace(scene, model=moved), rng)[1]
+
+
+def test_pairs_that_were_not_synchronised_are_named_and_others_are_not(scene_maker, rng):
+    scene = small_scene(scene_maker, n_views=14)
+    found = calibrate_from_corners(*unsynchronised(scene, rng, 0.2e-3), BOARD, FLAT)
+    assert not found.rejected_views
+    assert any("not synchronised" in w for w in found.warnings)
+    # each axis moves by 0.2 mm rms; the two poses share what moves along the common line of sight
+    assert 0.15e-3 < found.assessment.motion.distance < 0.7e-3
+    assert found.assessment.verdict.startswith(("Usable", "Poor"))
+    together = calibrate_from_corners(*corner_views(scene, rng), BOARD, FLAT)
+    assert not together.assessment.motion.is_seen
+    assert not any("synchronised" in w for w in together.warnings)
+
+
+@pytest.mark.slow
+def test_the_sigma_of_the_baseline_is_honest_where_pairs_were_not_synchronised(scene_maker):
+    z = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        scene = small_scene(scene_maker, n_views=16, seed=seed)
+        rig = calibrate_from_corners(*unsynchronised(scene, rng, 0.15e-3), BOARD, FLAT).rig
+        t = scene.model.t_right_left
+        axis = rig.t_right_left / rig.baseline
+        z.append((rig.baseline - np.linalg.norm(t)) / np.sqrt(axis @ rig.covariance[21:24, 21:24] @ axis))
+    assert 0.3 < np.mean(np.square(z)) < 2.2  # chi-square of 16 at two sigma, and what 16 views know of their scatter
+
+
+def test_views_that_a_rough_pose_puts_elsewhere_are_used_after_all(scene_maker, rng):
+    scene = small_scene(scene_maker, n_views=10)
+    observations = scene.observations(0.02, rng)
+    agrees = np.ones(10, bool)
+    agrees[[2, 6]] = False  # as if each camera alone had put these boards degrees off
+    start, usable = readmitted(observations, scene.model, BOARD.points, agrees, 5.0)
+    assert usable.all()
+    right = (observations.view == 6) & (observations.camera == 1)
+    pixels = observations.pixels.copy()
+    pixels[right] += [3.0, -2.0]
+    _, usable = readmitted(replace(observations, pixels=pixels), start, BOARD.points, agrees, 5.0)
+    assert usable[2]
+    assert not usable[6]
 
 
 def test_parallel_views_are_warned_of(scene_maker, rng):
