@@ -71,7 +71,8 @@ STAIRS = (
     ("files", "regular_precession"),
     ("rolling",),
     ("readers", "recording", "pages", "scene"),
-    ("track", "analyse", "render"),  # the measurement; the same physics forwards
+    ("track", "render"),  # the measurement; the same physics forwards
+    ("analyse",),
     ("calibrate", "repeats", "diagnosis"),
     ("first_look", "examples", "validate", "batch", "docs"),
     ("commands",),
