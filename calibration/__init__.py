@@ -13,6 +13,7 @@ from calibration.errors import CalibrationError, DiscTrackError, RigFileError
 
 if TYPE_CHECKING:
     from calibration.chessboard import BoardNotFound, CornerView, find_corners
+    from calibration.points import calibrate_from_points
     from calibration.refinement import refine_stereo
     from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners, calibrate_stereo
     from calibration.stereo_model import Observations, StereoModel, Terms
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 # Imported when asked for: the physics needs the camera model and the errors, not the image library behind these.
 _ON_DEMAND = {
     "chessboard": ("BoardNotFound", "CornerView", "find_corners"),
+    "points": ("calibrate_from_points",),
     "refinement": ("refine_stereo",),
     "stereo_model": ("Observations", "StereoModel", "Terms"),
     "tolerances": ("BoardTolerances",),
@@ -50,6 +52,7 @@ __all__ = [
     "StereoRig",
     "Terms",
     "calibrate_from_corners",
+    "calibrate_from_points",
     "calibrate_stereo",
     "find_corners",
     "refine_stereo",

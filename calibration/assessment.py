@@ -268,7 +268,7 @@ def _warnings(
     if inflation > BIG_INFLATION:
         found.append(
             f"the views disagree {inflation**0.5:.1f} times more than their corners' noise allows; the uncertainties "
-            "were enlarged by that: is the board flat, stiff and at rest?"
+            "were enlarged by that: the board moved or bent between views, or the lenses are not as modelled"
         )
     if halves is not None and halves.sigmas > 2.0:
         found.append(

@@ -270,14 +270,17 @@ def _views_not_found(
     views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]], names: Sequence[tuple[str, str]]
 ) -> tuple[dict[int, str], list[str]]:
     """Views that neither camera can use, and warnings about those that only one can."""
-    rejected, warnings = {}, []
+    rejected: dict[int, str] = {}
+    alone: dict[str, list[str]] = {}
     for v, pair in enumerate(zip(*views, strict=True)):
         missing = [(c, view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
         text = "; ".join(f"{names[v][c]}: {reason}" for c, reason in missing)
         if len(missing) == 2:
             rejected[v] = text
         elif missing:
-            warnings.append(f"view {v} is used in one camera only: {text}")
+            camera, reason = missing[0]
+            alone.setdefault(reason, []).append(f"view {v} is used in one camera only: {names[v][camera]}")
+    warnings = [f"{'; '.join(which)}: {reason}" for reason, which in alone.items()]
     notes = sorted({note for side in views for view in side if isinstance(view, CornerView) for note in view.notes})
     return rejected, warnings + notes
 

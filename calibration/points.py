@@ -1,0 +1,104 @@
+"""Calibration from corners that another program located: points and one sigma."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibration.board import Board
+from calibration.chessboard import BoardNotFound, CornerView
+from calibration.corner_fit import local_axes
+from calibration.errors import CalibrationError
+from calibration.stereo import CAMERA_NAMES, CalibrationSettings, StereoCalibration, calibrate_from_corners
+
+LARGEST_SQUARE = 0.5  # m: beyond, millimetres were given for metres
+OVERSTATED = 0.7  # times the declared sigma: corners that scatter by less were declared worse than they are
+_NOT_SEEN = BoardNotFound("no corners were given")
+
+
+def calibrate_from_points(
+    left: Sequence[ArrayLike | None],
+    right: Sequence[ArrayLike | None],
+    board: Board,
+    image_size: tuple[int, int] | tuple[tuple[int, int], tuple[int, int]],
+    sigma_px: float,
+    settings: CalibrationSettings | None = None,
+    table_view: int | None = None,
+    board_thickness: float = 0.0,
+) -> StereoCalibration:
+    """Calibrate a stereo pair from corners located elsewhere, item i of both lists from the same place of the board.
+
+    left, right : per view (n, 2) [px] in the order of `Board.points`, pixel (0, 0) the centre of the top-left pixel;
+        None where the camera did not see the board
+    image_size : (width, height) [px] of both cameras, or of each
+    sigma_px : standard deviation of a corner per axis; what the residuals show beyond it is found and added, and a
+        warning tells where they show less
+
+    Raises CalibrationError that names camera, view and corner of what cannot be right.
+    """
+    if len(left) != len(right):
+        raise CalibrationError(f"{len(left)} left and {len(right)} right views: give None where a camera saw no board")
+    if not (np.isfinite(sigma_px) and sigma_px > 0):
+        raise CalibrationError(f"sigma_px = {sigma_px}: the standard deviation of a corner must be above 0 px")
+    if board.square > LARGEST_SQUARE:
+        raise CalibrationError(
+            f"the board's squares are {board.square:g} m: lengths are in metres, {board.square:g} mm is "
+            f"{board.square * 1e-3:g}"
+        )
+    sizes = np.broadcast_to(np.asarray(image_size), (2, 2))
+    views = [
+        [
+            _view(points, board, (int(size[0]), int(size[1])), sigma_px, f"{name} view {v}")
+            for v, points in enumerate(side)
+        ]
+        for side, size, name in zip((left, right), sizes, CAMERA_NAMES, strict=True)
+    ]
+    found = calibrate_from_corners(views[0], views[1], board, settings, table_view, board_thickness)
+    shown = sigma_px * float(np.sqrt(found.refinement.chi_square))
+    if shown < OVERSTATED * sigma_px:
+        note = f"the corners scatter by {shown:.3g} px, {sigma_px:g} px were declared: the stated sigmas are too large"
+        found = replace(found, warnings=(*found.warnings, note))
+    return found
+
+
+def _view(
+    points: ArrayLike | None, board: Board, image_size: tuple[int, int], sigma: float, where: str
+) -> CornerView | BoardNotFound:
+    if points is None:
+        return _NOT_SEEN
+    pixels = np.asarray(points, float)
+    n = len(board.points)
+    pixels = pixels.reshape(len(pixels), 2) if pixels.shape == (len(pixels), 1, 2) else pixels
+    if pixels.shape != (n, 2):
+        columns, rows = board.inner_corners
+        raise CalibrationError(
+            f"{where}: corners of shape {pixels.shape}, expected ({n}, 2) for {columns} x {rows} inner corners; a view "
+            "with a corner missing must be left out (None)"
+        )
+    bad = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
+    if len(bad):
+        raise CalibrationError(f"{where}: corner {bad[0]} is {pixels[bad[0]]}: leave the view out (None), or mend it")
+    size = np.array(image_size)
+    outside = np.flatnonzero(((pixels < -0.5) | (pixels > size - 0.5)).any(axis=1))
+    if len(outside):
+        x, y = pixels[outside[0]]
+        raise CalibrationError(
+            f"{where}: corner {outside[0]} at ({x:.1f}, {y:.1f}) lies outside the image of {size[0]} x {size[1]} px; "
+            "are width and height, or x and y, exchanged?"
+        )
+    axes = local_axes(pixels, np.ones(n, bool), board.inner_corners)
+    return CornerView(
+        image_size=image_size,
+        points=pixels,
+        covariance=np.tile(sigma**2 * np.eye(2), (n, 1, 1)),
+        accepted=np.ones(n, bool),
+        reasons=("",) * n,
+        chi_square=np.full(n, np.nan),
+        contrast=np.full(n, np.nan),
+        blur=np.full(n, np.nan),
+        spacing=float(np.median(np.linalg.norm(axes, axis=-1))),
+        noise=(float("nan"), float("nan")),
+    )
