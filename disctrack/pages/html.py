@@ -5,6 +5,7 @@ Text is escaped here; what is HTML already is a `Markup`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 
@@ -16,8 +17,14 @@ class Markup(str):
 
 
 def text(item: str) -> Markup:
-    """The item as HTML."""
-    return item if isinstance(item, Markup) else Markup(escape(item))
+    """The item as HTML, set as people write it: µm, ± and m² for what a terminal shows as um, +- and m^2."""
+    return item if isinstance(item, Markup) else Markup(escape(typeset(item)))
+
+
+def typeset(said: str) -> str:
+    """Signs in place of what stands for them in plain text; units only after a number, a bracket or a space."""
+    said = said.replace(" +- ", " ± ").replace("^2", "²").replace("^3", "³").replace(" -> ", " → ")
+    return re.sub(r"(?<=[\d \[(])u(?=(?:m|rad|s|N m)\b)", "µ", said)
 
 
 def page(title: str, parts: Iterable[str], *, head: str = "") -> str:

@@ -6,6 +6,7 @@ folder with the sample data in it. Commands that do not begin with disctrack are
 
 import argparse
 import ast
+import json
 import os
 import re
 import shlex
@@ -195,6 +196,36 @@ def test_every_command_is_in_the_documentation():
     everything = "".join(page.read_text(encoding="utf-8") for page in PAGES if page.is_file())
     for command in COMMANDS:
         assert f"disctrack {command}" in everything or f"`{command}`" in everything, command
+
+
+def cells_of(notebook: Path) -> list[str]:
+    content = json.loads(text_of(notebook))
+    return ["".join(cell["source"]) for cell in content["cells"] if cell["cell_type"] == "code"]
+
+
+def test_the_notebook_is_one_and_its_cells_compile():
+    nbformat = json.loads(text_of(DOCS / "tour.ipynb"))
+    assert nbformat["nbformat"] == 4
+    for cell in cells_of(DOCS / "tour.ipynb"):
+        ast.parse(cell)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of the figures, which no screen shows here
+def test_the_notebook_runs_and_its_last_lines_show_themselves(workplace, monkeypatch):
+    """Without Jupyter: each cell is executed, and what it ends with must show itself in a few lines."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    monkeypatch.chdir(workplace)
+    scope: dict[str, object] = {}
+    for cell in cells_of(DOCS / "tour.ipynb"):
+        tree = ast.parse(cell)
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, "tour.ipynb", "exec"), scope)
+        if last is not None:
+            shown = eval(compile(ast.Expression(last.value), "tour.ipynb", "eval"), scope)
+            assert len(repr(shown)) < 4000, cell
 
 
 def test_a_wrong_option_or_block_would_be_noticed(workplace):

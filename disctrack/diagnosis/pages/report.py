@@ -152,7 +152,9 @@ def _energy(result: DiscDiagnosis, beside: Evidence) -> list[tuple[str, str, str
 def _tried(result: DiscDiagnosis) -> str:
     number = lambda value: "" if value is None else f"{value:.4g}"  # noqa: E731
     rows = [
-        (t.candidate.name, number(t.score), number(t.gain), number(t.held_out_gain), t.reason)
+        (t.candidate.title, t.candidate.name, number(t.score), number(t.gain), number(t.held_out_gain), t.reason)
         for t in result.diagnosis.tried
     ]
-    return table("", ("candidate", "score", "gain, refitted", "gain, held out", "outcome"), rows) if rows else ""
+    return (
+        table("", ("candidate", "name", "score", "gain, refitted", "gain, held out", "outcome"), rows) if rows else ""
+    )
