@@ -21,11 +21,10 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.files.whole import write_whole
 from disctrack.pages.html import Markup, page, paragraph
 from disctrack.pages.palette import RED
-from disctrack.track.overlay import draw_pair
 from disctrack.trajectory import FrameStatus
 
 Array = NDArray[np.float64]
-Pairs = Callable[[int], NDArray | None]  # frame -> images (2, height, width), None where they cannot be read
+Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
 
 MOST_ROWS = 1500  # frames on the page: every second, third, ... of longer recordings
 MOST_PICTURES = 80
@@ -33,15 +32,15 @@ PICTURE_HEIGHT = 300  # [px] of one camera's picture
 JPEG_QUALITY = 72
 
 
-def write_motion_page(path: Path, analysis: Analysis, name: str, pairs: Pairs | None = None) -> Path:
-    """Write the page. pairs : gives the images of a frame, where they are at hand. Raises OutputError."""
-    write_whole(path, motion_html(analysis, name, pairs).encode())
+def write_motion_page(path: Path, analysis: Analysis, name: str, drawn: Drawn | None = None) -> Path:
+    """Write the page. drawn : gives the picture of a frame, where the images are at hand. Raises OutputError."""
+    write_whole(path, motion_html(analysis, name, drawn).encode())
     return path
 
 
-def motion_html(analysis: Analysis, name: str, pairs: Pairs | None = None) -> str:
+def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> str:
     """The whole page."""
-    content = page_data(analysis, pairs)
+    content = page_data(analysis, drawn)
     data = json.dumps(content, separators=(",", ":")).replace("</", "<\\/")
     script = files("disctrack.pages").joinpath("motion.js").read_text(encoding="utf-8")
     curves = "".join(
@@ -69,7 +68,7 @@ def motion_html(analysis: Analysis, name: str, pairs: Pairs | None = None) -> st
     return page(f"{name}: the motion", [paragraph(_said(analysis)), body], head=f"<style>{_STYLE}</style>")
 
 
-def page_data(analysis: Analysis, pairs: Pairs | None = None) -> dict[str, Any]:
+def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
     """What the page draws, of JSON's types; lengths in mm, angles in degrees, None where nothing is known."""
     trajectory, motion = analysis.trajectory, analysis.motion
     rows = np.arange(0, len(trajectory), max(1, -(-len(trajectory) // MOST_ROWS)))
@@ -111,7 +110,7 @@ def page_data(analysis: Analysis, pairs: Pairs | None = None) -> dict[str, Any]:
         "residual_px": _plain(residual, 5),
         "residual_reach_px": float(1.2 * np.percentile(finite, 99.5)) if finite.size else 1.0,
         "rms_px": _plain(trajectory.reprojection_rms_px[rows], 5),
-        "pictures": [] if pairs is None else _pictures(analysis, rows, pairs),
+        "pictures": [] if drawn is None else _pictures(rows, drawn),
     }
 
 
@@ -145,17 +144,13 @@ def _plain(values: Array, digits: int) -> Any:
     return rounded.tolist()
 
 
-def _pictures(analysis: Analysis, rows: NDArray[np.intp], pairs: Pairs) -> list[dict[str, Any]]:
+def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> list[dict[str, Any]]:
     chosen = np.unique(np.linspace(0, len(rows) - 1, min(MOST_PICTURES, len(rows))).round().astype(int))
     found = []
     for k in chosen:
-        row = int(rows[k])
-        images = pairs(row)
-        if images is None:
-            continue
-        drawn = draw_pair(images, analysis.trajectory, row)[: images.shape[1]]
-        scale = min(1.0, PICTURE_HEIGHT / drawn.shape[0])
-        small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        picture = drawn(int(rows[k]))
+        scale = min(1.0, PICTURE_HEIGHT / picture.shape[0])
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if good:
             uri = f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"

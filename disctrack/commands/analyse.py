@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from disctrack.analyse.analysis import Analysis
 
 
@@ -88,6 +89,7 @@ def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recordi
     from disctrack.errors import RecordingError
     from disctrack.files.trajectory_file import read_provenance
     from disctrack.recording.declaration import FILE_NAME, read_recording
+    from disctrack.track.overlay import draw_pair
     from disctrack.track.stage import open_pairs
 
     folder = recording or next(
@@ -107,5 +109,10 @@ def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recordi
                 "measured from another recording."
             )
         pairs = None
-    take = None if pairs is None else partial(pair_of, pairs)
-    write_motion_page(page, analysis, read_provenance(trajectory).recording, take)
+
+    def drawn(row: int) -> NDArray:
+        assert pairs is not None
+        images = pair_of(pairs, row)
+        return draw_pair(images, analysis.trajectory, row)[: images.shape[1]]  # without the strip of numbers
+
+    write_motion_page(page, analysis, read_provenance(trajectory).recording, None if pairs is None else drawn)

@@ -12,6 +12,7 @@ import pytest
 import disctrack
 from disctrack.analyse.analysis import analyse
 from disctrack.analyse.motion_page import motion_html
+from disctrack.track.overlay import draw_pair
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
@@ -30,9 +31,11 @@ def measured(sample_clip, rig_file):
 
 @pytest.fixture(scope="module")
 def page(measured, tmp_path_factory):
-    _trajectory, analysis, images = measured
+    trajectory, analysis, images = measured
     file = tmp_path_factory.mktemp("page") / "motion.html"
-    file.write_text(motion_html(analysis, "a <clip> & more", lambda row: images[row]), encoding="utf-8")
+    file.write_text(
+        motion_html(analysis, "a <clip> & more", lambda row: draw_pair(images[row], trajectory, row)), encoding="utf-8"
+    )
     return file
 
 
