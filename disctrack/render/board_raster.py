@@ -35,9 +35,14 @@ def _nearest_line(x: float, n: int, margin: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _board_grid(
-    grid: Array, p0: float, q0: float, size: float, corners: tuple[Array, Array, Array, Array], R: Array, eye: Array
-) -> bool:
-    """Board coordinates of 3 x 3 points of a cell (size: of the pixel), and whether the rays all meet the board."""
+    grid: Array, p0: float, q0: float, size: float, corners: tuple[Array, Array, Array, Array], R: Array, eye: Array,
+    bent: Array,
+) -> bool:  # fmt: skip
+    """Board coordinates of 3 x 3 points of a cell (size: of the pixel), and whether the rays all meet the board.
+
+    bent : bow, middle and half length along the long side, stretch, in squares: the face lies bow (1 - u^2) above its
+           plane, u = (x - middle) / half length
+    """
     ahead = True
     for i in range(3):
         for j in range(3):
@@ -45,6 +50,11 @@ def _board_grid(
             rx, ry = between(corners, p, q)
             dx, dy, dz = ray_in_body(R, rx, ry)
             x, y, meets = plane_point(eye, dx, dy, dz, 0.0)
+            if bent[0] != 0.0:
+                for _ in range(3):  # the height changes little along the ray
+                    u = (x - bent[1]) / bent[2]
+                    x, y, meets = plane_point(eye, dx, dy, dz, bent[0] * (1.0 - u * u))
+            x /= 1.0 + bent[3]
             ahead = ahead and meets
             grid[i, j, 0], grid[i, j, 1] = x, y
     return ahead
@@ -85,12 +95,12 @@ def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) 
 @numba.njit(cache=True, nogil=True)
 def draw_board(
     cells: Array32, background: Array32, rays: Array, s: int, R: Array, t: Array, square: float, n_x: int, n_y: int,
-    margin: float, white: float, black: float,
+    margin: float, white: float, black: float, bent: Array,
 ) -> None:  # fmt: skip
     """Add the chessboard before the background to `cells`; arguments as in `draw_disc`.
 
     R, t     : R_camera_board, t_camera_board; the board's origin is its lower left inner corner
-    n_x, n_y : inner corners along the long and the short side; `margin` in squares
+    n_x, n_y : inner corners along the long and the short side; `margin` in squares; bent: see `_board_grid`
     """
     eye = -R.T @ t / square
     colours = np.array([0.0, white, black])
@@ -98,7 +108,7 @@ def draw_board(
     for row in range(cells.shape[0] // s):
         for column in range(cells.shape[1] // s):
             corners = (rays[row, column], rays[row, column + 1], rays[row + 1, column], rays[row + 1, column + 1])
-            ahead = _board_grid(grid, 0.0, 0.0, 1.0, corners, R, eye)
+            ahead = _board_grid(grid, 0.0, 0.0, 1.0, corners, R, eye, bent)
             x, y = grid[1, 1]
             y0, x0 = row * s, column * s
             if not ahead or abs(x) > 1e3 or abs(y) > 1e3:
@@ -118,7 +128,7 @@ def draw_board(
                 continue
             for i in range(s):
                 for j in range(s):
-                    _board_grid(grid, i / s, j / s, 1.0 / s, corners, R, eye)
+                    _board_grid(grid, i / s, j / s, 1.0 / s, corners, R, eye, bent)
                     colours[0] = background[y0 + i, x0 + j]
                     value, m_x, m_y = _board_cell(grid, colours, n_x, n_y, margin)
                     deposit(cells, y0 + i, x0 + j, value, m_x, m_y)

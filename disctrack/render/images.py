@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.camera import Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import rotation_from_euler
-from disctrack.render import optics
+from disctrack.render import imperfect, optics
 from disctrack.render.board_raster import draw_board
 from disctrack.render.disc_raster import draw_disc
 from disctrack.render.rays import View, corner_rays, image_of
 from disctrack.render.sensor import digitise, hot_pixels
 from disctrack.scene.description import (
     AppearanceSettings,
+    ImperfectionSettings,
     LightSettings,
     Occluder,
     OpticsSettings,
@@ -47,16 +48,20 @@ class Stage:
     table: Grey  # (height, width) blurred table, before lamp and vignetting
     factor: Grey
     glare: Grey
+    pattern: imperfect.Pattern | None
     hot: Grey | None
 
     def finish(self, irradiance: Grey) -> Grey:
-        """Lamp, vignetting and glare on a blurred image."""
-        return irradiance * self.factor + self.glare
+        """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern has it."""
+        grey = irradiance * self.factor + self.glare
+        return grey if self.pattern is None else self.pattern.seen(grey)
 
 
 def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, Stage]:
     """Left and right stage; cached, so that calls with the same rig and look share the table."""
-    look = (scene.seed, scene.appearance, scene.optics, scene.light, scene.sensor, scene.rig.target_mm)
+    look = (
+        scene.seed, scene.appearance, scene.optics, scene.light, scene.sensor, scene.imperfections, scene.rig.target_mm,
+    )  # fmt: skip
     left, right = (
         _stage(name, camera, R.tobytes(), t.tobytes(), *look, scene.render.subpixels)
         for name, camera, (R, t) in zip(("left", "right"), rig.cameras, rig.camera_poses(), strict=True)
@@ -75,6 +80,7 @@ def _stage(
     optics_settings: OpticsSettings,
     light: LightSettings,
     sensor: SensorSettings,
+    imperfections: ImperfectionSettings,
     target_mm: tuple[float, float, float],
     s: int,
 ) -> Stage:
@@ -92,11 +98,12 @@ def _stage(
         s=s,
         pad=pad,
         weights=weights,
-        rays=corner_rays(camera, pad),
+        rays=imperfect.lens_rays(corner_rays(camera, pad), pad, camera, imperfections, [seed, 9, index]),
         cells=cells,
         table=optics.blur_to_pixels(cells, weights, s),
         factor=factor,
         glare=glare,
+        pattern=imperfect.sensor_pattern(imperfections, camera.image_size, [seed, 10, index]),
         hot=hot_pixels(sensor, camera.image_size, np.random.default_rng([seed, 5, index])),
     )
 
@@ -314,6 +321,7 @@ def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stag
         view.R_camera_world @ t_world_board + view.t_camera_world,
         board.square_mm * 1e-3, board.inner_corners[0], board.inner_corners[1], board.margin_mm / board.square_mm,
         scene.appearance.board_white * light, scene.appearance.board_black * light,
+        imperfect.bent_board(scene.imperfections, board),
     )  # fmt: skip
     return stage.finish(optics.blur_to_pixels(cells, stage.weights, stage.s))
 

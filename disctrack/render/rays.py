@@ -6,6 +6,7 @@ as a disagreement between rendered images and projected points.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -71,6 +72,14 @@ def corner_rays(camera: Camera, pad: int) -> Array:
         raise SceneError(f"lens distortion {camera.distortion} folds inside the picture; choose smaller coefficients")
     rays.flags.writeable = False
     return rays
+
+
+def bent_rays(rays: Array, pad: int, field: Callable[[Array], Array]) -> Array:
+    """Rays of `corner_rays` where image points lie off by field(pixels (..., 2)), some hundredths of a pixel."""
+    rows, columns = np.mgrid[: rays.shape[0], : rays.shape[1]]
+    off = field(np.stack([columns, rows], axis=-1) - pad - 0.5)
+    by_row, by_column = np.gradient(rays, axis=(0, 1))
+    return np.asarray(rays - by_column * off[..., :1] - by_row * off[..., 1:])
 
 
 def image_of(points_world: Array, view: View) -> Array:

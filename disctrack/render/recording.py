@@ -21,7 +21,7 @@ from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.render.images import Stage, TrueDisc, expected_board_image, expected_disc_image, stages
 from disctrack.render.sensor import digitise
 from disctrack.render.truth import Truth, write_truth
-from disctrack.scene.description import Scene
+from disctrack.scene.description import ImperfectionSettings, Scene
 from disctrack.scene.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
 
 Array = NDArray[np.float64]
@@ -194,11 +194,14 @@ def _write_all(images: list[_Image], scene: Scene, progress: Progress | None) ->
 
 
 def recording_toml(scene: Scene) -> str:
-    """What the experimenter declares: nothing of the scene's faults."""
+    """What the experimenter declares: nothing of the scene's faults.
+
+    A scene without imperfections is exact, and says so; with them, the tolerances are the usual ones.
+    """
     disc: Disc = scene.declared_disc
     centres = ", ".join(f"[{x:.4f}, {y:.4f}]" for x, y in scene.markers.centres_mm)
     board, cameras = scene.board, scene.cameras
-    return f"""\
+    text = f"""\
 # A recording of a disc rolling on a table. Lengths in mm, masses in g, times in s.
 name = "{scene.name}"
 
@@ -234,3 +237,6 @@ board_thickness_tolerance_mm = 0.0
 [gravity]
 g_m_s2 = {scene.gravity_m_s2!r}
 """
+    if scene.imperfections == ImperfectionSettings():
+        return text
+    return "".join(line for line in text.splitlines(keepends=True) if "_tolerance_" not in line)

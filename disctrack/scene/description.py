@@ -90,6 +90,18 @@ class LightSettings:
 
 
 @dataclass(frozen=True)
+class ImperfectionSettings:
+    """What every laboratory has and nobody declares; off by default. Lenses and sensors are drawn by the scene's seed."""
+
+    lens_field_px: float = 0.0  # rms per axis of a smooth displacement beyond the lens' polynomial
+    board_bow_mm: float = 0.0  # middle of the board above its short sides (negative: below)
+    board_stretch: float = 0.0  # relative, of the squares along the long side
+    pixel_gain: float = 0.0  # rms of the pixels' gains about 1
+    column_offset_dn: float = 0.0  # rms of the columns' offsets
+    response_curve: float = 0.0  # largest departure of grey values from a straight line, of full scale
+
+
+@dataclass(frozen=True)
 class AppearanceSettings:
     """Grey values of the surfaces under full light, and the table's texture (fixed to the world)."""
 
@@ -256,6 +268,7 @@ class Scene:
     board: BoardSettings = field(default_factory=BoardSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     faults: Faults = field(default_factory=Faults)
+    imperfections: ImperfectionSettings = field(default_factory=ImperfectionSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     folder: Path = Path()  # where files named in the scene are looked for; set by load_scene
 
@@ -324,6 +337,13 @@ def _check(scene: Scene, where: str) -> None:
         (scene.faults.exposure_s < 0, "faults.exposure_s", scene.faults.exposure_s, "0 or more"),
         (min(scene.cameras.image_size) < 16, "cameras.image_size", scene.cameras.image_size, "at least 16 x 16"),
         (min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"),
+        (
+            min(scene.imperfections.lens_field_px, scene.imperfections.pixel_gain, scene.imperfections.column_offset_dn)
+            < 0,
+            "imperfections",
+            "a negative rms",
+            "0 or more",
+        ),
         (scene.render.subpixels < 2, "render.subpixels", scene.render.subpixels, "2 or more"),
         (
             scene.motion.kind not in ("static", "table", "rolling"),
