@@ -91,7 +91,7 @@ class LightSettings:
 
 @dataclass(frozen=True)
 class ImperfectionSettings:
-    """What every laboratory has and nobody declares; off by default. Lenses and sensors are drawn by the scene's seed."""
+    """What every laboratory has and nobody declares; off by default. Lenses and sensors are drawn by the seed."""
 
     lens_field_px: float = 0.0  # rms per axis of a smooth displacement beyond the lens' polynomial
     board_bow_mm: float = 0.0  # middle of the board above its short sides (negative: below)

@@ -89,8 +89,9 @@ def table_from_disc(
     stated = V - 3.0 * np.outer(by_thickness, by_thickness)
     board = H @ rig.covariance @ H.T
     difference = np.linalg.solve(board + V, plane) @ plane
-    # where they differ by more than both sigmas, it is the board that bends and lies on dust
-    more = board + np.diag(np.maximum(plane**2 - np.diag(board + V), 0.0))
+    # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
+    allowed = np.diag(board + V)
+    more = board + np.diag(np.where(plane**2 > 9.0 * allowed, plane**2 - allowed, 0.0))
     gains = {"board": np.zeros((3, 3)), "disc": np.eye(3)}
     # of what the plane is as these cameras see the disc: errors that both share do not count
     gain = gains[source] if source in gains else more @ np.linalg.inv(more + V)
