@@ -26,6 +26,11 @@ ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the f
 MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 
 
+def prepare() -> None:
+    """Compile the fit of corners, or load it: some seconds once per installation, then nothing."""
+    fit_corners(np.zeros((8, 8)), np.zeros((0, 13)), np.zeros((0, N_CORNER)), np.zeros((0, 2)), np.zeros(2), 1, 1e-2)
+
+
 @dataclass(frozen=True)
 class CornerView:
     """Inner corners of one view, in the order of `Board.points`."""

@@ -9,6 +9,7 @@ import argparse
 import importlib
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 
 from disctrack import __version__
@@ -34,6 +35,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("disctrack.commands.simulate", "rolling model: scene -> motion, energies, contact forces"),
     "render": ("disctrack.commands.render", "scene -> recording as the cameras would write it, and its truth"),
     "convert": ("disctrack.commands.convert", "trajectory or rig from and to the formats of other programs"),
+    "warm-up": ("disctrack.commands.warm_up", "compile the inner loops ahead of the first recording"),
     "validate": ("disctrack.commands.validate", "render -> measure -> compare: the verdict on 0.005 mm / 0.05 deg"),
 }
 
@@ -44,6 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. Errors are one line on stderr."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
+        _keep_compiled_loops_somewhere()
         arguments = _parser(words).parse_args(words)
         if arguments.command is None:
             _parser([]).print_help()
@@ -61,6 +64,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
         return _tell(error)
+
+
+def _keep_compiled_loops_somewhere() -> None:
+    """Where neither the installation nor the user's home can be written to, numba would refuse to start."""
+    here = os.path.dirname(os.path.abspath(__file__))
+    if "NUMBA_CACHE_DIR" in os.environ or "numba" in sys.modules or os.access(here, os.W_OK):
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~")
+    if os.path.isdir(home) and os.access(home, os.W_OK):
+        return
+    name = f"disctrack-{os.getuid()}" if hasattr(os, "getuid") else "disctrack"
+    folder = os.path.join(tempfile.gettempdir(), name)
+    os.makedirs(folder, mode=0o700, exist_ok=True)
+    if hasattr(os, "getuid") and os.stat(folder).st_uid != os.getuid():  # compiled code of others is not run
+        folder = tempfile.mkdtemp(prefix=name)
+    os.environ["NUMBA_CACHE_DIR"] = folder
+    print(f"compiled inner loops are kept in {folder}: installation and home are read-only", file=sys.stderr)
 
 
 def _tell(error: Exception) -> int:

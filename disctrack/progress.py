@@ -57,6 +57,30 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
         yield lambda step: _show(f"{what}: {step} ...")
 
 
+@contextlib.contextmanager
+def compiling(what: str, seconds: int) -> Iterator[None]:
+    """Say on stderr what is compiled and for how long, unless it is over at once because it was compiled before.
+
+    seconds: of processor time that it took where it was measured.
+    """
+    began, over = time.perf_counter(), threading.Event()
+    told = f"compiling the inner loops of {what}: once per installation, about {seconds} s of a free core"
+
+    def tell() -> None:
+        if not over.wait(1.0):  # loading what was compiled before takes half a second
+            print(told, file=sys.stderr, flush=True)
+
+    telling = threading.Thread(target=tell, daemon=True)
+    telling.start()
+    try:
+        yield
+    finally:
+        over.set()
+        telling.join()
+    if time.perf_counter() - began > 2.0:
+        _tell(began, f"inner loops of {what} compiled")
+
+
 def _show(text: str) -> None:
     """One line that the next one replaces; nothing where stderr is no terminal."""
     if sys.stderr.isatty():

@@ -11,13 +11,14 @@ from pathlib import Path
 import h5py
 
 from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
+from calibration.corner_fit import prepare
 from calibration.rig_file import read_rig, write_rig
 from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import whole_file
-from disctrack.progress import progress_bar
+from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording
 from disctrack.track import summary
 
@@ -147,6 +148,8 @@ def _reusable(path: Path, provenance: Provenance) -> list[str] | None:
 
 
 def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:
+    with compiling("corners", 8):
+        prepare()
     with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
         done = 0
 

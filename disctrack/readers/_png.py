@@ -61,6 +61,12 @@ def decode_plain_grey(content: bytes, header: PngHeader, out: NDArray | None) ->
     return out
 
 
+def prepare() -> None:
+    """Compile what undoes the row filters, or load it."""
+    for raw in (bytes(2), bytearray(2)):  # what zlib gives, and libdeflate
+        _undo_filters(np.frombuffer(raw, np.uint8).reshape(1, 2), 1, np.empty((1, 1), np.uint8))
+
+
 def _inflated(stream: bytes, size: int) -> bytes | bytearray | None:
     """The `size` bytes that a zlib stream holds, never more; None where it holds another number or is damaged."""
     if deflate is not None:

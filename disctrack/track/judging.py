@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri  # scipy.stats would take a second to import
 
 from disctrack.frames import vector_from_rotation
 from disctrack.track.pose import PoseFits
@@ -29,7 +29,7 @@ SUSPECT = 1e-3  # below this chance a frame's covariance follows its residuals
 OUTLYING = 6.0  # times the median reduced chi-square: of 18 degrees of freedom one in 10^14
 GREATEST_BLOW = 3.0  # [m/s] by which the disc's velocity may change between two frames: a fall from half a metre
 MOST_STRUCK = 0.2  # part of a frame's dots that may be struck as outliers: more, and it is open which are right
-_USUAL_MEDIAN = {d: float(chi2.median(d)) for d in (6, 18)}
+_USUAL_MEDIAN = {d: float(chdtri(d, 0.5)) for d in (6, 18)}
 
 
 def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floating]) -> Array:
@@ -114,13 +114,13 @@ def judge_poses(
     usual = np.clip(_usual(reduced[:, None])[0][:, 0], 1.0, most)
     with np.errstate(invalid="ignore"):
         square = fits.chi_square / usual
-        chance = np.where(freedom > 0, chi2.sf(square, np.maximum(freedom, 1)), 1.0)
+        chance = np.where(freedom > 0, chdtrc(np.maximum(freedom, 1), square), 1.0)
         factor = np.where(chance < SUSPECT, square / np.maximum(freedom, 1), 1.0)
     left, right = one_sided_jumps(fits)
     moved = np.fmin(left, right)
     quiet = np.fmax(_usual(moved[:, None])[0][:, 0] / _USUAL_MEDIAN[6], 1.0)
     with np.errstate(invalid="ignore"):
-        jumped = moved / quiet > chi2.isf(CHANCE, 6) * 2.0  # the smaller of two, in motion that is not quite steady
+        jumped = moved / quiet > chdtri(6, CHANCE) * 2.0  # the smaller of two, in motion that is not quite steady
     total = fits.used.sum(axis=(1, 2)) + struck
     status[jumped | torn_off(fits, period, radius)] = FrameStatus.JUMPED
     status[(chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))] = FrameStatus.CONTRADICTED
@@ -197,6 +197,6 @@ def _at_rest(fits: PoseFits) -> NDArray[np.bool_]:
     step = np.column_stack([t[2:] - t[:-2], vector_from_rotation(R[2:] @ np.swapaxes(R[:-2], 1, 2))])
     good = np.isfinite(step).all(axis=1)
     square = np.einsum("ni,ni->n", step[good], np.linalg.solve((C[2:] + C[:-2])[good], step[good][..., None])[..., 0])
-    rest[np.flatnonzero(good) + 1] = square < chi2.isf(SUSPECT, 6)
+    rest[np.flatnonzero(good) + 1] = square < chdtri(6, SUSPECT)
     rest[-1] = rest[-2]
     return rest

@@ -18,6 +18,7 @@ from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
 from disctrack.files.trajectory_file import Provenance
 from disctrack.frames import CAMERAS
+from disctrack.progress import compiling
 from disctrack.readers import FrameReader, open_frames
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
@@ -138,7 +139,8 @@ def measure(
     rate = recording.frame_rate
 
     stamps = usable_times(pairs.left, rate)
-    prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)  # not the camera's time: done once per installation
+    with compiling("tracking", 20):  # not the camera's time: done once per installation
+        prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
     span = _span(pairs, rate, settings, threads)
     progress(len(pairs) - (span.stop - span.start))

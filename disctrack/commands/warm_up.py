@@ -1,0 +1,32 @@
+"""`disctrack warm-up`: compile the inner loops ahead of the first recording, as when the image of a cluster is made."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack warm-up`: none."""
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compile what reading, calibrating and tracking use; returns the exit code."""
+    import numpy as np
+
+    from calibration import corner_fit
+    from disctrack.commands import DONE
+    from disctrack.progress import compiling
+    from disctrack.readers import _png as png
+    from disctrack.track import _kernels as kernels
+    from disctrack.track.following import prepare
+
+    with compiling("readers", 1):
+        png.prepare()
+    with compiling("corners", 8):
+        corner_fit.prepare()
+    with compiling("tracking, 8 bit", 20):
+        prepare(np.uint8)
+    with compiling("tracking, 16 bit", 20):
+        prepare(np.uint16)
+    print(f"inner loops are compiled; kept in {kernels.track_frames.stats.cache_path}")
+    return DONE
