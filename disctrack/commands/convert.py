@@ -46,10 +46,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Convert; returns the exit code."""
     from disctrack.commands import DONE
     from disctrack.errors import OutputError
+    from disctrack.files.inputs import keep, refuse_input
 
     target: Path = arguments.target
+    for source in arguments.source:
+        keep(source)
     if target.exists() and not arguments.overwrite:
         raise OutputError(f"{target}: exists. Choose another name, or replace it with --overwrite.")
+    refuse_input(target)
     if target.suffix in TRAJECTORY:
         written = [_trajectory(arguments)]
     elif target.suffix == ".h5":
