@@ -78,7 +78,7 @@ def run_analyse(
 
     path = Path(path)
     keep(path)
-    folder = Path(output) if output is not None else path.with_name(f"{path.stem}_analysis")
+    folder = Path(output) if output is not None else path.parent / f"{path.stem}_analysis"
     if (folder / "report.html").exists() and not overwrite:
         raise OutputError(
             f"{folder / 'report.html'}: exists. Choose another folder with -o, or replace with --overwrite."

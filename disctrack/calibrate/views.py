@@ -144,7 +144,7 @@ def calibrate_views(
     table_view : index among all views; board_thickness [m]
     Raises RecordingError if the table view cannot be read, CalibrationError if the views do not allow a calibration.
     """
-    if table_view is not None and table_view >= len(views):
+    if table_view is not None and not 0 <= table_view < len(views):
         raise RecordingError(
             f"{views.place}: [table] view = {table_view}, but there are {len(views)} calibration views, "
             "counted from 0. Name the view whose board lies flat on the table."

@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     from disctrack.progress import stage
 
     path = arguments.trajectory
-    folder = arguments.output or path.with_name(f"{path.stem}_analysis")
+    folder = arguments.output or path.parent / f"{path.stem}_analysis"
     motion = folder / "motion.rrd"
     if arguments.rerun:
         from disctrack.analyse.viewer import require_rerun, write_rerun

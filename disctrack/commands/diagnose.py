@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     from disctrack.track import summary
 
     path = arguments.trajectory
-    folder = arguments.output or path.with_name(f"{path.stem}_diagnosis")
+    folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
     origin = origin_of(path, {"model": told_model})

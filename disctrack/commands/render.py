@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from disctrack.scene.description import load_scene
     from disctrack.scene.motion import effects_in_words
 
-    folder = arguments.output or arguments.scene.with_suffix("")
+    folder = arguments.output or arguments.scene.parent / arguments.scene.stem
     with tqdm(unit="image", file=sys.stderr, disable=arguments.quiet or None) as bar:
 
         def progress(done: int, total: int) -> None:

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise SceneError("no scene given: name a TOML file, or ask for the effects with --list-effects")
     from disctrack.scene.simulation import run_simulate
 
-    output = arguments.output or arguments.scene.with_name(f"{arguments.scene.stem}_motion.h5")
+    output = arguments.output or arguments.scene.parent / f"{arguments.scene.stem}_motion.h5"
     done = run_simulate(
         arguments.scene, output, duration=arguments.duration, rate=arguments.rate, overwrite=arguments.overwrite
     )

@@ -169,7 +169,7 @@ def run_diagnose(
     path = Path(path)
     keep(path)
     keep(Path(model))
-    folder = Path(output) if output is not None else path.with_name(f"{path.stem}_diagnosis")
+    folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"
     report = folder / "diagnosis.json"
     if report.exists() and not overwrite:
         raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")

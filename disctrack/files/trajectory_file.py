@@ -481,6 +481,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         gravity=float(file.attrs["gravity_m_s2"]),
     )
     _check_shapes(trajectory)
+    _check_values(trajectory)
     return trajectory
 
 
@@ -555,3 +556,28 @@ def _check_shapes(trajectory: Trajectory) -> None:
     for name, shape in expected.items():
         if getattr(trajectory, name).shape != shape:
             raise TrajectoryFileError(f"{name} has shape {getattr(trajectory, name).shape}; expected {shape}")
+
+
+_MOST_METRES, _MOST_RADIANS = 1e3, 1e6  # beyond, no disc was filmed and squares lose all digits
+
+
+def _check_values(trajectory: Trajectory) -> None:
+    """Raise ValueError, which names the first frame, where a value can be no measurement."""
+    frame, q, C = trajectory.frame, trajectory.q, trajectory.pose_covariance
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(trajectory.time)
+        far = (np.abs(q) > np.r_[[_MOST_METRES] * 3, [_MOST_RADIANS] * 3]) | np.isinf(q)
+    if not np.isfinite(trajectory.time).all() or (steps <= 0).any():
+        row = int(np.argmax(~(steps > 0))) + 1
+        raise ValueError(f"time does not increase at frame {frame[row]}: {trajectory.time[row]:g} s")
+    if far.any():
+        row, column = np.argwhere(far)[0]
+        raise ValueError(f"{COORDINATES[column]} of frame {frame[row]} is {q[row, column]:g}, which is no pose")
+    posed = np.flatnonzero(np.isfinite(q).all(axis=1))
+    sound: NDArray[np.bool_] = np.asarray(np.isfinite(C[posed]).all(axis=(1, 2)))
+    sound[sound] = np.linalg.eigvalsh(C[posed][sound])[:, 0] > 0
+    if not sound.all():
+        raise ValueError(f"pose_covariance of frame {frame[posed[int(np.argmin(sound))]]} is not positive definite")
+    sizes = (trajectory.disc.radius, trajectory.disc.half_thickness, trajectory.disc.mass, trajectory.frame_rate)
+    if not (np.isfinite(sizes).all() and min(sizes) > 0):
+        raise ValueError("radius, thickness, mass and frame rate must be above 0")

@@ -4,11 +4,12 @@ import errno
 import os
 import shutil
 
+import h5py
 import numpy as np
 import pytest
 
 from disctrack.cli import main
-from disctrack.errors import OutputError
+from disctrack.errors import DiscTrackError, OutputError
 from disctrack.files.trajectory_file import read_findings, read_trajectory
 from disctrack.render import recording as render_recording
 from disctrack.scene.description import Scene
@@ -25,11 +26,17 @@ def measured(recording, code: int = 0):
 
 
 @pytest.fixture(scope="session")
-def untouched(short_recording, rig_file, tmp_path_factory):
-    """Trajectory of the recording without any fault."""
+def untouched_file(short_recording, rig_file, tmp_path_factory):
+    """Trajectory file of the recording without any fault."""
     file = tmp_path_factory.mktemp("untouched") / "trajectory.h5"
     assert main(["track", str(short_recording), "--rig", str(rig_file), "-o", str(file), *QUICK]) == 0
-    return read_trajectory(file)
+    return file
+
+
+@pytest.fixture(scope="session")
+def untouched(untouched_file):
+    """Trajectory of the recording without any fault."""
+    return read_trajectory(untouched_file)
 
 
 def test_frames_missing_in_one_piece_are_lost_and_time_goes_on(recording, untouched):
@@ -109,3 +116,87 @@ def test_rendering_leaves_a_folder_alone_that_looks_like_a_remainder(tmp_path, m
     with pytest.raises(OutputError, match="disk full"):
         render_recording.write_recording(tmp_path / "take", Scene())
     assert contents(tmp_path) == {"take.part/notes.txt": b"mine"}
+
+
+SPOILT = {
+    "x is 1e+300": lambda file: file["x"].__setitem__(7, 1e300),
+    "z is -inf": lambda file: file["z"].__setitem__(7, -np.inf),
+    "time does not increase": lambda file: file["time"].__setitem__(7, 0.0),
+    "not positive definite": lambda file: file["pose_covariance"].__setitem__(7, 0.0),
+    "have a pose": lambda file: [file[name].__setitem__(..., np.nan) for name in ("x", "psi")],
+    "at rest": lambda file: [
+        file[name].__setitem__(..., file[name][0]) for name in ("x", "y", "z", "psi", "theta", "phi", "quaternion")
+    ],
+}
+
+
+@pytest.mark.parametrize("said", SPOILT)
+@pytest.mark.parametrize("command", ["analyse", "diagnose"])
+def test_a_value_that_is_no_measurement_is_told_in_a_sentence(untouched_file, tmp_path, capsys, command, said):
+    if (command, said) == ("analyse", "at rest"):
+        pytest.skip("the physics of a disc at rest can be told")
+    file = shutil.copy(untouched_file, tmp_path / "trajectory.h5")
+    with h5py.File(file, "r+") as handle:
+        SPOILT[said](handle)
+    assert main([command, str(file)]) == 1
+    errors = capsys.readouterr().err
+    assert "internal error" not in errors
+    assert said.split(" is ")[0] in errors or command == "diagnose"
+
+
+def test_a_table_view_below_zero_is_no_view(short_recording, tmp_path, capsys):
+    views = [str(short_recording / "calibration" / camera / "*.png") for camera in ("left", "right")]
+    words = ["--left", views[0], "--right", views[1], "--corners", "9x6", "--square-mm", "6", "--table-view=-1"]
+    assert main(["calibrate", *words, "-o", str(tmp_path / "rig.h5")]) == 1
+    assert "view = -1" in capsys.readouterr().err
+
+
+def numbers_in(file) -> list[str]:
+    """Names of the data sets that hold floating-point numbers."""
+    found: list[str] = []
+    file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
+    return [name for name in found if file[name].dtype.kind == "f"]
+
+
+VALUES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e300, -1e300, 1e-300, 5e-324, 1e6)
+
+
+@pytest.mark.parametrize("n", [15, pytest.param(400, marks=pytest.mark.slow)])
+def test_random_values_in_a_trajectory_file_end_in_a_result_or_a_sentence(untouched_file, tmp_path, n):
+    """The reader lets pass what can be worked with; every damage is one value, or a run of them, anywhere."""
+    rng = np.random.default_rng(14)
+    for _ in range(n):
+        file = shutil.copy(untouched_file, tmp_path / "trajectory.h5")
+        with h5py.File(file, "r+") as handle:
+            names = numbers_in(handle)
+            item = handle[names[rng.integers(len(names))]]
+            values = item[...].reshape(-1)
+            if not values.size:
+                continue
+            start = int(rng.integers(values.size))
+            values[start : start + int(rng.choice([1, 1, 6, values.size]))] = rng.choice(VALUES)
+            item[...] = values.reshape(item.shape)
+        try:
+            trajectory = read_trajectory(file)
+        except DiscTrackError:
+            continue
+        assert (np.diff(trajectory.time) > 0).all()
+        assert (np.abs(trajectory.q[trajectory.measured]) < 1e7).all()
+
+
+COMMANDS = ("run", "track", "analyse", "calibrate", "simulate", "render")
+WORDS = ("-o", "--frames", "--overwrite", "-1", "9x6", "nan", "1e400", "--threads", "--corners")
+WORDS += ("--square-mm", "::", "\0", "../..", "nowhere", "--rig", "é", "")
+
+
+@pytest.mark.parametrize("n", [60, pytest.param(3000, marks=pytest.mark.slow)])
+def test_random_command_lines_end_with_an_exit_code_and_no_internal_error(tmp_path, monkeypatch, capsys, n):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(41)
+    for _ in range(n):
+        words = [str(rng.choice(COMMANDS)), *(WORDS[i] for i in rng.integers(0, len(WORDS), rng.integers(0, 6)))]
+        try:
+            code = main(words)
+        except SystemExit as stop:
+            code = stop.code
+        assert code in (0, 1, 2), (words, capsys.readouterr().err)
