@@ -1,14 +1,16 @@
 """Speed of reading and tracking beside decoding alone and beside a plain OpenCV + SciPy script.
 
-    python tests/benchmarks/bench_tracking.py RECORDING [--rig RIG] [--threads N] [--repeats N]
+    python tests/benchmarks/bench_tracking.py RECORDING [--rig RIG] [--threads N] [--repeats N] [--json FILE]
 
 Prints pairs per second, processor time per pair and ratios. Every figure is the best of the repeats; on a busy machine
-trust the processor's time. Not a test: nothing fails here.
+trust the processor's time. With --json the figures are kept, and a file that is there is compared with first. Not a
+test: nothing fails here.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -34,15 +36,18 @@ def main() -> None:
     parser.add_argument("--rig", type=Path, help="default: RECORDING/results/rig.h5")
     parser.add_argument("--threads", type=int, default=default_threads())
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="keep the figures here; compared with what is there")
     arguments = parser.parse_args()
     recording = read_recording(arguments.recording)
     rig = read_rig(arguments.rig or recording.rig_file or recording.folder / "results" / "rig.h5")
     pairs = open_pairs(recording)
     cv2.setNumThreads(1)
-    report(recording, rig, pairs, arguments.threads, arguments.repeats)
+    timings = report(recording, rig, pairs, arguments.threads, arguments.repeats)
+    if arguments.json:
+        compare_and_keep(arguments.json, {t.what: 1e3 * t.processor / len(pairs) for t in timings})
 
 
-def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int, repeats: int) -> None:
+def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int, repeats: int) -> list[Timing]:
     n = len(pairs)
     memory = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(n)])
     from_memory: list[Tracking] = []
@@ -55,7 +60,9 @@ def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int
 
     track_memory(1)  # compiles
     track_files()
-    decode, reader, files, one, many, plain = (
+    target = np.empty_like(memory)
+    copy, decode, reader, files, one, many, plain = (
+        Timing.of("a copy of the frames' bytes in memory", lambda: np.copyto(target, memory), repeats),
         Timing.of(f"decode alone: cv2.imread, {threads} threads", lambda: decode_alone(pairs, threads), repeats),
         Timing.of(f"our reader alone, {threads} threads", lambda: read_alone(pairs, threads), repeats),
         Timing.of(f"reading + tracking, {threads} reading threads", track_files, repeats),
@@ -66,7 +73,8 @@ def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int
         ),
     )
     print(f"{recording.name}: {n} pairs of {memory.shape[3]} x {memory.shape[2]} px, {threads} threads")
-    for timing in (decode, reader, files, one, many, plain):
+    timings = [copy, decode, reader, files, one, many, plain]
+    for timing in timings:
         print(
             f"  {timing.what:<46} {n / timing.wall:7.0f} pairs/s  {1e3 * timing.processor / n:7.2f} ms of a core/pair"
         )
@@ -76,8 +84,21 @@ def report(recording: Recording, rig: StereoRig, pairs: ImagePairs, threads: int
         ("reading + tracking / decode alone (aim: 1.25)", files, decode),
         ("plain script / ours, frames in memory", plain, one),
         (f"1 worker / {threads} workers", one, many),
+        ("tracking, frames in memory / a copy of the bytes", one, copy),
     ):
         print(f"  {what:<46} {a.wall / b.wall:8.2f} {a.processor / b.processor:10.2f}")
+    return timings
+
+
+def compare_and_keep(file: Path, figures: dict[str, float]) -> None:
+    """Milliseconds of a core per pair beside those of an earlier run, then in its place."""
+    if file.exists():
+        earlier = json.loads(file.read_text())
+        print(f"  {'ms of a core/pair, now / earlier':<46}")
+        for what, now in figures.items():
+            if what in earlier:
+                print(f"  {what:<46} {now:8.3f} {earlier[what]:8.3f} {now / earlier[what]:8.2f}")
+    file.write_text(json.dumps(figures, indent=2) + "\n")
 
 
 @dataclass(frozen=True)
