@@ -47,17 +47,18 @@ def grey_values(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
     return image[..., :3] @ np.array([0.114, 0.587, 0.299]), ("colour image read as luminance",)
 
 
-def find_corners(image: NDArray, inner_corners: tuple[int, int]) -> CornerView | BoardNotFound:
+def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
     """Locate the inner corners of a chessboard.
 
     image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `grey_values`
     inner_corners : counts along the board's i and j; see `Board` for the order of the corners
+    thorough : search with OpenCV's slow finder where its quick one sees nothing
     """
     grey, notes = grey_values(image)
     step = level_step(grey)
     if step > 1:  # an image whose values are multiples of a step is that image, whatever the step
         grey = grey // step
-    start = _rough_corners(_as_8_bit(grey), inner_corners)
+    start = _rough_corners(_as_8_bit(grey), inner_corners, thorough)
     if start is None:
         columns, rows = inner_corners
         return BoardNotFound(
@@ -91,14 +92,14 @@ def _as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
     return np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.uint8)
 
 
-def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Array | None:
+def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thorough: bool) -> Array | None:
     """Corners (n, 2) [px] to about a pixel in any of the board's orders, or None."""
     scale = min(1.0, SEARCH_SIZE / max(grey.shape))
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(grey, inner_corners, None, flags)
-    if not found:
+    if not found and thorough:
         found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
     if not found or corners is None:
         return None

@@ -25,6 +25,7 @@ from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import BoardTolerances, with_tolerances
 
 CAMERA_NAMES = ("left", "right")
+SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
 MAX_LOST = 0.3  # share of one image's corners that do not fit the others: beyond, the view as a whole is at fault
 MAX_VIEW_RATIO = 5.0  # a view's misfit against the median view's: beyond, the board moved between the two exposures
 Progress = Callable[[str, int, int], None]
@@ -141,24 +142,35 @@ def calibrate_stereo(
     names = names or [(f"left {i}", f"right {i}") for i in range(len(left_images))]
     _check_sizes(left_images, right_images, names)
     settings = settings or CalibrationSettings()
-    total = 2 * len(left_images)
-    done = 0
-
-    def locate(image: NDArray) -> CornerView | BoardNotFound:
-        nonlocal done
-        try:
-            found = find_corners(image, board.inner_corners)
-        except ValueError as error:
-            found = BoardNotFound(str(error))
-        done += 1
-        if progress:
-            progress("corners", done, total)
-        return found
-
-    with ThreadPoolExecutor(settings.threads) as pool:
-        views = list(pool.map(locate, [*left_images, *right_images]))
+    views = _located([*left_images, *right_images], board, settings.threads, progress)
     n = len(left_images)
     return calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
+
+
+def _located(
+    images: Sequence[NDArray], board: Board, threads: int, progress: Progress | None
+) -> list[CornerView | BoardNotFound]:
+    """The board in every image. Where a sample over all of them shows none, the others are searched quickly first."""
+    views: dict[int, CornerView | BoardNotFound] = {}
+
+    def locate(index: int, thorough: bool) -> None:
+        try:
+            views[index] = find_corners(images[index], board.inner_corners, thorough)
+        except ValueError as error:
+            views[index] = BoardNotFound(str(error))
+        if progress:
+            progress("corners", len(views), len(images))
+
+    sample = np.unique(np.linspace(0, len(images) - 1, min(SAMPLE, len(images))).astype(int)).tolist()
+    others = [index for index in range(len(images)) if index not in sample]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(locate, sample, [True] * len(sample)))
+        promising = any(isinstance(view, CornerView) for view in views.values())
+        list(pool.map(locate, others, [promising] * len(others)))
+        if not promising and any(isinstance(view, CornerView) for view in views.values()):
+            again = [index for index in others if isinstance(views[index], BoardNotFound)]
+            list(pool.map(locate, again, [True] * len(again)))
+    return [views[index] for index in range(len(images))]
 
 
 def _check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:

@@ -60,6 +60,11 @@ def find_dots(image: Image, target: DotTarget) -> DotView:
     noise = _flat_noise(image, rough, 0.5 * radius * _scale(maps[0], lattice[0].astype(float)))
     found = locate_on_plane(image, maps, lattice.astype(float), radius, noise=noise)
     good = (found.status == MarkerStatus.MEASURED) & np.isfinite(found.pixels).all(-1)
+    if not good.any():
+        raise CalibrationError(
+            f"{len(lattice)} dots lie on one lattice, but none looks like a printed circle of "
+            f"{target.diameter * 1e3:g} mm at a pitch of {target.pitch * 1e3:g} mm: are diameter and pitch right, and the image sharp?"
+        )
     return DotView(lattice[good], found.pixels[good], found.covariance_px2[good])
 
 
@@ -177,11 +182,25 @@ def _scale(H: Array, at: Array) -> float:
 
 
 def _flat_noise(image: Image, centres: Array, half_px: float) -> NoiseModel:
-    """Noise inside the dots, from differences of neighbouring pixels: free of the light's gradient."""
-    half = max(int(0.5 * half_px), 3)
+    """Noise inside the dots and halfway to their neighbours, from differences of neighbouring pixels.
+
+    Differences are free of the light's gradient. Ink that is clipped to black has no noise: the paper tells.
+    """
+    distance = np.linalg.norm(centres[:, None] - centres, axis=-1) + np.where(np.eye(len(centres)), np.inf, 0.0)
+    between = 0.5 * (centres + centres[distance.argmin(axis=1)])
+    gap = 0.25 * float(np.median(distance.min(axis=1))) - 0.5 * half_px
+    ink, ink_level = _scatter(image, centres, max(int(0.5 * half_px), 3))
+    paper, paper_level = _scatter(image, between, max(int(gap), 1))
+    floor = max(ink, 1 / 12)
+    return NoiseModel(floor, max(0.02, (paper - floor) / max(paper_level, ink_level, 1.0)))
+
+
+def _scatter(image: Image, places: Array, half: int) -> tuple[float, float]:
+    """Variance and level of the grey values in squares round the places: medians over the places."""
     parts = []
-    for x, y in np.rint(centres).astype(int):
+    for x, y in np.rint(places).astype(int):
         patch = image[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1].astype(float)
         if patch.shape == (2 * half + 1, 2 * half + 1):
-            parts.append(0.5 * np.mean(np.diff(patch, axis=1) ** 2))
-    return NoiseModel(max(float(np.median(parts)), 1 / 12) if parts else 1.0, 0.02)
+            parts.append((0.5 * np.mean(np.diff(patch, axis=1) ** 2), patch.mean()))
+    variance, level = np.median(parts, axis=0) if parts else (1.0, 0.0)
+    return float(variance), float(level)
