@@ -63,7 +63,8 @@ def find_dots(image: Image, target: DotTarget) -> DotView:
     if not good.any():
         raise CalibrationError(
             f"{len(lattice)} dots lie on one lattice, but none looks like a printed circle of "
-            f"{target.diameter * 1e3:g} mm at a pitch of {target.pitch * 1e3:g} mm: are diameter and pitch right, and the image sharp?"
+            f"{target.diameter * 1e3:g} mm at a pitch of {target.pitch * 1e3:g} mm: are diameter "
+            "and pitch right, and the image sharp?"
         )
     return DotView(lattice[good], found.pixels[good], found.covariance_px2[good])
 
