@@ -25,7 +25,7 @@ from disctrack.readers import FrameReader, open_frames, split_member
 from disctrack.readers.camera_header import header_of
 from disctrack.readers.files import match_files
 from disctrack.readers.images import decode
-from disctrack.recording.declaration import FILE_NAME
+from disctrack.recording.declaration import FILE_NAME, OPTIONAL
 
 VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's
 LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
@@ -238,6 +238,7 @@ def declaration(found: Found, known: Mapping[str, float], example: Mapping[str, 
         line("disc", "radius_mm", None, "37.5", "caliper"),
         line("disc", "thickness_mm", None, "6.0", "caliper, with the paper"),
         line("disc", "mass_g", None, "209.69", "balance, with the paper"),
+        *_optional("disc", example),
         "",
         "[markers]                       # round dots on the upper face, all of one size",
         line("markers", "diameter_mm", None, "7.0", "as printed"),
@@ -246,14 +247,14 @@ def declaration(found: Found, known: Mapping[str, float], example: Mapping[str, 
             "[x, y] of every dot from the disc's centre",
         ),
         "",
-        *_calibration_lines(found, line),
+        *_calibration_lines(found, line, example),
         "[gravity]",
         line("gravity", "g_m_s2", example.get("gravity", {}).get("g_m_s2", 9.81), "9.81", "9.78 (equator) to 9.83"),
     ]  # fmt: skip
     return "\n".join(lines) + "\n", tuple(missing)
 
 
-def _calibration_lines(found: Found, line: Any) -> list[str]:
+def _calibration_lines(found: Found, line: Any, example: Mapping[str, Any]) -> list[str]:
     if found.views is None and found.rig_file is not None:
         return ["[calibration]", _aligned(f"rig = {_toml(found.rig_file)}", "a rig that was calibrated before"), ""]
     left, right = (None, None) if found.views is None else (found.views.left.pattern, found.views.right.pattern)
@@ -265,11 +266,23 @@ def _calibration_lines(found: Found, line: Any) -> list[str]:
         line("calibration", "right", right, '"calibration/right/*.png"', "the same views, in the same order"),
         line("calibration", "inner_corners", corners, "[9, 6]", f"long side first; {found.board_seen or 'count them'}"),
         line("calibration", "square_mm", None, "6.0", "side of a square, measured over many squares"),
+        *_optional("calibration", example),
         "",
         "[table]                         # the lab frame: k up from the table, which is z = 0",
         line("table", "view", 0, "0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
         line("table", "board_thickness_mm", None, "3.0", "height of the printed face above the table"),
+        *_optional("table", example),
         "",
+    ]
+
+
+def _optional(section: str, example: Mapping[str, Any]) -> list[str]:
+    """Keys with a default, where the example gives them."""
+    given = example.get(section, {})
+    return [
+        f"{key} = {_toml(given[key])}"
+        for home, key in sorted(OPTIONAL)
+        if home == section and key in given and key != "rig"
     ]
 
 
