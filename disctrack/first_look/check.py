@@ -7,7 +7,7 @@ Each step looks at one thing and adds remarks: `fix` would stop a run or spoil i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
 from disctrack.track.tracking import PairBlock, Tracking, TrackingSettings, track
-from disctrack.trajectory import MarkerStatus, Trajectory
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -237,8 +237,26 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
     _dots(seen, [tracking for _, tracking in done])
     _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
     _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
-    for text in dict.fromkeys(text for _, tracking in done for text in tracking.warnings):
+    if _exchanged(recording, rig, pairs, *done[0]):
+        seen.say("fix", "cameras", "left and right are exchanged: the dots of both make sense the other way round",
+                 "exchange left and right in [cameras], or in [calibration]")  # fmt: skip
+        return
+    told = {text[:40]: text for _, tracking in done for text in tracking.warnings}  # numbers differ from place to place
+    for text in told.values():
         seen.say("look", "physics", text)
+
+
+def _exchanged(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, tracking: Tracking) -> bool:
+    """True where one camera's dots make no sense as declared, and both cameras' do with the images exchanged."""
+    status = tracking.trajectory.frame_status
+    if np.mean(status == FrameStatus.MEASURED) > 0.5:
+        return False
+    some = frames[:SLIP_FRAMES]
+    try:
+        other = _track(recording, rig, replace(pairs, left=pairs.right, right=pairs.left), some).trajectory
+    except DiscTrackError:
+        return False
+    return bool(np.mean(other.frame_status == FrameStatus.MEASURED) > 0.9)
 
 
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:

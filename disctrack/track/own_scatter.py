@@ -138,7 +138,8 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, faults: SharedF
         share = systematic / whole * 2 * float(fits.used.sum()) / freedom  # the poses take their part of the residuals
         square = np.where(fits.used[..., None], fits.residuals_px**2, np.nan)
         # of a normal distribution the median square is 0.455 variances; smears and objects in view do not count
-        left, right = (float(np.sqrt(np.nanmedian(square[:, camera]) / 0.455 * share)) for camera in (0, 1))
+        seen = [square[:, camera][np.isfinite(square[:, camera])] for camera in (0, 1)]  # none: it sees no dot
+        left, right = (float(np.sqrt(np.median(one) / 0.455 * share)) if one.size else 0.0 for one in seen)
         rms = (left, right)
     return Scatter(max(1.0, whole), noise, systematic, (rms[0], rms[1]))
 

@@ -187,7 +187,7 @@ FAULTS = {
     "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "lowest point", 0),
     "cameras exchanged": (
         lambda f: declare(declare(f, 'left = "left/', 'left = "_') or f, 'right = "right/', 'right = "left/')
-        or declare(f, 'left = "_', 'left = "right/'), "exchanged", None,
+        or declare(f, 'left = "_', 'left = "right/'), "left and right are exchanged", 1,
     ),
     "one frame late": (renumber_right, "right frame i+1 show the same instant", 1),
 }  # fmt: skip
