@@ -59,8 +59,8 @@ class Tracker:
 
     rig, disc : of the set-up, from `read_rig` and a trajectory or recording
     settings  : limits and rejection as for recordings; nothing is refined over the sequence
-    The first pairs compile (once per installation) and search the disc; after that a pair of 512 x 512 px takes under
-    a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
+    The first pairs compile (once per installation) and search the disc; after that a pair takes
+    about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
     """
 
     def __init__(self, rig: StereoRig, disc: Disc, settings: tracker.TrackingSettings | None = None) -> None:
