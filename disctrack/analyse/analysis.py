@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.brief import Brief
 from disctrack.analyse.contact import Contact, analyse_contact
+from disctrack.analyse.declaration import contradictions
 from disctrack.analyse.derivatives import GROUP_NAMES, Motion, differentiate
 from disctrack.analyse.energy import Energy, analyse_energy
 from disctrack.analyse.power_laws import (
@@ -141,7 +142,7 @@ def _end_of_rolling(motion: Motion) -> tuple[float, float]:
 
 def _warnings(trajectory: Trajectory, motion: Motion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
     """What an experimenter should know before using the numbers, in plain words."""
-    found = []
+    found = [f"{finding.sentence}." for finding in contradictions(trajectory)]
     asked = trajectory.looked_for
     n, missing, unknown = (int(rows.sum()) for rows in (asked, asked & ~motion.measured, asked & ~motion.known))
     if missing:

@@ -14,6 +14,7 @@ from typing import Any
 from calibration.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
+from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
@@ -136,8 +137,9 @@ def _track(
 
     measurement = measure(recording, rig, pairs, threads=job.threads, progress=advance)
     provenance = trajectory_provenance(recording, rig, pairs, None)
-    storage.write_trajectory(path, measurement.trajectory, provenance, overwrite=True, findings=measurement.findings)
-    return measurement.trajectory, measurement.findings, provenance
+    findings = told(measurement.findings, contradictions_of(recording, measurement.trajectory))
+    storage.write_trajectory(path, measurement.trajectory, provenance, overwrite=True, findings=findings)
+    return measurement.trajectory, findings, provenance
 
 
 def _after_tracking(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.camera import StereoRig
+from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files import trajectory_file as storage
 from disctrack.files.whole import check_writable as check_writable
@@ -116,7 +117,8 @@ def track_into(
     if trajectory is None:
         with progress_bar("track", len(pairs), "pair") as advance:
             measurement = measure(recording, rig, pairs, options.settings, options.threads, advance)
-        trajectory, findings = measurement.trajectory, measurement.findings
+        trajectory = measurement.trajectory
+        findings = told(measurement.findings, contradictions_of(recording, trajectory))
         provenance = trajectory_provenance(recording, rig, pairs, options.settings)
         storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, findings=findings)
         lines.append(summary.speed_line(len(pairs), measurement.seconds))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
 from calibration.grey_levels import saturation_level
 from calibration.rig_file import read_rig
+from disctrack.analyse.declaration import contradictions, turned_board
 from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.first_look.declare import board_size, some_images
@@ -95,6 +97,9 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
         seen.say("fix", "declaration", str(error), "every key: disctrack/docs/recording-toml.md")
         return seen
     seen.say("fine", "declaration", f"{recording.file} is complete")
+    if recording.chessboard is not None:
+        for finding in turned_board(recording.chessboard.inner_corners):
+            seen.say("look", "declaration", finding.sentence)
     pairs = _frames(seen, recording)
     progress("chessboard")
     rig = _rig(seen, recording)
@@ -235,6 +240,11 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         "fine" if measured == total else "look", "dots", f"disc measured in {measured} of {total} frames looked at"
     )
     _dots(seen, [tracking for _, tracking in done])
+    whole = _together([tracking.trajectory for _, tracking in done])
+    square = None if recording.chessboard is None else recording.chessboard.square
+    for finding in contradictions(whole, recording.disc, square):
+        level = "fix" if finding.spoils or finding.check == "dot" else "look"
+        seen.say(level, "declaration", finding.sentence)
     _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
     _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
     if _exchanged(recording, rig, pairs, *done[0]):
@@ -281,16 +291,19 @@ class _Block:
     readable: NDArray[np.bool_]
 
 
+def _together(stretches: list[Trajectory]) -> Trajectory:
+    """The stretches one after the other, as one trajectory with gaps in time."""
+    first = stretches[0]
+    names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
+    joined: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in stretches]) for name in names}
+    return replace(first, **joined)
+
+
 def _dots(seen: Check, tracks: list[Tracking]) -> None:
-    """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
+    """A camera that measures no dot."""
     status = np.concatenate([tracking.trajectory.marker_status for tracking in tracks])
     with_pose = np.concatenate([tracking.trajectory.measured for tracking in tracks])
     seen_share = np.mean(status[with_pose] == MarkerStatus.MEASURED, axis=0) if with_pose.any() else np.zeros((2, 1))
-    for dot in np.flatnonzero(seen_share.max(axis=0) < 0.1):
-        kinds, counts = np.unique(status[with_pose][:, :, dot], return_counts=True)
-        reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")
-        seen.say("fix", "dots", f"dot {dot} of [markers] centres_mm is measured in no image ({reason})",
-                 "is its centre right, and its sign? Numbers count from 0, in the order of centres_mm")  # fmt: skip
     for camera, name in enumerate(CAMERAS):
         if seen_share[camera].max() < 0.1:
             seen.say("fix", "dots", f"the {name} camera measures no dot",

@@ -184,6 +184,12 @@ FAULTS = {
     "frames are missing": (lambda f: (f / "left/000017.png").unlink(), "missing", 0),
     "other corners": (lambda f: declare(f, "[9, 6]", "[8, 5]"), "inner_corners = [9, 6]", 1),
     "no dot there": (lambda f: declare(f, "[6.5000, -11.2583]", "[0.5, 0.5]"), "dot 5", 1),
+    "twice the rate": (
+        lambda f: declare(f, "frame_rate_hz = 1000.0", "frame_rate_hz = 2000.0"), "frame_rate_hz = 2000 would be", 1,
+    ),
+    "gravity in mm": (lambda f: declare(f, "g_m_s2 = 9.81", "g_m_s2 = 9810.0"), "if it was given in mm/s^2", 1),
+    "wrong square": (lambda f: declare(f, "square_mm = 6.0", "square_mm = 6.1"), "square_mm = 6.1 would be 6;", 1),
+    "short side first": (lambda f: declare(f, "[9, 6]", "[6, 9]"), "would be [9, 6]", 0),
     "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "lowest point", 0),
     "cameras exchanged": (
         lambda f: declare(declare(f, 'left = "left/', 'left = "_') or f, 'right = "right/', 'right = "left/')

@@ -1,0 +1,353 @@
+"""Physics against declaration: do the measured motion and the dots contradict a number that was declared?
+
+Three laws hold whatever the friction is, and each contains declared numbers:
+
+- moments about the centre along e1, where the only force is the table's, at the contact A:
+  e1 . (J alpha + omega x J omega) = e1 . (r_OA x m (a + g k)). Time is counted in frames, so that the gravity which
+  satisfies it goes as the square of the frame rate and as the radius; the mass cancels. It holds in rolling, in slip
+  and in the air; not while something else touches the disc, nor at rest on a patch.
+- rigidity: dots seen by both cameras are as far apart as their declared centres, on the scale of the chessboard.
+- geometry: the centre of a disc on its rim rises by r sin(theta) + h cos(theta).
+
+A finding names what was seen, what was expected, and the declared numbers that could be wrong, best explanation first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import triangulate
+from disctrack.analyse.contact import K
+from disctrack.analyse.derivatives import Motion, differentiate
+from disctrack.analyse.propagation import state_of
+from disctrack.disc import Disc
+from disctrack.errors import AnalysisError
+from disctrack.trajectory import MarkerStatus, Trajectory, part
+
+if TYPE_CHECKING:
+    from disctrack.recording.declaration import Recording
+
+Array = NDArray[np.float64]
+
+STANDARD_GRAVITY = 9.81  # [m/s^2]; 9.78 to 9.83 on the Earth's surface
+USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
+STRETCHES, STRETCH, BLOCK = 4, 200, 20  # stretches looked at, frames of each, frames whose median is one estimate
+MIN_BLOCKS = 5
+# Below, the disc may lie on a patch of its face and the weight has no arm; above, the arm of the weight is short.
+THETA_RANGE = np.radians(1.0), np.radians(60.0)
+MIN_TURN = 1.0  # [rad] of precession in a stretch: a disc that leans on something does not precess
+SIGMAS = 5.0
+# What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
+BALANCE = 0.10
+# Where fewer blocks are as near to their median, something else acts on the disc: a hand holds it, or it lies still.
+COHERENT, COHERENT_SHARE = 0.3, 0.8
+GROWTH, STEADY = 0.05, 0.7  # of the energy; share of the blocks in which it does: a push is short
+SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
+RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
+MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
+SEEN_RARELY = 0.1  # share of the images
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A declared number that could be wrong, and what it would have to be."""
+
+    key: str  # as in recording.toml
+    declared: str
+    would_be: str
+    misfit: float  # how far from an ordinary value that is, natural logarithm; the smaller, the better explained
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A contradiction between what was declared and what was seen."""
+
+    check: str  # "gravity and rate", "energy", "scale", "radius", "dot"
+    observed: str
+    expected: str
+    suspects: tuple[Suspect, ...]  # best explanation first
+    spoils: bool  # True where numbers of the result are wrong, not only fewer
+
+    @property
+    def sentence(self) -> str:
+        """For a summary."""
+        listed = "; ".join(
+            f"{s.key} = {s.declared} would be {s.would_be}" if s.would_be else f"{s.key} = {s.declared}"
+            for s in self.suspects
+        )
+        told = f"{self.observed}; expected {self.expected}"
+        return f"{told}. Could be wrong, likeliest first: {listed}" if listed else told
+
+    def as_dict(self) -> dict[str, Any]:
+        """Of JSON's types, with the sentence."""
+        return {**asdict(self), "suspects": [asdict(s) for s in self.suspects], "sentence": self.sentence}
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The gravity that satisfies the balance of moments, block by block; NaN where none is determined."""
+
+    gravity: float  # [m/s^2] median of the blocks
+    sigma: float  # [m/s^2] of it, from the blocks' scatter
+    coherent: float  # share of the blocks within COHERENT of the median
+    n_blocks: int
+    energy: Array  # (n_blocks,) [J] mechanical energy, in the order of time
+
+
+def contradictions(
+    trajectory: Trajectory, declared: Disc | None = None, square: float | None = None
+) -> tuple[Finding, ...]:
+    """Every check that this trajectory allows.
+
+    declared : the disc as declared, before its dots were refined
+    square : [m] of the chessboard as declared, where it is known
+    """
+    declared = declared or trajectory.disc
+    found = [*scale_of_dots(trajectory, declared, square), *unseen_dots(trajectory, declared)]
+    if trajectory.rig.world_is_table:
+        found += [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
+    return tuple(found)
+
+
+def contradictions_of(recording: Recording, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Every check that a recording and its trajectory allow."""
+    board = recording.chessboard
+    if board is None:
+        return contradictions(trajectory, recording.disc)
+    return (*contradictions(trajectory, recording.disc, board.square), *turned_board(board.inner_corners))
+
+
+def told(findings: Mapping[str, Any], found: Sequence[Finding]) -> dict[str, Any]:
+    """The findings of a run with these before its warnings; what spoils the result is in doubt, too (exit code 3)."""
+    sentences = [finding.sentence for finding in found]
+    doubts = [finding.sentence for finding in found if finding.spoils]
+    return {
+        **findings,
+        "declaration": [finding.as_dict() for finding in found],
+        "warnings": [*sentences, *findings.get("warnings", [])],
+        "doubts": [*doubts, *findings.get("doubts", [])],
+    }
+
+
+def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Gravity and frame rate, and an energy that grows, on some stretches of the recording."""
+    seen = balance(trajectory)
+    g = trajectory.gravity
+    if not (seen.n_blocks >= MIN_BLOCKS and seen.gravity > 0 and seen.coherent >= COHERENT_SHARE):
+        return ()
+    ratio = seen.gravity / g
+    if abs(np.log(ratio)) > np.log1p(BALANCE) and abs(seen.gravity - g) > SIGMAS * seen.sigma:
+        return (
+            Finding(
+                "gravity and rate",
+                f"the motion satisfies the balance of moments with a gravity of {seen.gravity:.4g} +- {seen.sigma:.1g} "
+                f"m/s^2 ({seen.n_blocks} stretches of {BLOCK} frames)",
+                f"{g:.4g} m/s^2 at {trajectory.frame_rate:g} frames a second, nothing but the table touching the disc",
+                _of_gravity(trajectory, ratio),
+                spoils=True,
+            ),
+        )
+    times = np.arange(seen.n_blocks)
+    slope, start = np.polyfit(times, seen.energy, 1)
+    sigma = _robust(seen.energy - slope * times - start) / (np.std(times) * np.sqrt(len(times)))
+    end = start + slope * times[-1]
+    steady = np.mean(np.diff(seen.energy) > 0) > STEADY
+    if end - start > GROWTH * start and slope > SIGMAS * sigma and steady:
+        return (
+            Finding(
+                "energy",
+                f"the mechanical energy grows from {1e3 * start:.4g} to {1e3 * end:.4g} mJ though no force but the "
+                "table's acts",
+                "a loss: the frames may be in reverse order",
+                (Suspect("[cameras] left, right", "the order of the files", "reversed", 0.0),),
+                spoils=True,
+            ),
+        )
+    return ()
+
+
+def _of_gravity(trajectory: Trajectory, ratio: float) -> tuple[Suspect, ...]:
+    """Which declared number would explain that the balance holds with `ratio` times the declared gravity."""
+    g, rate, r = trajectory.gravity, trajectory.frame_rate, trajectory.disc.radius
+    true_rate = rate / np.sqrt(ratio)
+    departures = np.abs(np.log(true_rate / USUAL_RATES))
+    nearest = int(np.argmin(departures))
+    usual = f" ({USUAL_RATES[nearest]:g} is usual)" if departures[nearest] < 0.05 else ""
+    unit = ", if it was given in mm/s^2" if abs(np.log(1e3 * ratio)) < 0.1 else ""
+    found = (
+        Suspect("[gravity] g_m_s2", f"{g:g}", f"{g * ratio:.4g}{unit}", abs(np.log(g * ratio / STANDARD_GRAVITY))),
+        Suspect("[cameras] frame_rate_hz", f"{rate:g}", f"{true_rate:.4g}{usual}", float(departures[nearest])),
+        Suspect("[disc] radius_mm", f"{1e3 * r:g}", f"{1e3 * r / ratio:.4g}", abs(np.log(ratio))),
+    )
+    return tuple(sorted(found, key=lambda s: s.misfit))
+
+
+def balance(trajectory: Trajectory) -> Balance:
+    """The gravity with which the moments about the centre balance along e1; see the module."""
+    gravity, energy = [], []
+    for rows in _stretches(trajectory):
+        try:
+            motion = differentiate(part(trajectory, rows))
+        except AnalysisError:
+            continue
+        g, e = _blocks(motion, BLOCK)
+        gravity.append(g)
+        energy.append(e)
+    found = np.concatenate([*gravity, np.empty(0)])
+    if not len(found):
+        return Balance(float("nan"), float("nan"), float("nan"), 0, found)
+    middle = float(np.median(found))
+    sigma = _robust(found) * np.sqrt(np.pi / 2 / len(found))
+    coherent = float(np.mean(np.abs(found - middle) < COHERENT * abs(middle)))
+    return Balance(middle, sigma, coherent, len(found), np.concatenate(energy))
+
+
+def _stretches(trajectory: Trajectory) -> list[slice]:
+    """Some stretches without a large gap in time, evenly spread over the frames in which the disc was measured."""
+    rows = np.flatnonzero(trajectory.measured)
+    if len(rows) < BLOCK:
+        return []
+    gaps = np.diff(trajectory.time[rows])
+    pieces = np.split(rows, np.flatnonzero(gaps > BLOCK * np.median(gaps)) + 1)
+    found = [
+        slice(int(start), int(min(start + STRETCH, piece[-1] + 1)))
+        for piece in pieces
+        for start in range(piece[0], piece[-1] + 1 - BLOCK, STRETCH)
+    ]
+    chosen = np.linspace(0, len(found) - 1, min(STRETCHES, len(found))).round().astype(int)
+    return [found[i] for i in chosen]
+
+
+def _blocks(motion: Motion, size: int) -> tuple[Array, Array]:
+    """Medians of gravity and energy over blocks of frames of one stretch, where the balance determines gravity."""
+    disc, state = motion.disc, state_of(motion)
+    m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
+    e1, e2, e3 = state.axes()
+    theta = np.arctan2(state.sine, e3[:, 2])
+    psi = motion.euler[:, 0]
+    good = motion.known & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
+    if good.sum() < size or np.ptp(psi[good]) < MIN_TURN:
+        return np.empty(0), np.empty(0)
+    arm = -disc.radius * e2 - disc.half_thickness * e3
+    along = np.sum(motion.omega_world * e3, axis=1)[:, None] * e3
+    spin = J1 * motion.omega_world + (J3 - J1) * along
+    change = J1 * motion.alpha_world + (J3 - J1) * np.sum(motion.alpha_world * e3, axis=1)[:, None] * e3
+    moment = change + np.cross(motion.omega_world, spin)
+    left = np.sum(e1 * (moment - m * np.cross(arm, motion.acceleration)), axis=1)
+    weight = m * np.sum(e1 * np.cross(arm, K), axis=1)
+    kinetic = 0.5 * m * np.sum(motion.velocity**2, axis=1) + 0.5 * np.sum(motion.omega_world * spin, axis=1)
+    energy = kinetic + m * motion.gravity * motion.position[:, 2]
+    gravity, energies = [], []
+    for start in range(0, len(motion) - size + 1, size):
+        rows = np.arange(start, start + size)[good[start : start + size]]
+        if len(rows) > size // 2:
+            gravity.append(float(np.sum(left[rows] * weight[rows]) / np.sum(weight[rows] ** 2)))
+            energies.append(float(np.mean(energy[rows])))
+    return np.array(gravity), np.array(energies)
+
+
+def _robust(values: Array) -> float:
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
+    """The radius from height against sin(theta), where the nutation varies enough."""
+    q = trajectory.q[trajectory.measured]
+    theta, disc = q[:, 4], trajectory.disc
+    q = q[(theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])]
+    if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < MIN_SWING:
+        return ()
+    s = np.sin(q[:, 4])
+    z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
+    slope, offset = np.polyfit(s, z, 1)
+    for _ in range(5):  # frames in the air, or a hand's, count less
+        left = np.abs(z - slope * s - offset)
+        slope, offset = np.polyfit(s, z, 1, w=1 / np.sqrt(1 + (left / (2 * np.median(left) + 1e-9)) ** 2))
+    scatter = _robust(z - slope * s - offset)
+    sigma = scatter / (np.std(s) * np.sqrt(len(s) / BLOCK))
+    ratio = float(slope / disc.radius)
+    if not (abs(ratio - 1) > RISE and abs(slope - disc.radius) > SIGMAS * sigma and scatter < RISE * disc.radius):
+        return ()
+    suspects = (
+        Suspect("[disc] radius_mm", f"{1e3 * disc.radius:g}", f"{1e3 * slope:.4g}", abs(np.log(abs(ratio)))),
+        Suspect("[calibration] square_mm", "as declared", f"{1 / ratio:.4g} times that", 2 * abs(np.log(abs(ratio)))),
+    )
+    seen = f"the centre rises by {1e3 * slope:.2f} +- {1e3 * sigma:.2f} mm per unit of sin(theta)"
+    return (Finding("radius", seen, f"the radius, {1e3 * disc.radius:.2f} mm", suspects, spoils=True),)
+
+
+def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
+    """Distances of the dots, by both cameras alone, over those of their declared centres."""
+    rows = np.flatnonzero(trajectory.measured)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 50)).astype(int)] if len(rows) else rows
+    good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
+    pixels = np.where(good[:, None, :, None], trajectory.markers_px[rows], np.nan)
+    n, _, dots, _ = pixels.shape
+    if not np.isfinite(pixels).any():
+        return ()
+    seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), trajectory.rig).reshape(n, dots, 3)
+    i, j = np.triu_indices(dots, 1)
+    expected = np.linalg.norm(declared.marker_centres_body[i] - declared.marker_centres_body[j], axis=1)
+    ratio = np.linalg.norm(seen[:, i] - seen[:, j], axis=2) / expected
+    per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
+    if len(per_pair) < MIN_BLOCKS:
+        return ()
+    scale, spread = float(np.median(per_pair)), _robust(per_pair)
+    # Pairs of dots share dots: as many are independent as there are dots.
+    sigma = spread / np.sqrt(dots)
+    if not (abs(scale - 1) > SCALE and abs(scale - 1) > SIGMAS * sigma):
+        return ()
+    off = abs(float(np.log(scale)))
+    board = Suspect("[calibration] square_mm", "as declared", f"{1 / scale:.4f} times that", off)
+    if square is not None:
+        side = 1e3 * square / scale
+        usual = abs(float(np.log(side / (max(round(2 * side), 1) / 2))))  # boards have squares of whole or half mm
+        board = Suspect("[calibration] square_mm", f"{1e3 * square:g}", f"{side:.4g}", min(usual, off))
+    dots_off = Suspect("[markers] centres_mm", "as declared", f"{scale:.4f} times those", off)
+    suspects = tuple(sorted((board, dots_off), key=lambda s: s.misfit))
+    seen_text = f"by both cameras the dots are {scale:.4f} +- {max(sigma, 1e-4):.1g} times as far apart as declared"
+    return (Finding("scale", seen_text, "1 (chessboard and dots on one scale)", suspects, spoils=True),)
+
+
+def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
+    """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
+    status = trajectory.marker_status[trajectory.measured]
+    if not len(status):
+        return ()
+    share = np.mean(status == MarkerStatus.MEASURED, axis=0).max(axis=0)
+    found = []
+    for dot in np.flatnonzero(share < SEEN_RARELY) if (share > 0.5).sum() >= 3 else ():
+        kinds, counts = np.unique(status[:, :, dot], return_counts=True)
+        reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")
+        x, y = 1e3 * declared.marker_centres_body[dot, :2]
+        found.append(
+            Finding(
+                "dot",
+                f"dot {dot} of [markers] centres_mm is measured in {100 * share[dot]:.0f} % of the images ({reason})",
+                "a dot there, as round and dark as the others (numbers count from 0)",
+                (Suspect(f"[markers] centres_mm, entry {dot}", f"[{x:g}, {y:g}]", "", 0.0),),
+                spoils=False,
+            )
+        )
+    return tuple(found)
+
+
+def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
+    """Corners counted along the short side first turn the axes of the table by 90 deg."""
+    first, second = inner_corners
+    if first >= second:
+        return ()
+    return (
+        Finding(
+            "board",
+            f"inner_corners = [{first}, {second}] counts along the short side first: x runs along the short side",
+            "the long side first, so that x runs along it",
+            (Suspect("[calibration] inner_corners", f"[{first}, {second}]", f"[{second}, {first}]", 0.0),),
+            spoils=False,
+        ),
+    )

@@ -1,0 +1,145 @@
+"""Declared numbers against the motion: true motions pass, and a wrong number is named first.
+
+The motions are integrated in conftest.py and the dots projected here by the pinhole formula: nothing is shared with
+the balance of moments under test.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disctrack.analyse.declaration import balance, contradictions, told, turned_board
+from disctrack.frames import rotation_from_quaternion
+from disctrack.trajectory import MarkerStatus, Trajectory
+
+HONEST = [  # theta [deg], seconds, losses, nutation, spin [rad/s]
+    (3.3, 0.3, 0.381e-7, 0.05, 0.0),
+    (10.0, 0.4, 0.381e-7, 0.2, 1.0),
+    (25.0, 0.4, 2e-7, 0.05, 3.0),
+    (45.0, 0.5, 0.0, 0.1, 0.0),
+]
+
+
+def at_another_rate(trajectory: Trajectory, factor: float) -> Trajectory:
+    """The same frames, declared to be `factor` times as many a second."""
+    return replace(trajectory, frame_rate=trajectory.frame_rate * factor, time=trajectory.time / factor)
+
+
+@pytest.fixture(scope="module")
+def honest(true_motion, as_tracked):
+    return as_tracked(true_motion(8.0, 0.3, nutation=0.1), np.random.default_rng(4))
+
+
+@pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
+def test_honest_motions_are_not_contradicted(theta, seconds, k_m, nutation, spin, true_motion, as_tracked):
+    motion = true_motion(theta, seconds, k_m, nutation, spin=spin)
+    trajectory = as_tracked(motion, np.random.default_rng(1), missing=range(50, 58))
+    seen = balance(trajectory)
+    assert contradictions(trajectory) == ()
+    assert seen.n_blocks >= 12
+    assert abs(seen.gravity / 9.81 - 1) < max(5 * seen.sigma / 9.81, 2e-3)
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5, 1.1, 0.9])
+def test_a_wrong_frame_rate_is_named_with_the_true_one(factor, honest):
+    (finding,) = contradictions(at_another_rate(honest, factor))
+    first = finding.suspects[0]
+    assert first.key == "[cameras] frame_rate_hz"
+    assert abs(float(first.would_be.split()[0]) / 1000.0 - 1) < 2e-3
+    assert "(1000 is usual)" in finding.sentence
+    assert finding.spoils
+
+
+@pytest.mark.parametrize(("gravity", "hint"), [(9810.0, "mm/s^2"), (1.62, ""), (98.1, "")])
+def test_a_wrong_gravity_is_named_with_the_true_one(gravity, hint, honest):
+    (finding,) = contradictions(replace(honest, gravity=gravity))
+    assert finding.suspects[0].key == "[gravity] g_m_s2"
+    assert abs(float(finding.suspects[0].would_be.split(",")[0]) / 9.81 - 1) < 2e-3
+    assert hint in finding.sentence
+
+
+def test_departures_that_a_table_or_an_edge_may_make_are_no_contradiction(honest):
+    assert contradictions(at_another_rate(honest, 1.03)) == ()
+    assert contradictions(replace(honest, gravity=9.81 * 0.95)) == ()
+
+
+def test_a_film_that_runs_backwards_gains_energy(true_motion, as_tracked):
+    motion = true_motion(3.3, 0.3)
+    forwards = as_tracked(motion, np.random.default_rng(2))
+    backwards = replace(forwards, q=forwards.q[::-1], quaternion=forwards.quaternion[::-1])
+    assert contradictions(forwards) == ()
+    (finding,) = contradictions(backwards)
+    assert finding.check == "energy"
+    assert "reverse order" in finding.sentence
+
+
+def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracked, true_motion):
+    """What the table's force alone does not explain says nothing about gravity."""
+    motion = true_motion(10.0, 0.4)
+    psi = 20.0 * motion.time
+    axes = np.stack([np.cos(psi), np.sin(psi), 0 * psi], -1)
+    e3 = np.stack([np.sin(psi) * 0.2, -np.cos(psi) * 0.2, np.full(len(psi), np.sqrt(0.96))], -1)
+    held = replace(motion, R=np.stack([axes, np.cross(e3, axes), e3], -1), position=motion.position[:1] + 0 * e3)
+    resting = replace(held, R=np.broadcast_to(held.R[0], held.R.shape))
+    for motion in (held, resting):
+        assert not [f for f in contradictions(as_tracked(motion, np.random.default_rng(3))) if f.check != "radius"]
+
+
+def test_a_wrong_radius_is_seen_where_the_nutation_varies(true_motion, as_tracked):
+    rng = np.random.default_rng(5)
+    trajectory = as_tracked(true_motion(30.0, 0.3, nutation=0.5), rng)
+    assert np.ptp(np.sin(trajectory.q[:, 4])) > 0.05
+    assert contradictions(trajectory) == ()
+    (finding,) = contradictions(replace(trajectory, disc=replace(trajectory.disc, radius=35.0e-3)))
+    assert (finding.check, finding.suspects[0].key) == ("radius", "[disc] radius_mm")
+    assert abs(float(finding.suspects[0].would_be) / 37.5 - 1) < 5e-3
+
+
+def with_dots(trajectory: Trajectory, scale: float, unseen: tuple[int, ...] = ()) -> Trajectory:
+    """Half a metre before the cameras, with the images of dots `scale` times as far apart as declared."""
+    R = rotation_from_quaternion(trajectory.quaternion)
+    points = scale * trajectory.disc.marker_centres_body @ R.swapaxes(1, 2)
+    points = points + trajectory.q[:, None, :3] + [0.0, 0.0, 0.5]
+    pixels = np.stack([1000.0 * (points + t)[..., :2] / points[..., 2:] + 255.5 for t in ([0, 0, 0], [-0.2, 0, 0])], 1)
+    status = np.full(pixels.shape[:3], MarkerStatus.MEASURED, np.uint8)
+    status[:, :, list(unseen)] = MarkerStatus.LOW_CONTRAST
+    pixels = pixels + np.random.default_rng(6).normal(0, 0.03, pixels.shape)
+    return replace(trajectory, markers_px=pixels, marker_status=status)
+
+
+@pytest.mark.parametrize("scale", [6.0 / 6.1, 6.1 / 6.0])
+def test_a_chessboard_of_another_scale_is_told_from_the_dots(scale, honest):
+    (finding,) = contradictions(with_dots(honest, scale))
+    assert finding.check == "scale"
+    square = next(s for s in finding.suspects if s.key == "[calibration] square_mm")
+    assert abs(float(square.would_be.split()[0]) * scale - 1) < 1e-3
+
+
+def test_the_true_square_of_a_board_is_named_first(honest):
+    (finding,) = contradictions(with_dots(honest, 6.1 / 6.0), square=6.1e-3)
+    assert finding.suspects[0].key == "[calibration] square_mm"
+    assert abs(float(finding.suspects[0].would_be) - 6.0) < 5e-3
+
+
+def test_dots_on_the_boards_scale_but_for_printing_are_fine(honest):
+    assert contradictions(with_dots(honest, 1.0)) == contradictions(with_dots(honest, 1.002)) == ()
+
+
+def test_a_dot_that_is_never_seen_is_named(honest):
+    (finding,) = contradictions(with_dots(honest, 1.0, unseen=(1,)))
+    assert "dot 1 of [markers] centres_mm is measured in 0 % of the images (low contrast)" in finding.sentence
+    assert "[13, 22.5167]" in finding.sentence
+
+
+def test_corners_counted_along_the_short_side_first_turn_the_table():
+    assert turned_board((9, 6)) == turned_board((7, 7)) == ()
+    assert "[9, 6]" in turned_board((6, 9))[0].sentence
+
+
+def test_findings_carry_what_is_wrong_into_warnings_and_doubts(honest):
+    found = contradictions(with_dots(at_another_rate(honest, 2.0), 1.0, unseen=(0,)))
+    run = told({"warnings": ["one"], "doubts": [], "notes": []}, found)
+    assert len(run["warnings"]) == 3
+    assert len(run["doubts"]) == 1, "a dot that is not seen costs precision, a rate spoils every velocity"
+    assert [item["check"] for item in run["declaration"]] == ["dot", "gravity and rate"]
