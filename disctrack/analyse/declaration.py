@@ -36,11 +36,11 @@ Array = NDArray[np.float64]
 
 STANDARD_GRAVITY = 9.81  # [m/s^2]; 9.78 to 9.83 on the Earth's surface
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
-STRETCHES, STRETCH, BLOCK = 4, 200, 20  # stretches looked at, frames of each, frames whose median is one estimate
+STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, frames whose median is one estimate
 MIN_BLOCKS = 5
 # Below, the disc may lie on a patch of its face and the weight has no arm; above, the arm of the weight is short.
 THETA_RANGE = np.radians(1.0), np.radians(60.0)
-MIN_TURN = 1.0  # [rad] of precession in a stretch: a disc that leans on something does not precess
+MIN_TURN = 0.5  # [rad] of precession in a stretch: a disc that leans on something does not precess
 SIGMAS = 5.0
 # What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
 BALANCE = 0.10
