@@ -100,11 +100,14 @@ def refine_stereo(
         if settled or turn == MAX_ROUNDS - 1:  # what is returned belongs to the points that were fitted
             break
         kept = new_kept
-    # noise and points are settled: now the minimum itself
-    problem = replace(problem, weights=inverse_covariance(used.covariance, extra))
-    minimum = minimise(problem, model, damping=1e-6)
-    model, total = minimum.model, total + minimum.iterations
-    residuals = observations.pixels - predict(model, observations)[0]
+    # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that
+    # nothing is left of where the rough rounds happened to stop
+    for _ in range(2):
+        problem = replace(problem, weights=inverse_covariance(used.covariance, extra))
+        minimum = minimise(problem, model, damping=1e-6)
+        model, total = minimum.model, total + minimum.iterations
+        residuals = observations.pixels - predict(model, observations)[0]
+        final, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
     own = _mahalanobis2(residuals[kept], observations.covariance[kept], 0.0)
     return Refinement(
         model=model,
@@ -112,7 +115,7 @@ def refine_stereo(
         observations=observations,
         kept=kept,
         residuals=residuals,
-        unexplained_sigma=float(np.sqrt(extra)),
+        unexplained_sigma=float(np.sqrt(final)),
         chi_square=float(own.sum() / dof),
         normal=minimum.normal,
         problem=problem,

@@ -84,6 +84,7 @@ class Search:
     """What may be spent on searching for the disc, and what the images showed where it was not found."""
 
     credit: int = 8  # searches that may be made
+    always: bool = False  # whatever it costs
     earned: int = 0  # frames towards the next
     failures: int = 0  # in succession
     since: int = 0  # frames since the last of them
@@ -103,6 +104,8 @@ class Search:
         A disc that was seen before comes out from behind a hand after some frames: the wait grows by one with every
         failure. Where none was seen yet, the pair (2, height, width) must show something new, or the wait doubles.
         """
+        if self.always:
+            return True
         if self.credit == 0 or (self.failures and self.since < self.failures):
             return False
         if seen or self.scenes is None or self.since >= min(2**self.failures, FRAMES_PER_SEARCH) or not readable.all():

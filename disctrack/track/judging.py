@@ -117,14 +117,17 @@ def judge_poses(
         chance = np.where(freedom > 0, chdtrc(np.maximum(freedom, 1), square), 1.0)
         factor = np.where(chance < SUSPECT, square / np.maximum(freedom, 1), 1.0)
     left, right = one_sided_jumps(fits)
-    moved = np.fmin(left, right)
-    quiet = np.fmax(_usual(moved[:, None])[0][:, 0] / _USUAL_MEDIAN[6], 1.0)
+    moved = np.fmin(np.fmin(left, right), between_neighbours(fits))
+    rest = _at_rest(fits)
+    # a disc at rest does not tell how smooth its motion will be
+    usual_move = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
+    quiet = np.fmax(usual_move / _USUAL_MEDIAN[6], 1.0)
     with np.errstate(invalid="ignore"):
         jumped = moved / quiet > chdtri(6, CHANCE) * 2.0  # the smaller of two, in motion that is not quite steady
     total = fits.used.sum(axis=(1, 2)) + struck
     status[jumped | torn_off(fits, period, radius)] = FrameStatus.JUMPED
     status[(chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))] = FrameStatus.CONTRADICTED
-    status[repeated & ~_at_rest(fits)] = FrameStatus.REPEATED
+    status[repeated & ~_still_over_the_repeats(repeated, rest)] = FrameStatus.REPEATED
     status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge
     return Verdicts(status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0))
 
@@ -137,6 +140,29 @@ def one_sided_jumps(fits: PoseFits) -> tuple[Array, Array]:
     is no pose, or no three neighbours on that side.
     """
     return _jumps_from(fits, -1), _jumps_from(fits, 1)
+
+
+def between_neighbours(fits: PoseFits) -> Array:
+    """Squared distance (n,) of each pose, in its sigmas, from the cubic through two neighbours on either side.
+
+    It follows a motion that changes quickly from frame to frame far better than what is carried on from one side; only
+    a blow within these five frames is not smooth enough. NaN where a neighbour has no pose.
+    """
+    n, R, t, C = len(fits.converged), fits.R_world_body, fits.t_world_body, fits.covariance
+    square = np.full(n, np.nan)
+    rows = np.arange(2, n - 2)
+    near = rows[:, None] + np.array([-2, -1, 1, 2])
+    good = fits.converged[near].all(axis=1) & fits.converged[rows]
+    rows, near = rows[good], near[good]
+    if not len(rows):
+        return square
+    weights = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
+    turn = vector_from_rotation(R[near] @ np.swapaxes(R[rows], 1, 2)[:, None])  # from the frame itself
+    shift = t[near] - t[rows][:, None]
+    away = np.einsum("k,nki->ni", weights, np.concatenate([shift, turn], axis=2))
+    spread = C[rows] + np.einsum("k,nkij->nij", weights**2, C[near])
+    square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
+    return square
 
 
 def _jumps_from(fits: PoseFits, side: int) -> Array:
@@ -186,6 +212,22 @@ def torn_off(fits: PoseFits, period: float, radius: float) -> NDArray[np.bool_]:
         shorter = piece if length[piece] < length[piece - 1] else piece - 1
         refused[edges[shorter] : edges[shorter + 1]] = True
     return refused & good
+
+
+def _still_over_the_repeats(repeated: NDArray[np.bool_], rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) True in repeats of a disc that lies still; False where a recorder stuck while the disc moved.
+
+    One repeat is still where the frames around it are. In a longer run the frames in between are alike whatever the
+    disc did: it is still where rest, or the recording's end, lies on one side of it.
+    """
+    n = len(repeated)
+    edges = np.flatnonzero(np.diff(np.r_[False, repeated, False].astype(int)))
+    still = np.zeros(n, bool)
+    for first, end in edges.reshape(-1, 2):  # a handful, if any
+        before, after = first - 2, end  # `rest` of a frame is about the frames on both sides of it
+        alone = end - first == 1
+        still[first:end] = rest[first] if alone else before < 0 or after >= n or rest[before] or rest[after]
+    return still
 
 
 def _at_rest(fits: PoseFits) -> NDArray[np.bool_]:

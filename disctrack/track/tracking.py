@@ -28,6 +28,7 @@ from disctrack.track.following import (
     Follower,
     Images,
     Law,
+    Search,
     Setup,
     Tables,
     clear,
@@ -84,6 +85,7 @@ class TrackingSettings:
     )
     reject_outliers: bool = True
     table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
+    search_always: bool = False  # at every frame where the disc is lost, whatever it costs: for single, unrelated poses
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (first_pass.py)
 
 
@@ -142,7 +144,7 @@ def track(
     maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
     edges = stretch_edges(pairs, disc)
     setup = Setup(rig, disc, settings.limits, maps_x, maps_y)
-    followers = [Follower(setup) for _ in edges[1:]]
+    followers = [Follower(setup, search=Search(always=settings.search_always)) for _ in edges[1:]]
     for number, follower in enumerate(followers):
         follower.given = partial(_first_law, followers[:number])
 

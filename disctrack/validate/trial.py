@@ -26,7 +26,7 @@ from disctrack.recording.declaration import Recording, read_recording
 from disctrack.render import Truth, rig_of, write_recording
 from disctrack.scene.description import MotionSettings, RollingMotion, Scene
 from disctrack.scene.motion import SceneMotion, motion_of
-from disctrack.track.tracking import Tracking, track
+from disctrack.track.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import Trajectory
 from disctrack.validate.comparison import Comparison, compare
 from disctrack.validate.poses import cameras_in_sight, static_poses
@@ -211,7 +211,8 @@ def locate(images: Images, rig: StereoRig, disc: Disc, frame_rate: float, *, apa
             pairs[real] = images[frames[real] // step]
             yield Pairs(frames, pairs, np.repeat(real[:, None], 2, axis=1))
 
-    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate)
+    settings = TrackingSettings(search_always=apart)
+    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate, settings=settings)
 
 
 def every(trajectory: Trajectory, step: int) -> Trajectory:

@@ -82,7 +82,8 @@ def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short
     assert "not valid TOML" in lines[0]
     assert "000005.png" in lines[2]
     assert "2 measured, 1 failed" in said
-    assert errors.count("\n") == 1  # no bar where stderr is no terminal
+    assert "\r" not in errors  # no bar where stderr is no terminal, but a line for each recording that ends
+    assert errors.count("measured\n") == 2
     assert len(list((root / "batch_results" / "rigs").rglob("rig.h5"))) == 1
 
     rows = {row["recording"]: row for row in read_summary(root / "batch_results" / "summary.json")}
