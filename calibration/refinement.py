@@ -104,7 +104,7 @@ def refine_stereo(
     # nothing is left of where the rough rounds happened to stop
     for _ in range(2):
         problem = replace(problem, weights=inverse_covariance(used.covariance, extra))
-        minimum = minimise(problem, model, damping=1e-6)
+        minimum = minimise(problem, model, tolerance=1e-14, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict(model, observations)[0]
         final, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
