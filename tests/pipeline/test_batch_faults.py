@@ -156,7 +156,8 @@ def test_a_batch_killed_at_fifty_instants_leaves_only_whole_results_and_can_go_o
     assert len(died) > 1  # kills fell into different stages of a batch
 
 
-def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(day):
+def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_path):
+    day = a_day(recording, tmp_path / "day", tuple("abcdefgh"))  # more than are done while this process looks
     process = start(day)
     wait_until(lambda: begun(day), process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes
