@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.camera import N_INTRINSIC, Array, StereoRig
+from calibration.arrays import Array
+from calibration.camera import N_INTRINSIC, StereoRig
 from calibration.errors import CalibrationError
 from calibration.model_choice import Candidate
 from calibration.normal_equations import Problem, minimise

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import Array
+from calibration.arrays import Array
 from calibration.corner_fit import CornerView, fit_view, local_axes
 from calibration.grey_levels import level_step
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration._corner_kernel import N_CORNER, fit_corners
-from calibration.camera import Array
+from calibration.arrays import Array, Mask
 from calibration.robust_corners import LEAST_SIGMA, saddle_points, smooth_grid
 
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
@@ -38,7 +38,7 @@ class CornerView:
     image_size: tuple[int, int]  # width, height [px]
     points: Array  # (n, 2) [px]
     covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
-    accepted: NDArray[np.bool_]  # (n,)
+    accepted: Mask  # (n,)
     reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds
     chi_square: Array  # (n,) reduced, of the pixels on the edges; NaN where a saddle point stands in for their fit
     contrast: Array  # (n,) light minus dark [grey]
@@ -90,7 +90,7 @@ class _Fit:
     found: Array
     covariance: Array
     sums: Array
-    converged: NDArray[np.bool_]
+    converged: Mask
 
     @property
     def chi_square(self) -> Array:
@@ -120,7 +120,7 @@ def _with_smaller_windows(
     return fit
 
 
-def _grid_homography(points: Array, ok: NDArray[np.bool_], inner_corners: tuple[int, int]) -> Array:
+def _grid_homography(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
     columns, rows = inner_corners
     j, i = np.mgrid[:rows, :columns]
     board = np.stack([i.ravel(), j.ravel()], axis=-1).astype(float)
@@ -130,7 +130,7 @@ def _grid_homography(points: Array, ok: NDArray[np.bool_], inner_corners: tuple[
     return np.asarray(H, float)
 
 
-def local_axes(points: Array, ok: NDArray[np.bool_], inner_corners: tuple[int, int]) -> Array:
+def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
     """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
     columns, rows = inner_corners
     H = _grid_homography(points, ok, inner_corners)
@@ -218,7 +218,7 @@ def _measured_noise(sums: Array) -> Array:
     return np.array([low - slope * dark[1], slope])
 
 
-def _line_curvature(points: Array, ok: NDArray[np.bool_], angles: Array, inner_corners: tuple[int, int]) -> Array:
+def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple[int, int]) -> Array:
     """Bend of the board's lines at every corner (n, 2) [1/px], half the second derivative across each edge.
 
     A parabola along each row and column of corners: lens distortion bends a line by far less than a corner's own

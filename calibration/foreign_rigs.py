@@ -18,7 +18,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.camera import Array, Camera, StereoRig
+from calibration.arrays import Array
+from calibration.camera import Camera, StereoRig
 from calibration.errors import RigFileError
 
 MRCAL_MODELS = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5}

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.camera import Array
+from calibration.arrays import Array
 from calibration.normal_equations import inverse_covariance
 from calibration.refinement import Refinement, refine_stereo
 from calibration.splines import LensField, spline_weights

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import Array
+from calibration.arrays import Array, Mask
 from calibration.normal_equations import Problem, inverse_covariance, minimise
 from calibration.refinement import Refinement, refine_stereo
 from calibration.stereo_model import (
@@ -42,7 +42,7 @@ class Candidate:
 
 
 def held_out(
-    refinement: Refinement, sigma: float, good: NDArray[np.bool_]
+    refinement: Refinement, sigma: float, good: Mask
 ) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
     """Per view, each view left out in turn: chi-square (truncated) of all points, squared distance [px^2] of good ones.
 
@@ -89,7 +89,7 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
     return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7).model
 
 
-def candidate(refinement: Refinement, sigma: float, good: NDArray[np.bool_]) -> Candidate:
+def candidate(refinement: Refinement, sigma: float, good: Mask) -> Candidate:
     """The row of one fitted model; see `held_out`."""
     chi2, square, count, good_count = held_out(refinement, sigma, good)
     with np.errstate(invalid="ignore"):

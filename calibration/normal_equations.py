@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.camera import Array
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved, predict
 

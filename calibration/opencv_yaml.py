@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.camera import Array, Camera, StereoRig
+from calibration.arrays import Array
+from calibration.camera import Camera, StereoRig
 from calibration.errors import RigFileError
 
 MAX_BYTES = 10_000_000  # a rig has a few kB

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.camera import Array
+from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.model_choice import fit_poses
 from calibration.refinement import Refinement, refine_stereo
@@ -29,8 +28,8 @@ def view_rms(observations: Observations, model: StereoModel) -> Array:
 
 
 def readmitted(
-    observations: Observations, start: StereoModel, nominal: Array, agrees: NDArray[np.bool_], ratio: float
-) -> tuple[StereoModel, NDArray[np.bool_]]:
+    observations: Observations, start: StereoModel, nominal: Array, agrees: Mask, ratio: float
+) -> tuple[StereoModel, Mask]:
     """Start model and views (n_views,) that fit it within `ratio` times the median of those that agreed at first.
 
     The pose of a board in one camera alone, from rough intrinsics, may be degrees off; both cameras together tell.

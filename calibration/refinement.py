@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.camera import Array
+from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.stereo_model import Observations, StereoModel, Terms, board_basis, predict, restricted
@@ -26,7 +25,7 @@ class Refinement:
     model: StereoModel
     terms: Terms
     observations: Observations  # all that were given
-    kept: NDArray[np.bool_]  # (m,)
+    kept: Mask  # (m,)
     residuals: Array  # (m, 2) observed - predicted [px], of the rejected ones too
     unexplained_sigma: float  # [px per axis] added to the corners' own noise so that the residuals are explained
     chi_square: float  # reduced, with the points' own covariances alone
@@ -40,7 +39,7 @@ class Refinement:
         """Kept coordinates minus parameters."""
         return _degrees_of_freedom(self.problem, int(self.kept.sum()))
 
-    def rms(self, select: NDArray[np.bool_] | None = None) -> float:
+    def rms(self, select: Mask | None = None) -> float:
         """Root mean square distance [px] of the kept observations, or of some of them."""
         use = self.kept if select is None else self.kept & select
         return float(np.sqrt(np.mean(np.sum(self.residuals[use] ** 2, axis=-1)))) if use.any() else float("nan")

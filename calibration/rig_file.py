@@ -14,8 +14,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.board import Board
-from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Array, Camera, StereoRig
+from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Camera, StereoRig
 from calibration.errors import RigFileError
 from calibration.splines import LensField
 from calibration.stereo import StereoCalibration
@@ -37,7 +38,7 @@ class CalibrationRecord:
     board_thickness: float  # [m]
     view_names: tuple[tuple[str, str], ...]
     observations: Observations  # all located corners that were offered to the refinement
-    kept: NDArray[np.bool_]  # (m,)
+    kept: Mask  # (m,)
     residuals: Array  # (m, 2) observed - predicted [px]
     unexplained_sigma: float  # [px]
     R_left_board: Array  # (n_views, 3, 3)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from calibration.camera import Array
+from calibration.arrays import Array
 
 WINDOW = 0.35  # of a square: half width of the window of the saddle point
 LEAST_SIGMA = 0.05  # px, of a corner that no model fits

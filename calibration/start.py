@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.camera import Array, Camera, rotation_from_vector
+from calibration.arrays import Array, Mask
+from calibration.camera import Camera, rotation_from_vector
 from calibration.errors import CalibrationError
 from calibration.stereo_model import Observations, StereoModel
 
@@ -58,7 +58,7 @@ def rotation_angle(R: Array) -> Array:
     return np.arccos(np.clip(0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1), -1, 1))
 
 
-def common_pair(rotations: Array, translations: Array) -> tuple[int, NDArray[np.bool_]]:
+def common_pair(rotations: Array, translations: Array) -> tuple[int, Mask]:
     """Index of the stereo pose that most others agree with, and who agrees: within 5 deg and 10 % of the baseline."""
     angle = rotation_angle(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
     shift = np.linalg.norm(translations[:, None] - translations[None], axis=-1)
@@ -71,7 +71,7 @@ def common_pair(rotations: Array, translations: Array) -> tuple[int, NDArray[np.
 
 def start_stereo(
     observations: Observations, nominal: Array, image_sizes: tuple[tuple[int, int], tuple[int, int]], n_views: int
-) -> tuple[StereoModel, NDArray[np.bool_]]:
+) -> tuple[StereoModel, Mask]:
     """Start model, and which views (n_views,) agree with it or were seen by one camera only."""
     left, left_poses = start_camera(observations, 0, nominal, image_sizes[0])
     right, right_poses = start_camera(observations, 1, nominal, image_sizes[1])

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.assessment import Assessment, assess, consistency_factor, half_set_differences, stereo_covariance
 from calibration.board import Board
 from calibration.brief import Brief
-from calibration.camera import Array, StereoRig
+from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import N_INTRINSIC, Array, Camera, project_with_jacobians, rotation_from_vector
+from calibration.arrays import Array
+from calibration.camera import N_INTRINSIC, Camera, project_with_jacobians, rotation_from_vector
 from calibration.errors import CalibrationError
 
 DISTORTION_MODELS: dict[str, tuple[str, ...]] = {

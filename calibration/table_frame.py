@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.camera import N_RIG, Array, StereoRig
+from calibration.arrays import Array
+from calibration.camera import N_RIG, StereoRig
 from calibration.refinement import Refinement
 from calibration.stereo_model import N_STEREO
 

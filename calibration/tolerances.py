@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.camera import N_RIG, Array, StereoRig
+from calibration.arrays import Array
+from calibration.camera import N_RIG, StereoRig
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 POSE_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 COORDINATES = ("x", "y", "z", "psi", "theta", "phi")

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.brief import Brief
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import euler_jacobian
-
-Array = NDArray[np.float64]
 
 
 class FrameStatus(IntEnum):
@@ -128,12 +127,12 @@ class Trajectory(Brief):
         return to_xarray(self)
 
     @property
-    def looked_for(self) -> NDArray[np.bool_]:
+    def looked_for(self) -> Mask:
         """(n,) True where a pose was looked for, found or not."""
         return np.isin(self.frame_status, [int(status) for status in FrameStatus if status.looked_for])
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """(n,) True where there is a pose."""
         return np.asarray(np.isfinite(self.q).all(axis=1))
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.brief import Brief
 from disctrack.analyse.contact import Contact, analyse_contact
@@ -25,8 +24,6 @@ from disctrack.analyse.power_laws import (
 from disctrack.analyse.propagation import RATES, Series, propagate, rates
 from disctrack.errors import AnalysisError
 from disctrack.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, for the exponents' dependence
 CIRCLE_DURATION = 0.6  # [s], as for the paper's figure 9

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.derivatives import Motion
 from disctrack.analyse.propagation import Propagated, Series, State, propagate
 from disctrack.disc import Disc
-
-Array = NDArray[np.float64]
 
 K = np.array([0.0, 0.0, 1.0])
 CONTACT = (

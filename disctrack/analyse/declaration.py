@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import triangulate
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import Motion, differentiate
@@ -32,7 +32,6 @@ from disctrack.trajectory import MarkerStatus, Trajectory, part
 if TYPE_CHECKING:
     from disctrack.recording.declaration import Recording
 
-Array = NDArray[np.float64]
 
 STANDARD_GRAVITY = 9.81  # [m/s^2]; 9.78 to 9.83 on the Earth's surface
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]

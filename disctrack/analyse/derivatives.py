@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from calibration.arrays import Array, Mask
 from calibration.camera import N_RIG
 from disctrack.analyse.smoothing import (
     HALF_WINDOW_LENGTHS,
@@ -34,8 +35,6 @@ from disctrack.frames import (
     unwrap_euler,
 )
 from disctrack.trajectory import FrameStatus, Trajectory
-
-Array = NDArray[np.float64]
 
 STATE = (
     *(f"position_{axis}" for axis in "xyz"),
@@ -67,7 +66,7 @@ class Motion:
     alpha_world: Array  # (n, 3) d omega / dt [rad/s^2]
     covariance: Array  # (n, 18, 18) in the order of STATE, from the noise of the poses; rotation as in frames.py
     calibration_sensitivity: Array  # (n, 18, 30) d STATE / d RIG_PARAMETERS, common to all frames
-    measured: NDArray[np.bool_]  # (n,) False where the frame was bridged
+    measured: Mask  # (n,) False where the frame was bridged
     euler: Array  # (n, 3) psi, theta, phi [rad], unwrapped
     length: Array  # (n, 4) length of the process per group [s]
     noise_scale: Array  # (4,) variance found in the data over variance stated, per group
@@ -79,7 +78,7 @@ class Motion:
         return len(self.time)
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """(n,) True where the motion is a number."""
         return np.asarray(np.isfinite(self.omega_world).all(axis=1))
 
@@ -147,7 +146,7 @@ class _Samples:
     R: Array  # (n, 3, 3), gaps bridged along the shortest arc
     covariance: Array  # (n, 6, 6), 0 where not measured
     sensitivity: Array  # (n, 6, 30)
-    good: NDArray[np.bool_]  # (n,)
+    good: Mask  # (n,)
     part: NDArray[np.int64]  # (n,) number of the stretch between breaks
 
     @property
@@ -156,7 +155,7 @@ class _Samples:
         return np.where(self.good[:, None], np.diagonal(self.covariance, axis1=1, axis2=2), np.inf)
 
 
-def _require_samples(time: Array, good: NDArray[np.bool_]) -> None:
+def _require_samples(time: Array, good: Mask) -> None:
     if good.sum() < MIN_FRAMES:
         raise AnalysisError(
             f"only {int(good.sum())} of {len(good)} frames have a pose, but at least {MIN_FRAMES} are needed to tell "
@@ -170,7 +169,7 @@ def _require_samples(time: Array, good: NDArray[np.bool_]) -> None:
         )
 
 
-def _parts(time: Array, good: NDArray[np.bool_], breaks: Sequence[float]) -> NDArray[np.int64]:
+def _parts(time: Array, good: Mask, breaks: Sequence[float]) -> NDArray[np.int64]:
     """Number of the stretch (n,) that each frame belongs to."""
     kept: list[float] = []
     for instant in sorted(breaks):
@@ -180,7 +179,7 @@ def _parts(time: Array, good: NDArray[np.bool_], breaks: Sequence[float]) -> NDA
     return np.searchsorted(np.array(kept), time, side="right")
 
 
-def _bridged_rotations(time: Array, quaternion: Array, good: NDArray[np.bool_]) -> Array:
+def _bridged_rotations(time: Array, quaternion: Array, good: Mask) -> Array:
     """R_world_body (n, 3, 3), missing frames on the shortest arc between their neighbours, held at the ends."""
     R = rotation_from_quaternion(np.where(good[:, None], quaternion, np.array([1.0, 0.0, 0.0, 0.0])))
     missing = ~good
@@ -190,7 +189,7 @@ def _bridged_rotations(time: Array, quaternion: Array, good: NDArray[np.bool_]) 
     return R
 
 
-def _usable_sensitivity(trajectory: Trajectory, good: NDArray[np.bool_]) -> Array:
+def _usable_sensitivity(trajectory: Trajectory, good: Mask) -> Array:
     """Sensitivity (n, 6, 30) to the rig; where a camera was missing, that of the nearest complete frame.
 
     A pose from one camera depends on the rig in another way, and the jump must not be differentiated.
@@ -293,7 +292,7 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
 
 def _weights_and_prior(
     samples: _Samples, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Mask]:
     """For k rows: weights (k, groups, 3, w), prior covariance (k, 6, 3, 3), True where that leaves too much open."""
     k = len(rows)
     weights, prior = np.zeros((k, len(CHANNEL_GROUPS), 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))

@@ -10,16 +10,14 @@ import contextlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import Motion
 from disctrack.analyse.propagation import Propagated, Series, State, propagate
 from disctrack.disc import Disc
 from disctrack.errors import ModelError
 from disctrack.regular_precession import precession_rate
-
-Array = NDArray[np.float64]
 
 ENERGY = (
     ("translation", "J", "kinetic energy of the centre"),

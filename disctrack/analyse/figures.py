@@ -7,16 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import Series
 from disctrack.disc import MA_2014
 from disctrack.pages.figures import Drawn, dress
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
-
-Array = NDArray[np.float64]
 
 BAND = 3.0  # sigmas shown as a band
 INSET_DURATION = 0.3  # [s] last stage, as in the paper's figures 4 and 10

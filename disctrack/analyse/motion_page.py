@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.whole import write_whole
 from disctrack.pages.html import Markup, page, paragraph
 from disctrack.pages.palette import RED
 from disctrack.trajectory import FrameStatus
 
-Array = NDArray[np.float64]
 Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
 
 MOST_ROWS = 1500  # frames on the page: every second, third, ... of longer recordings

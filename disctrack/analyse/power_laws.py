@@ -17,11 +17,10 @@ from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 from scipy.stats import t as student_t
 
+from calibration.arrays import Array
 from disctrack.disc import Disc
 from disctrack.errors import ModelError
 from disctrack.regular_precession import nutation_frequency, precession_rate
-
-Array = NDArray[np.float64]
 
 # (name, n_theta): the power lost goes with theta^a on slow steady precession, n_theta = 1 / (1 - a), n_E = n_theta,
 # n_psidot = -n_theta / 2

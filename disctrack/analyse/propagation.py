@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.derivatives import N_STATE, Motion
 from disctrack.frames import nodal_axes_world, rotation_from_vector
-
-Array = NDArray[np.float64]
 
 # Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
 # quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.

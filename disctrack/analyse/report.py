@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.figures import all_figures
@@ -18,8 +17,6 @@ from disctrack.pages.figures import Drawn, draw, gallery
 from disctrack.pages.html import details, page, paragraph, section, table, tiles, warning
 from disctrack.published import SURFACES, agreement, published_table
 from disctrack.trajectory import FrameStatus
-
-Array = NDArray[np.float64]
 
 # Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
 ASYMPTOTIC_BELOW = np.radians(1.0)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.brief import Brief
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
@@ -21,8 +20,6 @@ from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.trajectory_file import Group, read_provenance, read_setup, read_trajectory, write_groups
 from disctrack.frames import euler_jacobian
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

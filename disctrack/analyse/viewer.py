@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import StereoRig
+from calibration.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import quaternion_from_rotation
-
-Array = NDArray[np.float64]
 
 TIMELINE = "recording"
 _RIM_POINTS = 96

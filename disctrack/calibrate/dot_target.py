@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import Array
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.refinement import Refinement, refine_stereo
 from calibration.start import start_stereo

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.fit import Fit, fit
@@ -30,8 +29,6 @@ from disctrack.examples._command import Outcome, command
 from disctrack.examples.ball_system import GRAVITY, BallDrops, Drop, height_noise, read_drops
 from disctrack.pages.figures import dress
 from disctrack.pages.palette import AMBER, BLUE, GREEN, MUTED, RED
-
-Array = NDArray[np.float64]
 
 SEEN = 1.2  # [s] of a second drop from which the rest is foretold, as in the published comparison
 FORMS = ("constant_drag", "linear_drag", "quadratic_drag")

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
-
-Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2] as declared
 AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
@@ -158,7 +156,7 @@ class BallDrops:
         """No candidate has a threshold."""
         return ()
 
-    def training_rows(self, seen: float = 1.2) -> NDArray[np.bool_]:
+    def training_rows(self, seen: float = 1.2) -> Mask:
         """(n,) True for all of the first drops, and for the first `seen` seconds of the second ones."""
         return (self.number == 1) | ((self.number > 1) & (self.time <= seen))
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibration.arrays import Array
 from disctrack.examples.cube_data import AT_REST, FRAME_RATE, HALF_WIDTH, SHORTEST, Flight, Toss
 
-Array = NDArray[np.float64]
 Estimate = tuple[float, float]  # value and standard error
 
 GRAVITY = 9.81  # [m/s^2]

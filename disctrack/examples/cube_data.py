@@ -12,12 +12,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibration.arrays import Array
 from disctrack.errors import AnalysisError
-
-Array = NDArray[np.float64]
 
 HALF_WIDTH = 0.0524  # [m] as declared
 FRAME_RATE = 148.0  # [Hz]

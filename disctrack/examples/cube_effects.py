@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting
-
-Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2] as declared
 UP = np.array([0.0, 0.0, 1.0])

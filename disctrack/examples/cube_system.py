@@ -12,15 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies
 from disctrack.examples.cube_effects import CANDIDATES, GRAVITY, columns, resting_columns
-
-Array = NDArray[np.float64]
 
 CHANNELS = ("x", "y", "z", "turn_1", "turn_2", "turn_3")
 GROUPS = {"horizontal": (0, 1), "vertical": (2,), "turn": (3, 4, 5)}  # channels whose noise is alike
@@ -74,7 +72,7 @@ class CubeTosses:
         """No candidate has a threshold."""
         return ()
 
-    def training_rows(self) -> NDArray[np.bool_]:
+    def training_rows(self) -> Mask:
         """(n,) False for every third toss."""
         return np.asarray(self.toss % HELD_OUT != HELD_OUT - 1, bool)
 
@@ -140,7 +138,7 @@ def _line(flight: Flight) -> Array:
     return np.column_stack([np.ones(len(flight.time)), flight.time])
 
 
-def _cleared(left: Array, rows: _Rows, seen: NDArray[np.bool_]) -> Array:
+def _cleared(left: Array, rows: _Rows, seen: Mask) -> Array:
     """Without what the flight's own motion, fitted to the samples `seen`, makes of it."""
     line, own = _line(rows.flight), rows.own
     place = line @ np.linalg.lstsq(line[seen], left[seen, :3], rcond=None)[0]

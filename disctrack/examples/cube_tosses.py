@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out
@@ -38,8 +38,6 @@ from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import CHANNELS, GROUPS, HELD_OUT, CubeTosses, white_chi_square
 from disctrack.pages.figures import dress
 from disctrack.pages.palette import BLUE, MUTED, RED
-
-Array = NDArray[np.float64]
 
 # The covariance of the noise is that of the data already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.system import Candidate, Values
@@ -17,8 +17,6 @@ from disctrack.examples.exponent_system import ExponentSystem, Series
 from disctrack.published import PREDICTED
 from disctrack.rolling import CATALOGUE, Model, steady_precession
 from disctrack.rolling.evaluate import effect_power, kinematics
-
-Array = NDArray[np.float64]
 
 THIN_DISC = np.array([PREDICTED[1], PREDICTED[2], PREDICTED[0]])  # n_theta, n_psidot, n_energy
 SHARE_AT = np.radians(2.0)  # [rad] nutation, in the windows of both surfaces
@@ -77,7 +75,7 @@ class Explanation:
     held_out_gain: dict[str, float]  # increase of 2 log density of the data left out, by split
 
 
-def splits(system: ExponentSystem) -> dict[str, NDArray[np.bool_]]:
+def splits(system: ExponentSystem) -> dict[str, Mask]:
     """Rows to fit on, by what is then foretold."""
     exponent = system.number < 3
     rows = {"later trials": training_rows(system)}

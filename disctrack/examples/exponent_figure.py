@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy import stats
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.system import Values
 from disctrack.examples.exponent_analysis import THIN_DISC, Explanation
 from disctrack.examples.exponent_report import Answer
 from disctrack.examples.exponent_system import ExponentSystem, Series
 from disctrack.pages.figures import dress
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED, SKY
-
-Array = NDArray[np.float64]
 
 AXES = ((0, 1), (0, 2))  # pairs of exponents that are shown against each other
 LABELS = (r"$n_\theta$", r"$n_{\dot\psi}$", "$n_E$")

@@ -14,14 +14,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
+from calibration.arrays import Array
 from disctrack.disc import MA_2014, Disc
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
-
-Array = NDArray[np.float64]
 
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
 SAMPLING = 2e-3  # [s] of the simulation; a cubic spline then follows the last nutations read to 1e-4

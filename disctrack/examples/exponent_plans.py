@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.power_laws import fit_power_laws
 from disctrack.diagnosis.engine.fit import compress, fit, prior_rows, solve_bounded
 from disctrack.diagnosis.engine.system import Quantity, Values
@@ -16,8 +16,6 @@ from disctrack.examples.exponent_analysis import Explanation
 from disctrack.examples.exponent_model import FRAME, Setup
 from disctrack.examples.exponent_system import SPIN, ExponentSystem, Series, sample_covariance
 from disctrack.rolling import CATALOGUE, Model, simulate, steady_precession
-
-Array = NDArray[np.float64]
 
 ALUMINIUM_OVER_STEEL = 2.70 / 7.85  # density
 LOW_PRESSURE = 0.1  # of the atmosphere

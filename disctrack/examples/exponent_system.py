@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis import Candidate, Quantity
 from disctrack.diagnosis.disc.motion import SLIP, motion_candidates
 from disctrack.diagnosis.engine.system import Values
@@ -23,8 +23,6 @@ from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import LastStage, Reading, Setup
 from disctrack.published import SURFACES, published_table
 from disctrack.rolling import CATALOGUE, Model, effects
-
-Array = NDArray[np.float64]
 
 ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin
 DURATION_SIGMA = 0.03  # of ln duration: simulation and measurement of figures 17 and 18 end within 50 ms of 1.5 s

@@ -15,15 +15,13 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.equations import Answer, Equations, Run, Term, diagnose, terms
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
 from disctrack.pages.figures import dress
 from disctrack.pages.palette import BLUE, MUTED, RED
-
-Array = NDArray[np.float64]
 
 FITTED_S = 36.668  # by the authors; the rest is their validation
 STEP = 0.157e-3  # [rad] of the encoder
@@ -69,7 +67,7 @@ def forecasts(answer: Answer, time: Array, angle: Array) -> dict[str, Array]:
     return {side: angle - answer.forecast(run, before=side == "before")["angle"] for side in ("before", "after")}
 
 
-def table(answer: Answer, left: dict[str, Array], kept: NDArray[np.bool_]) -> str:
+def table(answer: Answer, left: dict[str, Array], kept: Mask) -> str:
     """Before and after, for people."""
     best = 1e3 * STEP / np.sqrt(12)
     lines = [str(answer), "", f"{'rms [mrad]':<38}{'before':>10}{'after':>10}"]

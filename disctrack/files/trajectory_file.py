@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import disctrack
+from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError
@@ -173,7 +174,7 @@ def read_group(
 class Setup:
     """What was filmed, by which cameras and when, without the measurement itself."""
 
-    time: NDArray[np.float64]  # (n,) [s]
+    time: Array  # (n,) [s]
     disc: Disc
     rig: StereoRig
     gravity: float  # [m/s^2]
@@ -574,7 +575,7 @@ def _check_values(trajectory: Trajectory) -> None:
         row, column = np.argwhere(far)[0]
         raise ValueError(f"{COORDINATES[column]} of frame {frame[row]} is {q[row, column]:g}, which is no pose")
     posed = np.flatnonzero(np.isfinite(q).all(axis=1))
-    sound: NDArray[np.bool_] = np.asarray(np.isfinite(C[posed]).all(axis=(1, 2)))
+    sound: Mask = np.asarray(np.isfinite(C[posed]).all(axis=(1, 2)))
     sound[sound] = np.linalg.eigvalsh(C[posed][sound])[:, 0] > 0
     if not sound.all():
         raise ValueError(f"pose_covariance of frame {frame[posed[int(np.argmin(sound))]]} is not positive definite")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
+from calibration.arrays import Mask
 from calibration.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
@@ -29,8 +30,6 @@ from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
 from disctrack.track.tracking import PairBlock, Tracking, TrackingSettings, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
-
-Array = NDArray[np.float64]
 
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
 PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
@@ -288,7 +287,7 @@ def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: rang
 class _Block:
     frames: NDArray[np.int64]
     images: NDArray
-    readable: NDArray[np.bool_]
+    readable: Mask
 
 
 def _together(stretches: list[Trajectory]) -> Trajectory:

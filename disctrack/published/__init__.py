@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 EXPONENTS = ("n_energy", "n_theta", "n_psidot")
 PREDICTED = (2 / 3, 2 / 3, -1 / 3)  # a rolling moment proportional to psidot^2, thin disc, slow precession

@@ -6,12 +6,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-
-Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
@@ -41,14 +37,14 @@ class FrameReader(Protocol):
 
     image_size: tuple[int, int]  # width, height [px]
     bit_depth: int  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16)
-    timestamps: NDArray[np.float64] | None  # (n,) [s] by the camera's clock, where the file has them
+    timestamps: Array | None  # (n,) [s] by the camera's clock, where the file has them
     frame_rate: float | None  # [Hz] where the file states the camera's own, not that of a player
     notes: tuple[str, ...]  # what the user should know about how the frames were read, one sentence each
     random_access: bool  # False where frames are read fastest in order, by one thread
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned."""
         ...
 

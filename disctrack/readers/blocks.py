@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Mask
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
@@ -39,7 +40,7 @@ class PairBlock:
     unreadable: tuple[Unreadable, ...]
 
     @property
-    def readable(self) -> NDArray[np.bool_]:
+    def readable(self) -> Mask:
         """(n, 2) True where the image could be read."""
         good = np.ones(self.images.shape[:2], bool)
         for image in self.unreadable:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame
 from disctrack.readers._unpack_kernels import look_up, unpack_10, unpack_12
 from disctrack.readers.camera_header import CameraHeader
 from disctrack.readers.raw import RawFile, RawFrames
@@ -48,7 +48,7 @@ class PixelLayout:
         """True where the bytes of the file are the image."""
         return self.stored_bits in (8, 16) and not (self.padding or self.bottom_up) and self.table is None
 
-    def decode(self, stored: NDArray[np.uint8], out: Frame) -> None:
+    def decode(self, stored: NDArray[np.uint8], out: Image) -> None:
         """Bytes of one frame (frame_bytes,) into pixels (height, width), contiguous, native uint8 or uint16."""
         if self.stored_bits in (10, 12):
             (unpack_10 if self.stored_bits == 10 else unpack_12)(stored, out.reshape(-1))
@@ -70,7 +70,7 @@ class CameraFrames(RawFrames):
         offsets: NDArray[np.int64],
         header: CameraHeader,
         notes: tuple[str, ...] = (),
-        timestamps: NDArray[np.float64] | None = None,
+        timestamps: Array | None = None,
         doubts: tuple[str, ...] = (),
     ) -> None:
         """Frames whose pixels begin at offsets (n,), below 0 where the file holds none; beyond its end they are lost.
@@ -96,7 +96,7 @@ class CameraFrames(RawFrames):
         self.frame_bytes = layout.frame_bytes
         self._scratch = threading.local()
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
         file, offset = self.files[0], int(self.offsets[index])
         where = f"{file.path} ({self.camera} camera, frame {index})"

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.errors import RecordingError
 from disctrack.readers.camera_frames import (
     PIXELS_PER_GROUP,
@@ -214,12 +215,12 @@ def linear_from_10_bits() -> NDArray[np.uint16]:
     return grey.astype(np.uint16)
 
 
-def _seconds(fractions: NDArray[np.uint32], seconds: NDArray[np.uint32], since: int) -> NDArray[np.float64]:
+def _seconds(fractions: NDArray[np.uint32], seconds: NDArray[np.uint32], since: int) -> Array:
     """Times [s] after the whole second `since`; the two lowest bits of the fraction are flags."""
     return (seconds.astype(np.int64) - since) + (fractions & np.uint32(0xFFFFFFFC)) * 2.0**-32
 
 
-def _times(cine: _Cine) -> tuple[NDArray[np.float64] | None, list[str]]:
+def _times(cine: _Cine) -> tuple[Array | None, list[str]]:
     """(n,) [s] from the trigger to each frame by the camera's clock, or None and why they are not used."""
     block = _find_block(cine, _TIMES_BLOCK)
     if block is None:
@@ -237,7 +238,7 @@ def _times(cine: _Cine) -> tuple[NDArray[np.float64] | None, list[str]]:
     return times, []
 
 
-def _saved_step(cine: _Cine, times: NDArray[np.float64]) -> int:
+def _saved_step(cine: _Cine, times: Array) -> int:
     """Of how many recorded frames one was saved, by the time stamps (the setup does not tell); 0 if they cannot be."""
     steps = np.diff(times)
     if not len(steps):
@@ -263,7 +264,7 @@ def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
     return None
 
 
-def _header(cine: _Cine, layout: PixelLayout, times: NDArray[np.float64] | None) -> CameraHeader:
+def _header(cine: _Cine, layout: PixelLayout, times: Array | None) -> CameraHeader:
     rate = cine.field("FrameRate")
     if not rate:
         raise RecordingError(f"{cine.path}: the camera setup states no frame rate. Export the recording again.")

@@ -17,10 +17,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame, FrameReader
+from disctrack.readers import FrameReader
 from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
@@ -154,7 +154,7 @@ def _attribute(stack: Any, name: str) -> float | None:
     return None
 
 
-def _timestamps(stack: Any, n: int, where: str) -> NDArray[np.float64] | None:
+def _timestamps(stack: Any, n: int, where: str) -> Array | None:
     stamps = stack.attrs.get("timestamps", stack.parent.get("timestamps"))
     if stamps is None or (isinstance(stamps, h5py.Dataset) and stamps.shape != (n,)):
         if isinstance(stamps, h5py.Dataset) and stamps.ndim == 1:
@@ -180,7 +180,7 @@ class Hdf5Frames:
         stack: Any,
         camera: str,
         bit_depth: int | None,
-        timestamps: NDArray[np.float64] | None,
+        timestamps: Array | None,
         frame_rate: float | None,
     ) -> None:
         self.file, self.camera = file, camera
@@ -211,7 +211,7 @@ class Hdf5Frames:
         """File, data set and frame."""
         return f"{self.file}:{self._stack.name}, frame {index}"
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
         where = f"{self.file}:{self._stack.name} ({self.camera} camera, frame {index})"
         image = out
@@ -238,7 +238,7 @@ class Hdf5Frames:
         out[...] = image
         return out
 
-    def _inflate(self, content: bytes, image: Frame, where: str) -> None:
+    def _inflate(self, content: bytes, image: Image, where: str) -> None:
         """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
         inflater = zlib.decompressobj()
         try:

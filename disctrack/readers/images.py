@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image
 from calibration.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame, FrameReader
+from disctrack.readers import FrameReader
 from disctrack.readers._png import PngHeader, decode_plain_grey
 from disctrack.readers.file_numbers import NumberedFiles, check_continuation, number_files
 from disctrack.readers.raw import MOST_PIXELS
@@ -60,7 +61,7 @@ def open_image_sequence(numbered: NumberedFiles, camera: str) -> ImageSequence:
     return ImageSequence(numbered, camera, size, first.dtype, tuple(notes))
 
 
-def _depth_notes(stored: NDArray, grey: Frame) -> list[str]:
+def _depth_notes(stored: NDArray, grey: Image) -> list[str]:
     notes = []
     if stored.ndim == 3:
         notes.append(f"images are stored with {stored.shape[2]} channels of equal value; one is used, without loss")
@@ -74,7 +75,7 @@ def _depth_notes(stored: NDArray, grey: Frame) -> list[str]:
 class ImageSequence:
     """One file per frame; see FrameReader. Files are opened when a frame is read, and never written."""
 
-    timestamps: NDArray[np.float64] | None = None
+    timestamps: Array | None = None
     frame_rate: float | None = None
     random_access = True
 
@@ -104,7 +105,7 @@ class ImageSequence:
         file = self.files[index]
         return f"missing file of {self.camera} frame {index}" if file is None else str(file)
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
         where = f"{self.describe(index)} ({self.camera} camera, frame {index})"
         content = self._content(index, where)
@@ -167,7 +168,7 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     return image
 
 
-def as_grey(image: NDArray, where: str) -> Frame:
+def as_grey(image: NDArray, where: str) -> Image:
     """(h, w) of 8 or 16 bits: equal channels become one. Raises RecordingError where something would be lost."""
     if image.dtype not in (np.uint8, np.uint16):
         raise RecordingError(f"{where}: pixels of type {image.dtype}; expected 8 or 16 bit grey values.")

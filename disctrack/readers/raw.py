@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
@@ -108,7 +108,7 @@ class RawFrames:
         *,
         bit_depth: int | None = None,
         notes: tuple[str, ...] = (),
-        timestamps: NDArray[np.float64] | None = None,
+        timestamps: Array | None = None,
         frame_rate: float | None = None,
     ) -> None:
         """Frame i begins at byte offsets[i] of files[file_of_frame[i]]; dtype is that of the file, with byte order."""
@@ -127,7 +127,7 @@ class RawFrames:
         """File, frame and the byte where it begins."""
         return f"{self.files[self.file_of_frame[index]].path}, frame {index} at byte {self.offsets[index]}"
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
         shape = self.image_size[::-1]
         image = out

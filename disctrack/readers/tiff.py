@@ -20,8 +20,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame, FrameReader
+from disctrack.readers import FrameReader
 from disctrack.readers.images import as_grey, decode
 from disctrack.readers.raw import MOST_PIXELS, RawFile, RawFrames, check_frame_size
 
@@ -134,7 +135,7 @@ class TiffPages:
         pages: Sequence[_Page],
         camera: str,
         notes: tuple[str, ...],
-        timestamps: NDArray[np.float64] | None,
+        timestamps: Array | None,
         frame_rate: float | None,
     ) -> None:
         self._tiffs, self._pages, self.camera = list(tiffs), list(pages), camera
@@ -151,7 +152,7 @@ class TiffPages:
         page = self._pages[index]
         return f"{self._tiffs[page.file].file.path}, frame {index} (directory at byte {page.directory})"
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
         where = f"{self._where(index)} ({self.camera} camera, frame {index})"
         image = self._decoded(index, where)
@@ -182,7 +183,7 @@ class TiffPages:
     def _where(self, index: int) -> str:
         return str(self._tiffs[self._pages[index].file].file.path)
 
-    def _decoded(self, index: int, where: str) -> Frame:
+    def _decoded(self, index: int, where: str) -> Image:
         page = self._pages[index]
         check_frame_size(page.width, page.height, where)
         try:
@@ -191,7 +192,7 @@ class TiffPages:
             text = str(error)
             raise RecordingError(text if text.startswith(where) else f"{where}: {text}") from error
 
-    def _first_readable(self) -> Frame:
+    def _first_readable(self) -> Image:
         problem: RecordingError | None = None
         for index in range(len(self._pages)):
             try:
@@ -413,7 +414,7 @@ def _imagej_pages(description: str) -> int:
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
-def _times(description: str, n: int) -> tuple[float | None, NDArray[np.float64] | None]:
+def _times(description: str, n: int) -> tuple[float | None, Array | None]:
     """Frame rate [Hz] and time stamps [s] by ImageJ's or OME's notes, None where they say nothing."""
     if description.startswith("ImageJ="):
         for key, invert in (("finterval", True), ("fps", False)):
@@ -426,7 +427,7 @@ def _times(description: str, n: int) -> tuple[float | None, NDArray[np.float64] 
     return None, None
 
 
-def _ome_times(description: str, n: int) -> tuple[float | None, NDArray[np.float64] | None]:
+def _ome_times(description: str, n: int) -> tuple[float | None, Array | None]:
     """OME schema 2016-06: Pixels/@TimeIncrement, Pixels/Plane/@DeltaT, each with its unit (default s)."""
     try:
         root = ElementTree.fromstring(description)

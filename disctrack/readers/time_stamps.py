@@ -8,11 +8,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.frames import CAMERAS
 from disctrack.readers import FrameReader
 from disctrack.readers.camera_header import header_of, start_offset
-
-Array = NDArray[np.float64]
 
 RATE_TOLERANCE = 0.01  # of the declared rate; a clock's error is a thousandth of that, a wrong unit far more
 LOST = 1.5  # periods between two frames: beyond, at least one is missing

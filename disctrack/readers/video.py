@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers import Frame
 from disctrack.readers._ffv1 import checksums_hold
 from disctrack.readers.images import as_grey
 from disctrack.readers.raw import MOST_PIXELS, check_frame_size
@@ -43,7 +43,7 @@ class VideoFile:
     time in the container: going back starts at the key frame before.
     """
 
-    timestamps: NDArray[np.float64] | None = None  # those of the container are a player's, not the camera's
+    timestamps: Array | None = None  # those of the container are a player's, not the camera's
     frame_rate: float | None = None
     random_access = False
 
@@ -73,7 +73,7 @@ class VideoFile:
         """File and frame."""
         return f"{self.file}, frame {index}"
 
-    def read(self, index: int, out: Frame | None = None) -> Frame:
+    def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
         where = f"{self.file} ({self.camera} camera, frame {index})"
         with self._lock:
@@ -98,7 +98,7 @@ class VideoFile:
                 self._digest = b"unreadable" + os.urandom(16)
         return hashlib.sha256(self._digest + f"{start}:{stop}".encode()).hexdigest()
 
-    def _first_readable(self) -> tuple[Frame, list[str]]:
+    def _first_readable(self) -> tuple[Image, list[str]]:
         problem: RecordingError | None = None
         for index in range(len(self)):
             try:
@@ -302,7 +302,7 @@ def _varies(plane: Any) -> bool:
     return bool((rows != rows[0, 0]).any())
 
 
-def _luma(frame: Any, where: str) -> Frame:
+def _luma(frame: Any, where: str) -> Image:
     """Grey values (h, w) of a decoded frame without conversion; a view of its memory where possible."""
     name = frame.format.name
     component = frame.format.components[0]

@@ -8,11 +8,8 @@ second order.
 from __future__ import annotations
 
 import numba
-import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
+from calibration.arrays import Array, Array32
 
 
 @numba.njit(cache=True, nogil=True)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Array32
 from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)

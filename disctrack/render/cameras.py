@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import Camera, StereoRig
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
 from disctrack.render.rays import View, image_of
 from disctrack.scene.description import CameraFault, Scene
-
-Array = NDArray[np.float64]
 
 
 def rig_of(scene: Scene) -> StereoRig:

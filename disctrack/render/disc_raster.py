@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Array32
 from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane ahead of the camera
 _N_FIELDS = 11

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array, Array32, Mask
 from calibration.camera import Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import rotation_from_euler
@@ -29,8 +30,6 @@ from disctrack.scene.description import (
     SensorSettings,
 )
 
-Array = NDArray[np.float64]
-Grey = NDArray[np.float32]
 PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure -> (k, 6) q
 
 
@@ -42,16 +41,16 @@ class Stage:
     view: View
     s: int
     pad: int
-    weights: Grey
+    weights: Array32
     rays: Array
-    cells: Grey  # table in the cells of the padded image
-    table: Grey  # (height, width) blurred table, before lamp and vignetting
-    factor: Grey
-    glare: Grey
+    cells: Array32  # table in the cells of the padded image
+    table: Array32  # (height, width) blurred table, before lamp and vignetting
+    factor: Array32
+    glare: Array32
     pattern: imperfect.Pattern | None
-    hot: Grey | None
+    hot: Array32 | None
 
-    def finish(self, irradiance: Grey) -> Grey:
+    def finish(self, irradiance: Array32) -> Array32:
         """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern has it."""
         grey = irradiance * self.factor + self.glare
         return grey if self.pattern is None else self.pattern.seen(grey)
@@ -122,9 +121,9 @@ def expected_disc_image(
     stage: Stage,
     true_disc: TrueDisc,
     scene: Scene,
-    visible: NDArray[np.bool_] | None = None,
+    visible: Mask | None = None,
     occluders: Iterable[Occluder] = (),
-) -> Grey:
+) -> Array32:
     """Expected grey values (height, width) of one exposure [s]; `pose` gives q around mid exposure.
 
     Light is gathered at the nodes of a Gauss-Legendre rule over the exposure, at least one node per 0.8 px of motion:
@@ -200,7 +199,7 @@ def _window(outline: Array, margin: int, width: int, height: int) -> tuple[int, 
     return max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)
 
 
-def _draw_rod(cells: Grey, corner: tuple[int, int], s: int, rod: Occluder) -> None:
+def _draw_rod(cells: Array32, corner: tuple[int, int], s: int, rod: Occluder) -> None:
     """Lay a straight rod over the cells; its edges are linear over one cell."""
     y = (np.arange(cells.shape[0]) + 0.5) / s - 0.5 + corner[0] - rod.centre_px[1]
     x = (np.arange(cells.shape[1]) + 0.5) / s - 0.5 + corner[1] - rod.centre_px[0]
@@ -220,7 +219,7 @@ def expected_disc(
     qdot: ArrayLike | None = None,
     visible: ArrayLike | None = None,
     paper_centre_body: tuple[float, float] = (0.0, 0.0),
-) -> Grey:
+) -> Array32:
     """Noise-free grey values (n, 2 cameras, height, width) before quantisation; arguments as for `render_disc`."""
     return _disc_series(q, rig, disc, scene or Scene(), qdot, visible, paper_centre_body, lambda image, _: image)
 
@@ -251,7 +250,7 @@ def render_disc(
     noise = [None] * (2 * len(q)) if rng is None else rng.spawn(2 * len(q))
     hot = [stage.hot for stage in stages(rig, settings)]
 
-    def expose(image: Grey, index: int) -> NDArray[Any]:
+    def expose(image: Array32, index: int) -> NDArray[Any]:
         return digitise(image, settings.sensor, settings.cameras.bit_depth, noise[index], hot[index % 2])
 
     return _disc_series(q, rig, disc, settings, qdot, visible, paper_centre_body, expose)
@@ -265,7 +264,7 @@ def _disc_series(
     qdot: ArrayLike | None,
     visible: ArrayLike | None,
     paper_centre_body: tuple[float, float],
-    finish: Callable[[Grey, int], NDArray[Any]],
+    finish: Callable[[Array32, int], NDArray[Any]],
 ) -> NDArray[Any]:
     q = np.atleast_2d(np.asarray(q, float))
     rates = np.zeros_like(q) if qdot is None else np.broadcast_to(np.asarray(qdot, float), q.shape)
@@ -310,7 +309,7 @@ def render_board(
     return _gather(one, len(R), settings)
 
 
-def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stage, scene: Scene) -> Grey:
+def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stage, scene: Scene) -> Array32:
     """Expected grey values (height, width) of the chessboard at rest in one camera."""
     view, board = stage.view, scene.board
     cells = np.zeros_like(stage.cells)

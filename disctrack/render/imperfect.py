@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Array32
 from calibration.camera import Camera
 from disctrack.render.rays import bent_rays
 from disctrack.scene.description import BoardSettings, ImperfectionSettings
-
-Array = NDArray[np.float64]
-Grey = NDArray[np.float32]
 
 N_WAVES = 5
 PERIODS = 0.4, 1.4  # of the waves that make up a lens field, along the image's longer side
@@ -21,12 +18,12 @@ PERIODS = 0.4, 1.4  # of the waves that make up a lens field, along the image's 
 class Pattern(NamedTuple):
     """What a sensor adds to the light, the same in every frame."""
 
-    gain: Grey  # (height, width)
-    offset: Grey  # (width,) [grey]
+    gain: Array32  # (height, width)
+    offset: Array32  # (width,) [grey]
     curve: float
 
-    def seen(self, grey: Grey) -> Grey:
-        """Grey values (height, width) as the sensor has them, before its noise."""
+    def seen(self, grey: Array32) -> Array32:
+        """Array32 values (height, width) as the sensor has them, before its noise."""
         part = grey / np.float32(255.0)
         curved = grey + np.float32(255.0 * 4.0 * self.curve) * part * (1 - part)
         return np.asarray(curved * self.gain + self.offset, np.float32)

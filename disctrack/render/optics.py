@@ -6,14 +6,11 @@ from functools import lru_cache
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
+from calibration.arrays import Array, Array32
 from disctrack.render.rays import View, table_points
 from disctrack.scene.description import Scene
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 _TEXTURE_SIZE = 1024  # texels per side
 _TEXEL = 0.25e-3  # [m]; the texture repeats after 256 mm

@@ -12,12 +12,10 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import Camera
 from disctrack.errors import SceneError
-
-Array = NDArray[np.float64]
 
 
 class View(NamedTuple):

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Array32, Image
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
@@ -24,7 +24,6 @@ from disctrack.render.truth import Truth, write_truth
 from disctrack.scene.description import ImperfectionSettings, Scene
 from disctrack.scene.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]  # images done, images in all
 
 TRUTH_NAME = "truth.h5"
@@ -35,7 +34,7 @@ class _Image:
     """One file to be written."""
 
     path: Path
-    expose: Callable[[], NDArray[np.uint8] | NDArray[np.uint16]]
+    expose: Callable[[], Image]
 
 
 def write_recording(
@@ -144,7 +143,7 @@ def _board_images(part: Path, scene: Scene, truth: Truth) -> Iterator[_Image]:
 
             def expose(
                 stage: Stage = stage, R: Array = R, t: Array = t, key: tuple[int, ...] = (scene.seed, 3, c, view)
-            ) -> NDArray[np.uint8] | NDArray[np.uint16]:
+            ) -> Image:
                 return _digitise(expected_board_image(R, t, stage, scene), stage, scene, key)
 
             yield _Image(part / "calibration" / CAMERAS[c] / f"{view:02d}.png", expose)
@@ -162,7 +161,7 @@ def _disc_images(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) ->
 
             def expose(
                 i: int = i, mid: float = truth.time[i] + delay, stage: Stage = stage, rods: list = rods, c: int = c
-            ) -> NDArray[np.uint8] | NDArray[np.uint16]:
+            ) -> Image:
                 image = expected_disc_image(
                     lambda dt: motion.pose(mid + dt), exposure, stage, true_disc, scene, truth.markers_printed, rods
                 )
@@ -171,9 +170,7 @@ def _disc_images(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) ->
             yield _Image(part / CAMERAS[c] / f"{i:06d}.png", expose)
 
 
-def _digitise(
-    image: NDArray[np.float32], stage: Stage, scene: Scene, key: tuple[int, ...]
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def _digitise(image: Array32, stage: Stage, scene: Scene, key: tuple[int, ...]) -> Image:
     """Own noise for every image, so that neither order nor number of threads matters."""
     return digitise(image, scene.sensor, scene.cameras.bit_depth, np.random.default_rng(key), stage.hot)
 

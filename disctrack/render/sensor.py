@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array32, Image
 from disctrack.scene.description import SensorSettings
-
-Grey = NDArray[np.float32]
 
 
 def digitise(
-    expected: Grey, settings: SensorSettings, bit_depth: int, rng: np.random.Generator | None, hot: Grey | None = None
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    expected: Array32,
+    settings: SensorSettings,
+    bit_depth: int,
+    rng: np.random.Generator | None,
+    hot: Array32 | None = None,
+) -> Image:
     """Image as the camera writes it, from the expected 8-bit grey values (..., height, width).
 
     Electrons are Poisson with mean gain * grey, read noise is Gaussian, the sum is scaled to the bit depth, rounded and
@@ -29,7 +31,7 @@ def digitise(
     return np.clip(levels, 0, top).astype(np.uint8 if bit_depth == 8 else np.uint16)
 
 
-def hot_pixels(settings: SensorSettings, image_size: tuple[int, int], rng: np.random.Generator) -> Grey | None:
+def hot_pixels(settings: SensorSettings, image_size: tuple[int, int], rng: np.random.Generator) -> Array32 | None:
     """Excess grey of the sensor's hot pixels (height, width), the same in every frame; None without any."""
     if settings.hot_pixels == 0:
         return None

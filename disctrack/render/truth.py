@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_vector, vector_from_rotation
 from disctrack.render.rays import View, image_of
 from disctrack.scene.description import Scene, scene_toml
-
-Array = NDArray[np.float64]
 
 SCHEMA = "disctrack truth"
 SCHEMA_VERSION = 1
@@ -35,7 +34,7 @@ class Truth:
     rig_while_filming: StereoRig  # while the disc was filmed
     disc: Disc  # with the true centres of the dots
     paper_centre_body: Array  # (2,) [m]
-    markers_printed: NDArray[np.bool_]  # (m,) False for dots that have come off
+    markers_printed: Mask  # (m,) False for dots that have come off
     R_world_board: Array  # (v, 3, 3) of the calibration views
     t_world_board: Array  # (v, 3) [m]
     effects: dict[str, float]  # "effect.parameter" of the rolling model, SI

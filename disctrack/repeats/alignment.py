@@ -12,12 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from calibration.arrays import Array, Mask
 from disctrack.repeats.runs import INDEX, NUTATION_PER_PRECESSION, Run
-
-Array = NDArray[np.float64]
 
 MATCHED = tuple(INDEX[name] for name in ("theta", "psidot", "energy"))
 MIN_OVERLAP = 0.5  # of the shorter run: less could be matched by chance
@@ -52,7 +50,7 @@ class Curves:
         self._time, self._sigma = run.time[good], run.sigma[good]
         self._spline = CubicSpline(self._time, run.value[good])
 
-    def _outside(self, time: Array) -> NDArray[np.bool_]:
+    def _outside(self, time: Array) -> Mask:
         after = np.clip(np.searchsorted(self._time, time), 1, len(self._time) - 1)
         hole = self._time[after] - self._time[after - 1] > GAP * self.interval
         return np.asarray((time < self.start) | (time > self.end) | hole)

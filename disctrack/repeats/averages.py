@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 CONSISTENT = 0.05  # probability of a larger chi-square below which the runs are said not to agree
 # Probability, over all runs of a group, that one is pointed at by chance, per quantity: where the others agree within

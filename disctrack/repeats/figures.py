@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.figures import INSET_DURATION, MIN_INSET_SHARE
 from disctrack.pages.figures import Drawn, dress
 from disctrack.pages.palette import AMBER, BLUE, INK, MUTED, SERIES
@@ -18,8 +18,6 @@ from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import ExponentTable, RepeatGroup
 from disctrack.repeats.runs import INDEX, QUANTITIES, Run
 from disctrack.repeats.spread import Spread
-
-Array = NDArray[np.float64]
 
 MOST_NAMED = 8  # runs in a legend
 FITTED_LABELS = {"n_energy": "n_E", "n_theta": "n_θ", "n_psidot": "n_ψ̇", "k_m": "k_m (10⁻⁸ m s²)"}

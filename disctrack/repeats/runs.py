@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.files.trajectory_file import read_group, read_provenance, read_setup
-
-Array = NDArray[np.float64]
 
 NUTATION_PER_PRECESSION = 0.785  # of the frequencies, thin disc 0.775 to 0.80 at 20 deg: enough to cut into periods
 MIN_PERIODS = 4  # of nutation, to judge a slope by their scatter
@@ -84,7 +83,7 @@ class Run:
     fingerprint: str  # of what the trajectory was made from
     notes: tuple[str, ...]  # why a fitted number is missing
 
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """(n,) True where every quantity is a number."""
         return np.asarray(np.isfinite(self.value).all(axis=1))
 

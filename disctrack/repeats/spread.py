@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from calibration.arrays import Array, Mask
 from disctrack.repeats.alignment import Alignment, Curves
 from disctrack.repeats.averages import CONSISTENT, improbable
 from disctrack.repeats.runs import INDEX, QUANTITIES
-
-Array = NDArray[np.float64]
 
 TURNED = 0.3  # [rad] psi offsets beyond this: the runs started turned about the vertical, and so are their paths
 MATCHED = ("theta", "psidot", "energy")  # in which a run can stand out
@@ -25,7 +24,7 @@ class Spread:
 
     time: Array  # (k,) [s]
     count: NDArray[np.int64]  # (k,) runs that are there
-    common: NDArray[np.bool_]  # (k,) where all are; where any two are, if all never are together
+    common: Mask  # (k,) where all are; where any two are, if all never are together
     value: Array  # (n, k, 8) each run on the common clock, its offset taken off; NaN where it is not
     mean: Array  # (k, 8)
     std: Array  # (k, 8) over the runs, n - 1 in the denominator; NaN where fewer than two are
@@ -114,7 +113,7 @@ def _mean(values: Array, count: NDArray[np.int64]) -> Array:
         return np.asarray(np.nansum(values, axis=0) / np.where(count > 0, count, np.nan)[:, None])
 
 
-def _without_offsets(value: Array, common: NDArray[np.bool_]) -> tuple[Array, Array, bool]:
+def _without_offsets(value: Array, common: Mask) -> tuple[Array, Array, bool]:
     """Values without each run's constant offset where a quantity has an origin of its own, and these offsets."""
     value = value.copy()
     offset = np.zeros((len(value), len(QUANTITIES)))

@@ -6,13 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array
 from disctrack.disc import Disc
 from disctrack.rolling.effects import Effect
 from disctrack.rolling.records import KINEMATICS, WRENCH, record_dtype
-
-Array = NDArray[np.float64]
 
 _K = np.array([0.0, 0.0, 1.0])
 

@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
+from calibration.arrays import Array
 from disctrack.rolling._compiled import call_system
 
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
@@ -56,9 +57,9 @@ def integrate(
     system: System,
     t0: Any,
     y0: NDArray[Any],
-    grid: NDArray[np.float64],
+    grid: Array,
     rtol: float,
-    atol: NDArray[np.float64],
+    atol: Array,
     max_steps: int = 200_000,
 ) -> Stretch:
     """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.

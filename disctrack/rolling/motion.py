@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.frames import nodal_axes_world, rotation_from_euler
 from disctrack.rolling import equations
 from disctrack.rolling.model import Model
 from disctrack.rolling.records import ROLLING_COMPONENTS
-
-Array = NDArray[np.float64]
 
 
 class Regime(IntEnum):

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, coordinates
@@ -20,7 +21,6 @@ from disctrack.rolling.records import STATE_COMPONENTS
 from disctrack.rolling.simulate import MAX_SWITCHES, RTOL, _grid, _start, follow
 from disctrack.rolling.state import State
 
-Array = NDArray[np.float64]
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from disctrack.rolling import integrate
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import ModelError
@@ -15,8 +16,6 @@ from disctrack.rolling.equations import EVENTS, FLYING, ROLLING, SLIPPING, STICK
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Motion, Regime, Samples, Switch, coordinates, motion_from_samples
 from disctrack.rolling.state import State
-
-Array = NDArray[np.float64]
 
 RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over 1.5 s
 # m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of what moves

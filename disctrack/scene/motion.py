@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.scene.description import RollingMotion, Scene
 
 if TYPE_CHECKING:
     from disctrack.rolling import Model, Motion, State
 
-Array = NDArray[np.float64]
 
 _SAMPLES_PER_FRAME = 4  # of the simulated motion; a cubic between them errs by 3e-8 of a nutation oscillation
 

@@ -14,13 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig, normalise, triangulate
 from calibration.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_vector
 from disctrack.track.pose import fit_poses, marker_pixels
-
-Array = NDArray[np.float64]
 
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by little
@@ -277,7 +276,7 @@ def _best_explanation(
     return best
 
 
-def _facing(R: Array, t: Array, rig: StereoRig, disc: Disc) -> NDArray[np.bool_]:
+def _facing(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Mask:
     """(n, 2) True where the camera is on the side of the upper face."""
     result = []
     for R_cw, t_cw in rig.camera_poses():

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
@@ -26,7 +27,7 @@ BLOCK = 256  # pairs
 class _Block:
     frames: NDArray[np.int64]
     images: Images
-    readable: NDArray[np.bool_]
+    readable: Mask
 
 
 def measure_pairs(

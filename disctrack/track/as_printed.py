@@ -17,13 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import N_RIG, StereoRig
 from disctrack.disc import Disc
 from disctrack.track.pose import fit_poses, marker_pixels, whitening
-
-Array = NDArray[np.float64]
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
@@ -134,7 +132,7 @@ def refine_as_built(
     )
 
 
-def _prior_information(rig_covariance: Array, free: NDArray[np.bool_], m: int) -> Array:
+def _prior_information(rig_covariance: Array, free: Mask, m: int) -> Array:
     information = np.zeros((len(free), len(free)))
     rig_free = np.flatnonzero(free[:N_RIG])
     if rig_free.size:
@@ -188,7 +186,7 @@ def _pattern_motions(disc: Disc) -> Array:
     return motions
 
 
-def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:
+def _information_scale(covariance: Array, used: Mask) -> float:
     """Factor on the data's information: n frames of sigma count at most as (sigma / SYSTEMATIC_PX)^2 frames."""
     variance = float(np.median(0.5 * np.trace(covariance, axis1=-2, axis2=-1)[used]))
     independent = variance / SYSTEMATIC_PX**2
@@ -199,12 +197,12 @@ def _information_scale(covariance: Array, used: NDArray[np.bool_]) -> float:
 def shared_normal_equations(
     observed: Array,
     covariance: Array,
-    used: NDArray[np.bool_],
+    used: Mask,
     rig: StereoRig,
     disc: Disc,
     R: Array,
     t: Array,
-    free: NDArray[np.bool_],
+    free: Mask,
     further: Array | None = None,
 ) -> tuple[Array, Array]:
     """Normal matrix (k, k) and gradient (k,) of what the frames share, every frame's pose eliminated.

@@ -20,14 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image
 from calibration.camera import Camera, normalise, project
 from calibration.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
 from disctrack.track import _kernels as kernels
 from disctrack.trajectory import MarkerStatus
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
 

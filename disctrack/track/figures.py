@@ -8,13 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.pages.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
-
-Array = NDArray[np.float64]
 
 BAND = 3.0  # sigmas shown as a band: one is thinner than the line in most recordings
 _LABELS = {

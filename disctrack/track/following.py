@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from calibration.arrays import Array, Array32, Image, Mask
 from calibration.camera import StereoRig
 from calibration.grey_levels import saturation_level
 from disctrack.disc import Disc
@@ -32,8 +33,6 @@ from disctrack.track.dots import (
 from disctrack.track.motion_span import StillScene
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
-Array = NDArray[np.float64]
-Images = NDArray[np.uint8] | NDArray[np.uint16]
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
@@ -98,7 +97,7 @@ class Search:
             since=self.since + n,
         )  # fmt: skip
 
-    def is_due(self, pair: Images, readable: NDArray[np.bool_], seen: bool) -> bool:
+    def is_due(self, pair: Image, readable: Mask, seen: bool) -> bool:
         """True where there is credit, and reason to hope.
 
         A disc that was seen before comes out from behind a hand after some frames: the wait grows by one with every
@@ -112,7 +111,7 @@ class Search:
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
-    def failed(self, images: Images, readable: NDArray[np.bool_]) -> Search:
+    def failed(self, images: Image, readable: Mask) -> Search:
         """After a search of the first of the pairs; the second tells how pixels scatter without anything new."""
         scenes = None
         if len(images) > 1 and readable[:2].all():
@@ -138,8 +137,8 @@ class Tables:
     pixels: Array  # (n, 2, m, 2)
     covariance_px2: Array  # (n, 2, m, 2, 2)
     status: NDArray[np.uint8]  # (n, 2, m)
-    misfit: NDArray[np.float32]  # (n, 2, m) reduced chi-square of the grey values round each dot
-    n_pixels: NDArray[np.float32]  # (n, 2, m) grey values that it was taken over
+    misfit: Array32  # (n, 2, m) reduced chi-square of the grey values round each dot
+    n_pixels: Array32  # (n, 2, m) grey values that it was taken over
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
     frame_status: NDArray[np.uint8]  # (n,)
@@ -189,9 +188,7 @@ class Follower:
             self.told.set_result(None)
 
 
-def run(
-    setup: Setup, law: Law, heading: Heading, images: Images, readable: NDArray[np.bool_], rows: Rows
-) -> tuple[int, Heading]:
+def run(setup: Setup, law: Law, heading: Heading, images: Image, readable: Mask, rows: Rows) -> tuple[int, Heading]:
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
     poses = setup.rig.camera_poses()
     # the loop moves them on
@@ -277,7 +274,7 @@ def empty_rows(n: int, m: int) -> Rows:
     return Rows(np.full((n, 2, m, kernels.N_RESULT), np.nan), tables.status, tables.R, tables.t)
 
 
-def follow_block(follower: Follower, images: Images, readable: NDArray[np.bool_], tables: Tables, start: int) -> None:
+def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
     """Fill the tables' rows from `start` on with what n pairs show; images (n, 2, height, width), readable (n, 2)."""
     n, i = len(images), 0
     own = slice(start, start + n)
@@ -315,9 +312,7 @@ def follow_block(follower: Follower, images: Images, readable: NDArray[np.bool_]
     tables.misfit[own], tables.n_pixels[own] = dots.misfit, results[..., kernels.N_PIXELS]
 
 
-def _repeated_alone(
-    images: Images, readable: NDArray[np.bool_], tables: Tables, start: int, first: int
-) -> NDArray[np.bool_]:
+def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, first: int) -> Mask:
     """(n, 2) True where one camera repeats an earlier image and the other does not; the tables keep the digests.
 
     No two images of a camera are equal, by their noise. Where both repeat, nothing may have moved: that is judged by
@@ -331,7 +326,7 @@ def _repeated_alone(
     return repeated & ~repeated.all(axis=1, keepdims=True)
 
 
-def repeats(digest: NDArray[np.uint32]) -> NDArray[np.bool_]:
+def repeats(digest: NDArray[np.uint32]) -> Mask:
     """(n, 2) True where a camera's image is one of those REPEAT_REACH frames before; digest (n, 2), 0 for no image."""
     repeated = np.zeros(digest.shape, bool)
     for back in range(1, min(REPEAT_REACH, len(digest) - 1) + 1):
@@ -339,7 +334,7 @@ def repeats(digest: NDArray[np.uint32]) -> NDArray[np.bool_]:
     return repeated
 
 
-def recover(follower: Follower, images: Images, readable: NDArray[np.bool_]) -> bool:
+def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     """Set a heading that leads to the disc in the first of the pairs; False where it is not found.
 
     First its last motion is carried on, which costs no more than any other frame; then, now and then, it is searched
@@ -359,7 +354,7 @@ def recover(follower: Follower, images: Images, readable: NDArray[np.bool_]) -> 
     return False
 
 
-def _holds(follower: Follower, heading: Heading, images: Images, readable: NDArray[np.bool_]) -> bool:
+def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) -> bool:
     """True where the first of the pairs shows dots enough at the place where the heading leads."""
     trial = empty_rows(1, follower.setup.disc.n_markers)
     done, _ = run(follower.setup, follower.law, heading, images[:1], readable[:1], trial)
@@ -377,8 +372,8 @@ def _enough(status: NDArray[np.uint8]) -> bool:
 
 def _go_back(
     follower: Follower,
-    images: Images,
-    readable: NDArray[np.bool_],
+    images: Image,
+    readable: Mask,
     rows: Rows,
     status: NDArray[np.uint8],
     found: int,
@@ -392,7 +387,7 @@ def _go_back(
     back = slice(first, found)
     trial = empty_rows(found - first, follower.setup.disc.n_markers)
     heading = Heading((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
-    pairs: Images = np.ascontiguousarray(images[back][::-1])  # type: ignore[assignment]  # the stubs forget the depth
+    pairs: Image = np.ascontiguousarray(images[back][::-1])  # type: ignore[assignment]  # the stubs forget the depth
     usable = np.ascontiguousarray(readable[back][::-1])
     done, _ = run(follower.setup, follower.law, heading, pairs, usable, trial)
     for k in range(done):
@@ -412,7 +407,7 @@ def _refusals(status: NDArray[np.uint8]) -> str:
     return f"blobs lie where the dots should be, but their grey values do not fit the dots of [markers]: {listed}"
 
 
-def _search(follower: Follower, images: Images, readable: NDArray[np.bool_]) -> bool:
+def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     """Search the whole of the first pair (and of the second, for the velocity); at first also measure blur, noise."""
     pose = _found(follower, images[0], readable[0])
     if pose is None:
@@ -431,7 +426,7 @@ def _search(follower: Follower, images: Images, readable: NDArray[np.bool_]) -> 
     return True
 
 
-def _found(follower: Follower, pair: Images, readable: NDArray[np.bool_]) -> Pose | None:
+def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
     setup = follower.setup
     found = acquire(np.where(readable[0], pair[0], 0), np.where(readable[1], pair[1], 0), setup.rig, setup.disc)
     if found.R_world_body is None or found.t_world_body is None:
@@ -440,9 +435,7 @@ def _found(follower: Follower, pair: Images, readable: NDArray[np.bool_]) -> Pos
     return found.R_world_body, found.t_world_body
 
 
-def _measure_blur_and_noise(
-    follower: Follower, images: Images, readable: NDArray[np.bool_], pose: Pose, heading: Heading
-) -> None:
+def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:
     """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
     setup, law = follower.setup, Law()
     n, m = min(NOISE_FRAMES, len(images)), setup.disc.n_markers
@@ -491,7 +484,7 @@ def _measure_blur_and_noise(
     follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1])))
 
 
-def _saturated(images: Images, results: Array, noise: NoiseModel) -> int | None:
+def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:
     """Grey value at which the background of the dots (n, m, 12) is clipped; None where it is not."""
     saturation = saturation_level(images)
     light = results[..., kernels.FIT_LEVEL]

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri  # scipy.stats would take a second to import
 
+from calibration.arrays import Array, Mask
 from disctrack.frames import vector_from_rotation
 from disctrack.track.pose import PoseFits
 from disctrack.trajectory import FrameStatus
-
-Array = NDArray[np.float64]
 
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
@@ -77,7 +76,7 @@ def _nanmedian(values: Array) -> Array:
     return np.where(count > 0, 0.5 * (take[0] + take[1]), np.nan)
 
 
-def outlying_frames(residual_square: Array, dots: NDArray[np.int64]) -> NDArray[np.bool_]:
+def outlying_frames(residual_square: Array, dots: NDArray[np.int64]) -> Mask:
     """(n,) True where a frame's dots miss the tracked pose by far more than is usual: it must not teach the others.
 
     residual_square : (n,) squared residuals of the dots in their sigmas; dots (n,) how many
@@ -98,9 +97,7 @@ class Verdicts:
     factor: Array  # (n,) on the pose's covariance, at least 1
 
 
-def judge_poses(
-    fits: PoseFits, repeated: NDArray[np.bool_], struck: NDArray[np.int64], period: float, radius: float
-) -> Verdicts:
+def judge_poses(fits: PoseFits, repeated: Mask, struck: NDArray[np.int64], period: float, radius: float) -> Verdicts:
     """Judge every pose by its residuals and by the motion of its neighbours.
 
     fits : with the covariances and chi-squares scaled as they will be told; repeated (n,): both images are those of a
@@ -182,7 +179,7 @@ def _jumps_from(fits: PoseFits, side: int) -> Array:
     return square
 
 
-def torn_off(fits: PoseFits, period: float, radius: float) -> NDArray[np.bool_]:
+def torn_off(fits: PoseFits, period: float, radius: float) -> Mask:
     """(n,) True for frames that no motion joins to their neighbours, where the neighbours are the more.
 
     Between two frames the disc may be hit: its centre's velocity changes by GREATEST_BLOW, its turn by that over the
@@ -214,7 +211,7 @@ def torn_off(fits: PoseFits, period: float, radius: float) -> NDArray[np.bool_]:
     return refused & good
 
 
-def _still_over_the_repeats(repeated: NDArray[np.bool_], rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
     """(n,) True in repeats of a disc that lies still; False where a recorder stuck while the disc moved.
 
     One repeat is still where the frames around it are. In a longer run the frames in between are alike whatever the
@@ -230,7 +227,7 @@ def _still_over_the_repeats(repeated: NDArray[np.bool_], rest: NDArray[np.bool_]
     return still
 
 
-def _at_rest(fits: PoseFits) -> NDArray[np.bool_]:
+def _at_rest(fits: PoseFits) -> Mask:
     """(n,) True where the poses before and after differ by no more than their noise: then a repeat shows no fault."""
     n, rest = len(fits.t_world_body), np.zeros(len(fits.t_world_body), bool)
     if n < 3:

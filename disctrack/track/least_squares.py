@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array, Mask
+
 State = tuple[Array, ...]  # arrays with the problems on the first axis
 MAX_DAMPING = 1e10
 
@@ -21,7 +22,7 @@ class BatchFit:
     state: State
     cost: Array  # (n,) sum of squared whitened residuals at the minimum
     normal_matrix: Array  # (n, p, p) J^T J at the minimum
-    converged: NDArray[np.bool_]  # (n,)
+    converged: Mask  # (n,)
     n_iterations: int
 
 
@@ -80,5 +81,5 @@ def _normal_equations(residuals: Array, jacobian: Array) -> tuple[Array, Array]:
     return (transposed @ residuals[..., None])[..., 0], transposed @ jacobian
 
 
-def _broad(mask: NDArray[np.bool_], like: NDArray[Any]) -> NDArray[np.bool_]:
+def _broad(mask: Mask, like: NDArray[Any]) -> Mask:
     return mask.reshape(-1, *([1] * (like.ndim - 1)))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Image, Mask
 from calibration.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
@@ -20,9 +21,6 @@ from disctrack.track.dots import dot_centres, normalised_maps
 from disctrack.track.following import Follower, Heading, Pose, Rows, Setup, empty_rows, recover, run
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
 from disctrack.trajectory import FrameStatus, coordinate_sigma
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True, repr=False)
@@ -165,13 +163,13 @@ class Tracker:
 
 def _refined(
     pixels: Array, covariances: Array, rig: StereoRig, disc: Disc, R: Array, t: Array, reject: bool
-) -> tuple[Array, Array, Array, Array, float, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Array, Array, float, Mask]:
     """One weighted Gauss-Newton step from the loop's pose, which is good to a hundredth of a pixel: then it is exact.
 
     pixels (1, 2, m, 2), covariances (1, 2, m, 2, 2), R (1, 3, 3), t (1, 3); where a dot stands out, `fit_poses` judges.
     returns : R (3, 3), t (3,), covariance (6, 6), residuals (2, m, 2), reduced chi-square, used (2, m)
     """
-    used: NDArray[np.bool_] = np.asarray(np.isfinite(pixels).all(-1))
+    used: Mask = np.asarray(np.isfinite(pixels).all(-1))
     projected, J = marker_pixels(R, t, rig, disc.marker_centres_body)
     W = whitening(np.where(used[..., None, None], covariances, np.eye(2)))
     residual = np.where(used[..., None], pixels - projected, 0.0)

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array32
 from calibration.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.readers import FrameReader
 from disctrack.readers.blocks import default_threads
 
-Array = NDArray[np.float32]
 Pair = tuple[NDArray, NDArray]
 
 STRIDE = 16  # frames between two looks; irregular by JITTER, so that no turn of the disc comes back to every look
@@ -67,14 +67,14 @@ class StillScene:
         return int(np.count_nonzero(z > THRESHOLD)) >= MIN_PIXELS
 
 
-def _reduced(image: NDArray) -> Array:
+def _reduced(image: NDArray) -> Array32:
     """Means of two by two pixels, in steps of the grey value: images of any depth alike."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     whole = image[: 2 * height, : 2 * width].astype(np.float32) / np.float32(level_step(image))
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _noise(mean: Array, difference: Array, steep: Array) -> Array:
+def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
     """Variance (h, w) of a difference of two reduced images at rest, read + gain * grey, from flat parts.
 
     Medians, because the two images may already show motion; where things move, they move at edges.

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.grey_levels import full_scale
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
-Array = NDArray[np.float64]
 ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
 
 PLAYBACK_HZ = 25.0

@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, StereoRig
 from disctrack.disc import Disc
 from disctrack.track.as_printed import DOT_SIGMA, declared_places_kept, places_sigma, shared_normal_equations
 from disctrack.track.pose import PoseFits, fit_poses, whitening
-
-Array = NDArray[np.float64]
 
 MIN_FRAMES = 20
 LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
@@ -55,7 +53,7 @@ def without_shared_faults(
 
     Shapes as in `pose.fit_poses`. None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
     """
-    seen: NDArray[np.bool_] = np.asarray(np.isfinite(markers_px).all(-1))
+    seen: Mask = np.asarray(np.isfinite(markers_px).all(-1))
     steady = np.zeros(len(R), bool)
     complete = np.asarray(seen.all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
     steady[1:-1] = complete[:-2] & complete[1:-1] & complete[2:]

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig, project_with_jacobians
 from disctrack import frames
 from disctrack.track.least_squares import BatchFit, State, levenberg_marquardt
-
-Array = NDArray[np.float64]
 
 MIN_DOTS = 3  # six unknowns, two numbers per dot
 # A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
@@ -33,10 +32,10 @@ class PoseFits:
     covariance: Array  # (n, 6, 6) POSE_COMPONENTS, from the markers' covariances alone
     sensitivity: Array  # (n, 6, 30) d pose / d RIG_PARAMETERS with the markers held fixed
     residuals_px: Array  # (n, 2, m, 2) observed - projected, also of rejected dots; NaN where a dot was not seen
-    used: NDArray[np.bool_]  # (n, 2, m)
+    used: Mask  # (n, 2, m)
     chi_square: Array  # (n,)
     degrees_of_freedom: NDArray[np.int64]  # (n,)
-    converged: NDArray[np.bool_]  # (n,)
+    converged: Mask  # (n,)
 
     @property
     def reduced_chi_square(self) -> Array:
@@ -144,9 +143,7 @@ def fit_poses(
     )
 
 
-def _minimise(
-    observed: Array, W: Array, used: NDArray[np.bool_], rig: StereoRig, centres: Array, R: Array, t: Array
-) -> BatchFit:
+def _minimise(observed: Array, W: Array, used: Mask, rig: StereoRig, centres: Array, R: Array, t: Array) -> BatchFit:
     n = len(observed)
 
     def evaluate(state: State) -> tuple[Array, Array]:
@@ -164,7 +161,7 @@ def _minimise(
 def _worst_dot(
     observed: Array,
     W: Array,
-    used: NDArray[np.bool_],
+    used: Mask,
     rig: StereoRig,
     centres: Array,
     R: Array,
@@ -201,15 +198,15 @@ def _worst_dot(
     return rows[struck]
 
 
-def _safe_rotation(R: Array, possible: NDArray[np.bool_]) -> Array:
+def _safe_rotation(R: Array, possible: Mask) -> Array:
     return R[np.argmax(possible)] if possible.any() else np.eye(3)
 
 
-def _safe_translation(t: Array, possible: NDArray[np.bool_]) -> Array:
+def _safe_translation(t: Array, possible: Mask) -> Array:
     return t[np.argmax(possible)] if possible.any() else np.zeros(3)
 
 
-def _empty(n: int, m: int, seen: NDArray[np.bool_]) -> PoseFits:
+def _empty(n: int, m: int, seen: Mask) -> PoseFits:
     nan = np.nan
     return PoseFits(
         np.full((n, 3, 3), nan),

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.brief import Brief
 from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
@@ -29,7 +29,6 @@ from disctrack.track.motion_span import MotionSpan, find_motion
 from disctrack.track.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
-Array = NDArray[np.float64]
 Progress = Callable[[int], None]
 
 WHOLE_BELOW = 2.0  # [s] a recording as short as this was cut to what is wanted, and rest in it is wanted too

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import StereoCalibration, StereoRig
+from calibration.arrays import Array
 from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 
-Array = NDArray[np.float64]
 _SHOWN_RANGES = 6
 
 

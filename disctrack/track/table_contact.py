@@ -18,15 +18,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from calibration.arrays import Array
 from calibration.camera import N_RIG, StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits
-
-Array = NDArray[np.float64]
 
 SOURCES = ("both", "board", "disc")
 MIN_FRAMES = 30

@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
@@ -26,7 +27,7 @@ from disctrack.track.as_printed import MIN_MARKER_SHIFT, AsBuilt, refine_as_buil
 from disctrack.track.dots import NoiseModel, TemplateLimits, normalised_maps
 from disctrack.track.following import (
     Follower,
-    Images,
+    Image,
     Law,
     Search,
     Setup,
@@ -42,8 +43,6 @@ from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, wi
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
 from disctrack.track.table_contact import TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
-
-Array = NDArray[np.float64]
 
 MIN_GOOD_DOT_IMAGES = 6
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
@@ -66,11 +65,11 @@ class PairBlock(Protocol):
         """(n,) numbers of the pairs."""
 
     @property
-    def images(self) -> Images:
+    def images(self) -> Image:
         """(n, 2, height, width)."""
 
     @property
-    def readable(self) -> NDArray[np.bool_]:
+    def readable(self) -> Mask:
         """(n, 2)."""
 
 
@@ -239,7 +238,7 @@ def _torn(tables: Tables, edge: int) -> bool:
     return bool(np.arccos(np.clip((np.trace(miss) - 1) / 2, -1, 1)) > MAX_EDGE_TURN)
 
 
-def check_images(images: Images, rig: StereoRig) -> None:
+def check_images(images: Image, rig: StereoRig) -> None:
     """Raise TrackingError unless the images have the size that the rig was calibrated at."""
     height, width = images.shape[-2:]
     for name, camera in zip(frames.CAMERAS, rig.cameras, strict=True):
@@ -324,7 +323,7 @@ def _assemble(
     )
 
 
-def _outlying(tables: Tables, setup: Setup) -> NDArray[np.bool_]:
+def _outlying(tables: Tables, setup: Setup) -> Mask:
     """(n,) True where the dots miss the pose that was tracked by far more than in the other frames."""
     n = len(tables.t)
     square, dots = np.zeros(n), np.zeros(n, np.int64)
@@ -341,7 +340,7 @@ def _outlying(tables: Tables, setup: Setup) -> NDArray[np.bool_]:
 _MISFIT = "the dots miss their fitted places"
 
 
-def _repeats_in_words(repeated: NDArray[np.bool_], pairs: range) -> tuple[str, ...]:
+def _repeats_in_words(repeated: Mask, pairs: range) -> tuple[str, ...]:
     """Images that are copies of earlier ones, as (n, 2)."""
     said = []
     for camera, copies in zip(frames.CAMERAS, (repeated & ~repeated.all(axis=1, keepdims=True)).T, strict=True):

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Array32, Mask
 from calibration.camera import Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_euler, rotation_from_vector
@@ -20,7 +20,6 @@ from disctrack.render import expected_disc
 from disctrack.scene.description import Scene, SensorSettings
 from disctrack.track.dots import face_edge, normalised_maps
 
-Array = NDArray[np.float64]
 Maps = tuple[tuple[Array, Array], tuple[Array, Array]]
 
 # Steps of the central differences: 0.08 px in the image. Their error is (step/blur)^2 / 6 = 0.2 %, that of 32-bit grey
@@ -35,7 +34,7 @@ class Bound:
 
     dots: Array  # (6, 6) from the pixels of the upper face's dots: what a method that uses the dots can know
     image: Array  # (6, 6) from all pixels: rim, side and the table behind included
-    expected: NDArray[np.float32]  # (2, height, width) the noise-free images
+    expected: Array32  # (2, height, width) the noise-free images
 
     @property
     def covariance(self) -> Array:
@@ -98,7 +97,7 @@ def _information(derivative: Array, weight: Array) -> Array:
     return np.asarray((rows * weight.ravel()) @ rows.T)
 
 
-def dot_pixels(R: Array, t: Array, camera: Camera, disc: Disc, rays: tuple[Array, Array]) -> NDArray[np.bool_]:
+def dot_pixels(R: Array, t: Array, camera: Camera, disc: Disc, rays: tuple[Array, Array]) -> Mask:
     """(height, width) True within DOT_BAND_PX of a dot of the upper face, if the camera sees that face."""
     h = disc.half_thickness
     if (-R.T @ t)[2] <= h:

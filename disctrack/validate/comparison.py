@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.frames import rotation_from_euler, rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 GROSS_POSITION = 0.5e-3  # [m] and
 GROSS_ROTATION = np.radians(1.0)  # beyond: not an error of measurement but another pose
@@ -30,19 +28,19 @@ class Comparison:
     calibration_covariance: Array  # (n, 6, 6) reported, the rig's share
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def found(self) -> Mask:
         """(n,) True where a pose was reported."""
         return np.asarray(np.isfinite(self.error).all(axis=1))
 
     @property
-    def gross(self) -> NDArray[np.bool_]:
+    def gross(self) -> Mask:
         """(n,) True where what was reported is another pose altogether."""
         size = [np.linalg.norm(self.error[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))]
         with np.errstate(invalid="ignore"):
             return np.asarray((size[0] > GROSS_POSITION) | (size[1] > GROSS_ROTATION))
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> Mask:
         """(n,) found and not gross."""
         return np.asarray(self.found & ~self.gross)
 
@@ -53,7 +51,7 @@ class Comparison:
             return self.error[ok, 3:].ravel()
         return self.error[ok, i] if i < 3 else self.angles[ok, i - 3]
 
-    def part(self, rows: NDArray[np.bool_]) -> Comparison:
+    def part(self, rows: Mask) -> Comparison:
         """The poses where `rows` (n,) is True."""
         return Comparison(
             self.q[rows], self.error[rows], self.angles[rows], self.covariance[rows], self.calibration_covariance[rows]

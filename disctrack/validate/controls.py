@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
@@ -21,8 +22,6 @@ from disctrack.validate.comparison import Comparison, compare
 from disctrack.validate.poses import centre_height
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, LOST_ALLOWED, stress_poses
 from disctrack.validate.trial import every, locate
-
-Array = NDArray[np.float64]
 
 N_POSES = 24  # the measurement judges its own scatter from 20 pairs on
 DIAMETER_FAULT = 1.08

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.frames import euler_jacobian
 from disctrack.render.sensor import digitise
@@ -16,9 +16,7 @@ from disctrack.trajectory import MarkerStatus
 from disctrack.validate.bound import camera_maps, inverse_information, pose_bound
 from disctrack.validate.comparison import QUANTITIES, Comparison, compare
 from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, static_poses
-from disctrack.validate.trial import Images, every, locate
-
-Array = NDArray[np.float64]
+from disctrack.validate.trial import Image, every, locate
 
 
 @dataclass(frozen=True)
@@ -32,11 +30,11 @@ class Efficiency:
     bias: Array  # (n, 7) mean of the copies minus truth; rotation: root mean square of its components
     reported: Array  # (n, 7) sigma that the measurement states
     excess: Array  # (n,) mean of e^T F e / 6 about the mean: variance over the bound's, 1 at best
-    all_dots: NDArray[np.bool_]  # (n,) every dot was used in both cameras in every copy
+    all_dots: Mask  # (n,) every dot was used in both cameras in every copy
     copies: int
 
     @property
-    def judged(self) -> NDArray[np.bool_]:
+    def judged(self) -> Mask:
         """(n,) poses that `efficiency` is taken from: those with all dots, or all where there are none.
 
         A dot seen nearly edge-on, or in part, is refused though its pixels count in the bound.
@@ -67,7 +65,7 @@ def measure_efficiency(scene: Scene, rig: StereoRig, n_poses: int, copies: int) 
             for _ in range(copies)
         ]
     )
-    tracking = locate(cast(Images, images), rig, disc, scene.cameras.frame_rate_hz, apart=True)
+    tracking = locate(cast(Image, images), rig, disc, scene.cameras.frame_rate_hz, apart=True)
     trajectory = every(tracking.trajectory, 2)
     comparison = compare(trajectory, np.repeat(poses, copies, axis=0))
     used = (trajectory.marker_status == MarkerStatus.MEASURED).all(axis=(1, 2)).reshape(len(poses), copies)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.calibrate.views import calibrate_recording
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.recording.declaration import read_recording
@@ -18,8 +18,6 @@ from disctrack.scene.description import GlareSettings, ImperfectionSettings, Sce
 from disctrack.scene.motion import motion_of
 from disctrack.validate.comparison import compare
 from disctrack.validate.trial import locate, read_images, rolling_scene
-
-Array = NDArray[np.float64]
 
 ORDINARY = ImperfectionSettings(
     lens_field_px=0.02,

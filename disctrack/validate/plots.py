@@ -8,15 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED
 from disctrack.validate.comparison import Comparison, joined
 from disctrack.validate.efficiency import Efficiency
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, Stress
 from disctrack.validate.trial import Trial
-
-Array = NDArray[np.float64]
 
 _UM, _DEG = 1e6, 180 / np.pi
 AXES = (BLUE, AMBER, RED)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_euler
-
-Array = NDArray[np.float64]
 
 # Nutation [deg]: the error of psi and phi goes as 1/sin(theta), so the strata are about even in log(theta).
 STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, 85.0))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
@@ -22,8 +23,6 @@ from disctrack.scene.description import GlareSettings, Occluder, Scene
 from disctrack.validate.comparison import compare
 from disctrack.validate.poses import cameras_in_sight, centre_height
 from disctrack.validate.trial import every, locate
-
-Array = NDArray[np.float64]
 
 CLAIM_POSITION = 5e-6  # [m] and
 CLAIM_ROTATION = np.radians(0.05)  # Ma et al. 2014, end of section 3
@@ -179,7 +178,7 @@ def apply_stress(
     return Stress(disturbance.name, disturbance.unit, ordered, bracket(list(ordered)))
 
 
-def _dots_off(disc: Disc, n: int, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _dots_off(disc: Disc, n: int, count: int, rng: np.random.Generator) -> Mask:
     """(n, m) which dots have come off, at random, but for the innermost: without it the others repeat every 60 deg."""
     keeps = int(np.argmin(np.linalg.norm(disc.marker_centres_body[:, :2], axis=1)))
     others = np.delete(np.arange(disc.n_markers), keeps)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.validate.comparison import (
     QUANTITIES,
     Comparison,
@@ -23,8 +23,6 @@ from disctrack.validate.efficiency import Efficiency, law_constant
 from disctrack.validate.poses import STRATA_DEG
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, Stress
 from disctrack.validate.trial import FINAL, ROLLING, Measured, Trial
-
-Array = NDArray[np.float64]
 
 CLAIM = dict(zip(QUANTITIES, 3 * [CLAIM_POSITION] + 4 * [CLAIM_ROTATION], strict=True))
 REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta) is all there is to see
@@ -130,7 +128,7 @@ def summarise(
 Pair = tuple[Comparison, Comparison]  # through the own calibration, through the true cameras
 
 
-def _both(measured: Measured, rows: NDArray[np.bool_]) -> Pair:
+def _both(measured: Measured, rows: Mask) -> Pair:
     return measured.own.part(rows), measured.true.part(rows)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import StereoCalibration
+from calibration.arrays import Array, Image, Mask
 from calibration.camera import StereoRig
 from disctrack.calibrate.views import calibrate_recording
 from disctrack.disc import Disc
@@ -30,9 +31,6 @@ from disctrack.track.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import Trajectory
 from disctrack.validate.comparison import Comparison, compare
 from disctrack.validate.poses import cameras_in_sight, static_poses
-
-Array = NDArray[np.float64]
-Images = NDArray[np.uint8] | NDArray[np.uint16]
 
 ROLLING = "rolling at 8 to 12 deg"
 FINAL = "rolling to rest at 0.5 deg"
@@ -68,8 +66,8 @@ class Pairs:
     """Pairs of images in memory, as `track` reads them."""
 
     frames: NDArray[np.int64]
-    images: Images  # (n, 2, height, width)
-    readable: NDArray[np.bool_]  # (n, 2)
+    images: Image  # (n, 2, height, width)
+    readable: Mask  # (n, 2)
 
 
 def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
@@ -165,7 +163,7 @@ def run_trial(
     return Trial(scene, truth, calibration, measured[0], dict(zip(stretches, measured[1:], strict=True)))
 
 
-def read_images(recording: Recording, start: int, stop: int) -> Images:
+def read_images(recording: Recording, start: int, stop: int) -> Image:
     """(n, 2, height, width) pairs start ... stop-1 of a recording."""
     left, right = (
         open_frames(pattern, recording.folder, camera)
@@ -175,7 +173,7 @@ def read_images(recording: Recording, start: int, stop: int) -> Images:
 
 
 def measure_twice(
-    images: Images,
+    images: Image,
     q_true: Array,
     disc: Disc,
     own: StereoRig,
@@ -198,7 +196,7 @@ def measure_twice(
     )
 
 
-def locate(images: Images, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
+def locate(images: Image, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
     """Track pairs in memory. apart: an unreadable pair follows each one, so that each is found without a prior."""
     step = 2 if apart else 1
 

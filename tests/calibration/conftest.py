@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calibration import Board, Camera, Observations, StereoModel
-from calibration.camera import Array, project, rotation_from_vector
+from calibration.arrays import Array
+from calibration.camera import project, rotation_from_vector
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.system import DiscSystem
@@ -16,8 +15,6 @@ from disctrack.diagnosis.engine.whiteness import Whiteness, whiteness
 from disctrack.frames import euler_jacobian, nodal_axes_world
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_power, kinematics
-
-Array = NDArray[np.float64]
 
 HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last frame that the fit has seen
 HALF_WINDOW = 0.01  # [s] over which the error at a horizon is averaged: some frames, a fraction of a turn

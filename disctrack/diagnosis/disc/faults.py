@@ -15,15 +15,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import Camera, StereoRig, project_with_jacobians
 from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS, rotation_from_vector
 from disctrack.scene.description import CameraFault, Faults, Scene
-
-Array = NDArray[np.float64]
 
 TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
 RIM_POINTS = 24  # of a dot's outline, for the centre of its image

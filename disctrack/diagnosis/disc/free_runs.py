@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import Motion, differentiate
 from disctrack.analyse.energy import analyse_energy
@@ -20,8 +20,6 @@ from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.held_out import held_out
 from disctrack.errors import AnalysisError
 from disctrack.trajectory import part
-
-Array = NDArray[np.float64]
 
 SHORTEST = 0.05  # [s] of frames from which a longer free run may start
 

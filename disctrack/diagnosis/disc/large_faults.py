@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from calibration.arrays import Array
 from calibration.camera import StereoRig
 from disctrack.diagnosis.disc.faults import Setup, faults_of, setup_of
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
@@ -26,8 +26,6 @@ from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, 
 from disctrack.rolling import Model
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 LARGE_PX = 1.0  # rms in the dots, from which a fault is sought without the linear approximation
 ITERATIONS = 6

@@ -13,16 +13,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, prior_rows, triangle
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.rolling import Model
 from disctrack.rolling.effects import Effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
-
-Array = NDArray[np.float64]
 
 AXES = ("n", "m", "z")
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved

@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.whiteness import ljung_box, whiteness
-
-Array = NDArray[np.float64]
 
 LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
 MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks

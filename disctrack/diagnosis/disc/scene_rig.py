@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import StereoRig
 from disctrack.scene.description import RigSettings, Scene
-
-Array = NDArray[np.float64]
 
 
 def scene_with_rig(scene: Scene, rig: StereoRig) -> Scene:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from disctrack.diagnosis.disc.stretch import MIN_FRAMES, Stretch
 from disctrack.diagnosis.disc.system import DiscSystem
@@ -17,8 +16,6 @@ from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import State, simulate, steady_precession
 from disctrack.trajectory import MarkerStatus
-
-Array = NDArray[np.float64]
 
 NUTATIONS_DEG = (3.0, 8.0, 15.0, 30.0)
 SPINS = (0.5, 5.0)  # omega_3 [rad/s]

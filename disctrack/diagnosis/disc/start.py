@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
 from disctrack.diagnosis.disc.stretch import FIRST_WINDOW
 from disctrack.diagnosis.engine.fit import fit
@@ -17,7 +17,6 @@ from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.system import DiscSystem
 
-Array = NDArray[np.float64]
 
 STRETCHES = (0.03, 0.08, 0.2, 0.5)  # [s] a linear step from one stretch's fit stays in the next one's basin
 FRICTIONS = (0.03, 1.0)  # coefficients to begin with are sought between these

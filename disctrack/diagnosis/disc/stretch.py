@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_euler, vector_from_rotation
 from disctrack.trajectory import Trajectory
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 MIN_THETA = np.radians(0.7)  # below, the disc of Ma et al. touches its paper, and leaves the model

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.disc.faults import Sight, faults_of, measurement_candidates, predict, setup_of
 from disctrack.diagnosis.disc.motion import (
     SLIP,
@@ -28,8 +29,6 @@ from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
 from disctrack.track.pose import whitening
 from disctrack.trajectory import MarkerStatus, Trajectory
-
-Array = NDArray[np.float64]
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
@@ -59,7 +58,7 @@ class StaticView:
     faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by faults of the measurement, in their typical sizes
     sizes: dict[str, dict[str, float]]  # the typical sizes of their quantities
     places: Array  # (k, 2, m, 2) [px]
-    used: NDArray[np.bool_]  # (k, 2, m)
+    used: Mask  # (k, 2, m)
     whiten: Array  # (k, 2, m, 2, 2)
 
 

@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from calibration.arrays import Array, Mask
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.system import DiscSystem, StaticView
     from disctrack.diagnosis.engine.system import Values
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_DIFFERENCES = 20  # third differences from which a noise is read
 INFLATED = 0.8  # variance from frame to frame over that stated, below which the statement holds more than noise

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.nuisances import Projection, is_linear, projection
 from disctrack.diagnosis.engine.system import Quantity, System, Values
-
-Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.system import Quantity, Subset, System, Values
-
-Array = NDArray[np.float64]
 
 TRAIN_FRACTION = 0.65  # of the time
 
@@ -21,7 +19,7 @@ class HeldOut:
     """Prediction of samples that the fit has not seen."""
 
     train: Fit
-    test_rows: NDArray[np.bool_]  # (n,)
+    test_rows: Mask  # (n,)
     chi_square: float  # of the free run on the test rows; infinite where it ends too early
     expected: float  # what noise and the fitted quantities' uncertainty make of it
     log_density: float  # of the test data under the predictive distribution (up to a constant)
@@ -33,13 +31,13 @@ class HeldOut:
         return float(np.sqrt(self.chi_square / self.expected)) if self.expected > 0 else float("nan")
 
 
-def training_rows(system: System, fraction: float = TRAIN_FRACTION) -> NDArray[np.bool_]:
+def training_rows(system: System, fraction: float = TRAIN_FRACTION) -> Mask:
     """(n,) True in the first part of the time that has data."""
     seen = system.time[system.weights > 0]
     return np.asarray(system.time <= seen[0] + fraction * (seen[-1] - seen[0]), bool)
 
 
-def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows: NDArray[np.bool_]) -> HeldOut:
+def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows: Mask) -> HeldOut:
     """Fit on `rows`, then predict the others from that fit alone.
 
     The predictive distribution of the test data is normal with covariance 1 + J P J^T (P: covariance of the fit), so

@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
 from disctrack.diagnosis.engine.system import System
-
-Array = NDArray[np.float64]
 
 SHORTEST = 40  # samples from which a memory is looked for
 SURE = 3.0  # standard deviations of the long-run variance itself, below which it says nothing

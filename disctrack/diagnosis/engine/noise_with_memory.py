@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 
 @dataclass(frozen=True)

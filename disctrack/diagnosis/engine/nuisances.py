@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.system import Quantity, Subset, System, Values
-
-Array = NDArray[np.float64]
 
 _KNOWN: WeakKeyDictionary[System, dict[tuple[object, ...], Projection]] = WeakKeyDictionary()
 

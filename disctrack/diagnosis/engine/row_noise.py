@@ -12,10 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.system import System, Values, Wrapped
-
-Array = NDArray[np.float64]
 
 MARGIN = 1.5  # over the largest eigenvalue that independent noise brings (Marchenko and Pastur's edge)
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2

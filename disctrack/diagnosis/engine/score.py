@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, compress, prior_rows, solve_bounded
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
 from disctrack.diagnosis.engine.system import Candidate, System
-
-Array = NDArray[np.float64]
 
 INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
 

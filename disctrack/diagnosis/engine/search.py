@@ -12,17 +12,15 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from calibration.arrays import Mask
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_all, score_pairs
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
-
-Array = NDArray[np.float64]
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
@@ -106,9 +104,7 @@ class Diagnosis:
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
 
 
-def diagnose(
-    system: System, start: Values, settings: Settings | None = None, rows: NDArray[np.bool_] | None = None
-) -> Diagnosis:
+def diagnose(system: System, start: Values, settings: Settings | None = None, rows: Mask | None = None) -> Diagnosis:
     """Fit the base model, look for what it lacks, and say how sure that is.
 
     start : values of the base quantities from which Gauss-Newton converges
@@ -141,7 +137,7 @@ def noise_variance(system: System, fit_: Fit) -> float:
 
 
 class _Search:
-    def __init__(self, system: System, settings: Settings, rows: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, system: System, settings: Settings, rows: Mask | None = None) -> None:
         self.system, self.settings = system, settings
         self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
         self.noise = 1.0

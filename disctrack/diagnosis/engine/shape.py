@@ -11,16 +11,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.score import Linearisation, score
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System
-
-Array = NDArray[np.float64]
 
 MAX_TRIALS = 12  # values of a shape at which the rest is refitted
 ENOUGH = 0.1  # of chi-square: a third of a sigma, beyond which a shape is not pursued

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array, Mask
+
 Values = Mapping[str, float]
 
 
@@ -128,7 +128,7 @@ class Wrapped:
 class Subset(Wrapped):
     """The first samples of a system, or any others: the rest counts as missing."""
 
-    def __init__(self, system: System, rows: NDArray[np.bool_]) -> None:
+    def __init__(self, system: System, rows: Mask) -> None:
         """Rows (n,) True where the sample belongs to the subset."""
         super().__init__(system)
         self._rows = rows

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal, stats
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 LAGS = 20
 

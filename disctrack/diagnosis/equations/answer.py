@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.system import System
@@ -19,8 +19,6 @@ from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term
 from disctrack.diagnosis.equations.loop import Answered, ask
 from disctrack.diagnosis.equations.system import EquationSystem
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

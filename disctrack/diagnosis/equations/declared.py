@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array
 from disctrack.diagnosis.equations.expressions import Formula, checked_name, unknown_name
 from disctrack.errors import AnalysisError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 import sympy
 from numba import njit
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Equations, Parameter, Term
 from disctrack.diagnosis.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
 from disctrack.errors import AnalysisError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, compress, fit
 from disctrack.diagnosis.engine.held_out import held_out
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
@@ -28,8 +28,6 @@ from disctrack.diagnosis.equations.noise import (
 from disctrack.diagnosis.equations.start import LOST, guessed, led, misfit, turn
 from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part
 from disctrack.errors import AnalysisError
-
-Array = NDArray[np.float64]
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them

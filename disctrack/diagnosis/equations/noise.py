@@ -7,12 +7,10 @@ from dataclasses import replace
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.system import System, Values, Wrapped
 from disctrack.diagnosis.equations.declared import Samples
-
-Array = NDArray[np.float64]
 
 _ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them
 MAX_MEMORY = 24  # samples over which noise may remember
@@ -79,7 +77,7 @@ class Remembering(Wrapped):
     coefficients : (w, order) of the autoregression of each channel's whitened residual; gaps begin anew.
     """
 
-    def __init__(self, system: System, rows: Sequence[slice], coefficients: Array, present: NDArray[np.bool_]) -> None:
+    def __init__(self, system: System, rows: Sequence[slice], coefficients: Array, present: Mask) -> None:
         """Rows of each stretch; present (n, w) where there are data."""
         super().__init__(system)
         self._rows, self._present = tuple(rows), present
@@ -99,7 +97,7 @@ class Remembering(Wrapped):
         return out[..., 0], out[..., 1:]
 
 
-def autoregression(residual: Array, present: NDArray[np.bool_], rows: Sequence[slice]) -> tuple[Array, float]:
+def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tuple[Array, float]:
     """Coefficients (w, order) that make a residual (n, w) white, and its variance then over before.
 
     Yule and Walker's equations; the order is Schwarz's choice. Missing samples count as zeros.

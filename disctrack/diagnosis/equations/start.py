@@ -9,18 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 from scipy.optimize import least_squares
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import fit
 from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Samples
 from disctrack.diagnosis.equations.formulas import Formulas
 from disctrack.diagnosis.equations.system import EquationSystem, first_part
-
-Array = NDArray[np.float64]
 
 GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
 LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion

@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Parameter, Samples, Term
 from disctrack.diagnosis.equations.formulas import Formulas
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
 MAX_STEPS = 400_000

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from calibration.arrays import Array
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import frequencies, simulated
 from disctrack.diagnosis.disc.free_runs import Evidence, Measured, force_of
@@ -19,8 +19,6 @@ from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
 from disctrack.pages.figures import Drawn, dress
 from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
-
-Array = NDArray[np.float64]
 
 N_TRIED = 14
 

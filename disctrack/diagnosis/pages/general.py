@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.diagnosis.engine.search import Diagnosis
 from disctrack.diagnosis.engine.system import System
 from disctrack.diagnosis.pages.output import effect_json, tried_json
-
-Array = NDArray[np.float64]
 
 
 def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, Any]:
@@ -73,6 +71,6 @@ def portmanteau(system: System, fit: Fit, lags: int = 5) -> Array:
     return np.asarray(pairs @ memory(system, fit, lags) ** 2, float)
 
 
-def _full_rows(system: System, fit: Fit) -> tuple[Array, NDArray[np.bool_]]:
+def _full_rows(system: System, fit: Fit) -> tuple[Array, Mask]:
     residual, _ = system.linearise(fit.values, [])
     return residual, np.asarray(system.weights == system.weights.max(), bool)

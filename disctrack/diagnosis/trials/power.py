@@ -14,18 +14,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import brentq
 
+from calibration.arrays import Array
 from disctrack.diagnosis import DiscSystem, Settings
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model
 from disctrack.diagnosis.engine.fit import fit
 from disctrack.diagnosis.engine.score import Linearisation
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted
 from disctrack.diagnosis.trials.rates import FRAME_RATE, draw, trajectory_of
-
-Array = NDArray[np.float64]
 
 FARTHEST = 1e4  # times the effect's size, beyond which nothing is looked for
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.camera import N_RIG, StereoRig
 from disctrack.diagnosis.trials.imperfect import Laboratory, shifted_dots
 from disctrack.disc import Disc
@@ -32,7 +32,6 @@ from disctrack.scene.description import Faults, Scene
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings

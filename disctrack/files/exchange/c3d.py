@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 
 def write_c3d(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Path:

@@ -1,0 +1,11 @@
+"""Types of the arrays that both packages speak of."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Array32 = NDArray[np.float32]
+Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack of them, as a camera gives it
