@@ -50,6 +50,8 @@ GROUP_OF_CHANNEL = np.array([0, 0, 1, 2, 2, 3])
 GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
 FRAMES_AT_ONCE = 1024
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
+# Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
+SYSTEMATIC_LENGTH = 0.1
 KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
 
 
@@ -73,6 +75,8 @@ class Motion:
     disc: Disc
     gravity: float  # [m/s^2]
     rig_covariance: Array  # (30, 30)
+    systematic_covariance: Array  # (n, 6, 6) of the pose: what repeats beside the noise and is not the rig's
+    systematic_pace: Array  # (n,) [1/s] of its change: the dots' speed in the image over SYSTEMATIC_LENGTH
 
     def __len__(self) -> int:
         return len(self.time)
@@ -81,6 +85,19 @@ class Motion:
     def known(self) -> Mask:
         """(n,) True where the motion is a number."""
         return np.asarray(np.isfinite(self.omega_world).all(axis=1))
+
+    def systematic_at(self, frames: NDArray[np.int64]) -> Array:
+        """(f, 18, 18) covariance of STATE by what repeats, as of a stationary error that changes at its pace w:
+
+        of itself S, of its rate w^2 S, of that one's rate 3 w^4 S, and -w^2 S between the first and the last.
+        """
+        S, w2 = self.systematic_covariance[frames], self.systematic_pace[frames, None, None] ** 2
+        C = np.zeros((len(frames), N_STATE, N_STATE))
+        for first, second, factor in ((0, 0, 1.0), (6, 6, w2), (12, 12, 3 * w2**2), (0, 12, -w2), (12, 0, -w2)):
+            C[:, first : first + 6, second : second + 6] = factor * S
+        turned = np.broadcast_to(np.eye(N_STATE), C.shape).copy()
+        _rates_of_turned_frame(turned, self.omega_world[frames], self.alpha_world[frames])
+        return np.asarray(turned @ C @ turned.swapaxes(1, 2))
 
     @property
     def state(self) -> tuple[Array, Array, Array, Array, Array, Array]:
@@ -116,7 +133,7 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Motio
     scale = np.repeat(per_order, 6)
     covariance *= np.outer(scale, scale)
     sensitivity *= scale[:, None]
-    _rates_of_turned_frame(sensitivity, state)
+    _rates_of_turned_frame(sensitivity, state[:, 1, 3:], state[:, 2, 3:])
     return Motion(
         time=time,
         position=state[:, 0, :3],
@@ -134,7 +151,30 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Motio
         disc=trajectory.disc,
         gravity=trajectory.gravity,
         rig_covariance=trajectory.rig.covariance,
+        systematic_covariance=_filled(trajectory.systematic_covariance, good),
+        systematic_pace=_pace(trajectory),
     )
+
+
+def _filled(covariance: Array, good: NDArray[np.bool_]) -> Array:
+    """(n, 6, 6) with that of the nearest pose where there is none; 0 where no pose has one."""
+    known = np.flatnonzero(good & np.isfinite(covariance).all(axis=(1, 2)))
+    if not known.size:
+        return np.zeros_like(covariance)
+    after = np.clip(np.searchsorted(known, np.arange(len(good))), 0, len(known) - 1)
+    return np.asarray(covariance[known[after]])
+
+
+def _pace(trajectory: Trajectory) -> Array:
+    """(n,) [1/s] at which errors that depend on the place in the image change, the dots' median over the recording."""
+    px, n = trajectory.markers_px, len(trajectory)
+    with np.errstate(invalid="ignore"):
+        step = np.linalg.norm(np.diff(px, axis=0), axis=-1) / np.diff(trajectory.time)[:, None, None]
+    seen = np.isfinite(step)
+    if not seen.any():
+        return np.zeros(n)
+    length = SYSTEMATIC_LENGTH * max(max(camera.image_size) for camera in trajectory.rig.cameras)
+    return np.full(n, float(np.sqrt(np.mean(step[seen] ** 2))) / length)
 
 
 @dataclass(frozen=True)
@@ -333,13 +373,13 @@ def _smoothed_rows(
     return state, R, covariance[:, by_order][:, :, by_order], sensitivity[:, by_order]
 
 
-def _rates_of_turned_frame(sensitivity: Array, state: Array) -> None:
+def _rates_of_turned_frame(sensitivity: Array, omega_world: Array, alpha_world: Array) -> None:
     """Complete, in place, d omega and d alpha for a rotation error delta(t) that turns the frame: R' = exp(delta) R.
 
     omega' = omega + delta' + delta x omega,  alpha' = alpha + delta'' + delta' x omega + delta x alpha.
     """
     turn, rate = sensitivity[:, 3:6].copy(), sensitivity[:, 9:12].copy()
-    omega, alpha = skew(state[:, 1, 3:]), skew(state[:, 2, 3:])
+    omega, alpha = skew(omega_world), skew(alpha_world)
     sensitivity[:, 9:12] -= omega @ turn
     sensitivity[:, 15:18] -= omega @ rate + alpha @ turn
 

@@ -93,8 +93,12 @@ def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:
     noise = found.covariance_at(ends, this).sum()
     before, after = found.sensitivity_at(ends, this)[:, 0]
     difference = after - before
-    common = max(0.0, float(difference @ found.rig_covariance @ difference))
-    return float(found.value[first, column] - found.value[last, column]), float(np.sqrt(noise)), float(np.sqrt(common))
+    common = float(difference @ found.rig_covariance @ difference) + found.systematic_covariance_at(ends, this).sum()
+    return (
+        float(found.value[first, column] - found.value[last, column]),
+        float(np.sqrt(noise)),
+        float(np.sqrt(max(0.0, common))),
+    )
 
 
 def _level_ratio(motion: Motion, level: Array) -> tuple[float, float]:

@@ -1,7 +1,8 @@
 """Quantities derived from a motion, with two uncertainties that must not be mixed.
 
-Noise differs from frame to frame; the calibration's error is one and the same in all frames. The first averages out,
-the second does not, so every derived quantity carries both apart.
+Noise differs from frame to frame; the calibration's error is one and the same in all frames, and what else repeats
+(`Motion.systematic_at`) changes with the motion only. The first averages out, the others do not, so every derived
+quantity carries the two apart.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Series:
     long_name: str
     value: Array  # (n,)
     sigma: Array  # (n,) from the noise of the poses
-    sigma_calibration: Array  # (n,) from the rig, common to all frames
+    sigma_calibration: Array  # (n,) from the rig, common to all frames, and from what else repeats
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Propagated:
 
     @property
     def calibration_covariance(self) -> Array:
-        """(n, k, k) at one instant, common to all instants."""
+        """(n, k, k) at one instant: the rig's, common to all instants, and that of what else repeats."""
         return self.calibration_covariance_at(np.arange(len(self.value)), slice(None))
 
     @property
@@ -107,11 +108,20 @@ class Propagated:
         )
 
     def calibration_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
-        """(f, c, c) from the rig, of some values in some frames."""
+        """(f, c, c) from the rig and from what else repeats, of some values in some frames."""
 
         def some(rows: NDArray[np.int64]) -> Array:
             S = self.sensitivity_at(rows, columns)
-            return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2))
+            return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2)) + self.systematic_covariance_at(rows, columns)
+
+        return _by_parts(some, frames)
+
+    def systematic_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
+        """(f, c, c) from what repeats and is not the rig's, of some values in some frames."""
+
+        def some(rows: NDArray[np.int64]) -> Array:
+            J = self.jacobian[rows][:, columns]
+            return np.asarray(J @ self.motion.systematic_at(rows) @ J.swapaxes(1, 2))
 
         return _by_parts(some, frames)
 
@@ -121,9 +131,7 @@ class Propagated:
 
         def sigmas(rows: NDArray[np.int64]) -> Array:
             noise = np.diagonal(self.covariance_at(rows, all_columns), axis1=1, axis2=2)
-            return np.stack(
-                [np.sqrt(noise), common_sigma(self.sensitivity_at(rows, all_columns), self.rig_covariance)], 1
-            )
+            return np.stack([np.sqrt(noise), shared_sigma(self.motion, self.jacobian[rows], rows)], 1)
 
         both = _by_parts(sigmas, frames)
         return tuple(
@@ -132,14 +140,20 @@ class Propagated:
         )
 
 
-def common_sigma(sensitivity: Array, rig_covariance: Array) -> Array:
-    """Standard deviations (n, k) that the rig's covariance gives to quantities of sensitivity (n, k, 30)."""
+def shared_sigma(motion: Motion, jacobian: Array, frames: NDArray[np.int64] | None = None) -> Array:
+    """Standard deviations (f, k) of quantities of derivative (f, k, 18) by STATE, from all that does not average out.
 
-    def some(rows: NDArray[np.int64]) -> Array:
-        S = sensitivity[rows]
-        return np.asarray(np.sqrt(np.maximum(np.sum((S @ rig_covariance) * S, axis=2), 0.0)))
+    frames : (f,) that the derivatives belong to; all without
+    """
+    frames = np.arange(len(motion)) if frames is None else frames
 
-    return _by_parts(some, np.arange(len(sensitivity)))
+    def some(part: NDArray[np.int64]) -> Array:
+        J, rows = jacobian[part], frames[part]
+        S = J @ motion.calibration_sensitivity[rows]
+        rig = np.sum((S @ motion.rig_covariance) * S, axis=2)
+        return np.asarray(np.sqrt(np.maximum(rig + np.sum((J @ motion.systematic_at(rows)) * J, axis=2), 0.0)))
+
+    return _by_parts(some, np.arange(len(frames)))
 
 
 def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np.int64]) -> Array:

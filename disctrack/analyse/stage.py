@@ -14,7 +14,7 @@ from disctrack.analyse.power_laws import (
     WINDOW,
     Exponent,
 )
-from disctrack.analyse.propagation import Series, common_sigma
+from disctrack.analyse.propagation import Series, shared_sigma
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
@@ -182,8 +182,7 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
         ("alpha", motion.alpha_world, "rad s-2", "angular acceleration, world axes", 15),
     )
     sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
-    S = motion.calibration_sensitivity
-    common = common_sigma(S, motion.rig_covariance)
+    common = shared_sigma(motion, np.broadcast_to(np.eye(len(STATE)), motion.covariance.shape))
     for name, values, unit, text, first in vectors:
         for i, axis in enumerate("xyz"):
             item = Series(
@@ -192,7 +191,9 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
             variables |= _series_variables((item,))
     J = euler_jacobian(motion.euler[:, 0], motion.euler[:, 1])
     angle_variance = np.einsum("nij,njk,nik->ni", J, motion.covariance[:, 3:6, 3:6], J)
-    shared = common_sigma(J @ S[:, 3:6], motion.rig_covariance)
+    by_state = np.zeros((len(motion), 3, len(STATE)))
+    by_state[:, :, 3:6] = J
+    shared = shared_sigma(motion, by_state)
     for i, name in enumerate(("psi", "theta", "phi")):
         noise = np.sqrt(np.maximum(angle_variance[:, i], 0.0))
         item = Series(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared[:, i])

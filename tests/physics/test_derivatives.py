@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.stats import norm
 
-from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.derivatives import SYSTEMATIC_LENGTH, differentiate
 from disctrack.analyse.propagation import propagate, rates
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_vector, vector_from_rotation
@@ -236,3 +237,33 @@ def test_time_that_runs_backwards_is_an_error(true_motion, as_tracked, rng):
     time[[50, 51]] = time[[51, 50]]
     with pytest.raises(AnalysisError, match="time does not increase"):
         differentiate(as_tracked(replace(truth, time=time), rng))
+
+
+def test_what_repeats_in_the_poses_is_carried_to_the_rates(true_motion, as_tracked, rng):
+    """A smooth error with the stated variance and pace: of pose and rates within their stated sigma, chi-square."""
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:300]
+    trajectory = as_tracked(truth, rng, noise=0.0)
+    S = np.diag([2e-6, 1e-6, 3e-6, 3e-5, 2e-5, 1e-5]) ** 2
+    length = SYSTEMATIC_LENGTH * 512
+    pace = 40.0  # [1/s]: dots that run through the image
+    px = np.broadcast_to((pace * length * truth.time)[:, None, None, None] * [1.0, 0.0], trajectory.markers_px.shape)
+    trajectory = replace(trajectory, systematic_covariance=np.broadcast_to(S, (300, 6, 6)), markers_px=px)
+    motion = differentiate(trajectory)
+    assert_allclose(motion.systematic_pace, pace, rtol=1e-9)
+    squared = {"position": [], "velocity": [], "omega_world": [], "acceleration": [], "alpha_world": []}
+    for _ in range(12):
+        # waves with a normal spectrum of the pace's width
+        w = pace * norm.ppf((np.arange(24) + 0.5) / 24)
+        phase = rng.uniform(0, 2 * np.pi, (6, 24))
+        error = np.sqrt(np.diag(S)) * np.cos(w * truth.time[:, None, None] + phase).sum(-1) / np.sqrt(12)
+        wrong = replace(truth, position=truth.position + error[:, :3], R=rotation_from_vector(error[:, 3:]) @ truth.R)
+        found = differentiate(as_tracked(wrong, rng, noise=0.0))
+        for name in squared:
+            squared[name].append((getattr(found, name) - getattr(motion, name)) ** 2)
+    C = np.diagonal(motion.systematic_at(np.arange(300)), axis1=1, axis2=2)
+    first = {"position": 0, "velocity": 6, "omega_world": 9, "acceleration": 12, "alpha_world": 15}
+    for name, values in squared.items():
+        ratio = np.mean(np.mean(values, axis=0) / C[:, first[name] : first[name] + 3])
+        assert 0.7 < ratio < 1.4, (name, ratio)
+    silent = differentiate(as_tracked(truth, rng, noise=0.0))
+    assert not silent.systematic_at(np.arange(5)).any()
