@@ -1,6 +1,7 @@
 """The command line: a shell round the stages, and the one place where an error becomes a line and an exit code.
 
-A new subcommand is a line in COMMANDS and a module in `disctrack.commands`, which is imported only when it is called.
+A new subcommand is a line in COMMANDS, its arguments in `disctrack.commands.options`, and a module of its name in
+`disctrack.commands` with `run(arguments) -> exit code`, which is imported only when it is called.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ import importlib
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from disctrack import __version__
-from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE
+from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE, options
 
 # The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
 # save. It must stand before numpy is loaded; a user's own setting is kept.
@@ -21,22 +22,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # A damaged image is reported once, in our words with file and frame, not in the decoder's log as well.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
-# In the order of the measurement: name -> (module, what it does).
-COMMANDS: dict[str, tuple[str, str]] = {
-    "init": ("disctrack.commands.init", "folder of frames -> a commented recording.toml"),
-    "print": ("disctrack.commands.print", "declared dots and board -> PDF to print, true to scale"),
-    "check": ("disctrack.commands.check", "what would a run trip over? seconds"),
-    "run": ("disctrack.commands.run", "calibrate and track a recording: folder in, trajectory and pictures out"),
-    "calibrate": ("disctrack.commands.calibrate", "views of a chessboard -> stereo rig with covariance"),
-    "track": ("disctrack.commands.track", "recording and rig -> trajectory with covariance"),
-    "analyse": ("disctrack.commands.analyse", "trajectory -> velocities, contact, energy, scaling laws and a report"),
-    "diagnose": ("disctrack.commands.diagnose", "trajectory -> which effect the model lacks, before and after"),
-    "batch": ("disctrack.commands.batch", "many recordings side by side: a report of each, and one summary"),
-    "simulate": ("disctrack.commands.simulate", "rolling model: scene -> motion, energies, contact forces"),
-    "render": ("disctrack.commands.render", "scene -> recording as the cameras would write it, and its truth"),
-    "convert": ("disctrack.commands.convert", "trajectory or rig from and to the formats of other programs"),
-    "warm-up": ("disctrack.commands.warm_up", "compile the inner loops ahead of the first recording"),
-    "validate": ("disctrack.commands.validate", "render -> measure -> compare: the verdict on 0.005 mm / 0.05 deg"),
+# In the order of the measurement: name -> (its arguments, what it does).
+COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str]] = {
+    "init": (options.add_init, "folder of frames -> a commented recording.toml"),
+    "print": (options.add_print, "declared dots and board -> PDF to print, true to scale"),
+    "check": (options.add_check, "what would a run trip over? seconds"),
+    "run": (options.add_run, "calibrate and track a recording: folder in, trajectory and pictures out"),
+    "calibrate": (options.add_calibrate, "views of a chessboard -> stereo rig with covariance"),
+    "track": (options.add_track, "recording and rig -> trajectory with covariance"),
+    "analyse": (options.add_analyse, "trajectory -> velocities, contact, energy, scaling laws and a report"),
+    "diagnose": (options.add_diagnose, "trajectory -> which effect the model lacks, before and after"),
+    "batch": (options.add_batch, "many recordings side by side: a report of each, and one summary"),
+    "simulate": (options.add_simulate, "rolling model: scene -> motion, energies, contact forces"),
+    "render": (options.add_render, "scene -> recording as the cameras would write it, and its truth"),
+    "convert": (options.add_convert, "trajectory or rig from and to the formats of other programs"),
+    "warm-up": (options.add_warm_up, "compile the inner loops ahead of the first recording"),
+    "validate": (options.add_validate, "render -> measure -> compare: the verdict on 0.005 mm / 0.05 deg"),
 }
 
 TRACEBACK_VARIABLE = "DISCTRACK_TRACEBACK"
@@ -47,14 +48,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         _keep_compiled_loops_somewhere()
-        arguments = _parser(words).parse_args(words)
+        parser = _parser()
+        arguments = parser.parse_args(words)
         if arguments.command is None:
-            _parser([]).print_help()
+            parser.print_help()
             return USAGE
         from disctrack.files.inputs import inputs_kept  # here, so that --help does not wait for what it imports
 
+        command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
         with inputs_kept():
-            return int(arguments.run(arguments))
+            return int(command.run(arguments))
     except KeyboardInterrupt:
         return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`
@@ -102,8 +105,8 @@ def _say(message: str, code: int) -> int:
     return code
 
 
-def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Parser of all subcommands; only the one that was named is imported and gets its arguments."""
+def _parser() -> argparse.ArgumentParser:
+    """Parser of all subcommands."""
     parser = argparse.ArgumentParser(
         prog="disctrack",
         description="Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.",
@@ -112,13 +115,8 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"disctrack {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND")
-    named = next((word for word in words if not word.startswith("-")), None)
-    for name, (module, summary) in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-        if name == named:
-            command = importlib.import_module(module)
-            command.add_arguments(subparser)
-            subparser.set_defaults(run=command.run)
+    for name, (add_arguments, summary) in COMMANDS.items():
+        add_arguments(subparsers.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + "."))
     return parser
 
 

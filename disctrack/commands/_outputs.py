@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import StereoRig
+from calibration import CalibrationSettings, StereoRig
 from disctrack.analyse.declaration import contradictions_of, told
+from disctrack.commands import DONE, INCOMPLETE
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files import trajectory_file as storage
 from disctrack.files.whole import check_writable as check_writable
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import Recording
 from disctrack.track import summary
+from disctrack.track.overlay import shown_rows, write_overlay
 from disctrack.track.stage import ImagePairs, check_rig, measure, trajectory_provenance
 from disctrack.track.tracking import TrackingSettings
 from disctrack.trajectory import Trajectory
@@ -41,29 +43,8 @@ class TrackOptions:
     settings: TrackingSettings
 
 
-def add_track_options(parser: argparse.ArgumentParser) -> None:
-    """Options that `run` and `track` have in common."""
-    part = parser.add_mutually_exclusive_group()
-    part.add_argument("--frames", type=_frame_range, metavar="A:B",
-                      help="measure frames A to B-1, no others; the file keeps the recording's length")  # fmt: skip
-    part.add_argument("--all", action="store_true",
-                      help="measure every frame (default: not the rest before and after the motion)")  # fmt: skip
-    parser.add_argument("--overwrite", action="store_true", help="replace results of other inputs or settings")
-    parser.add_argument("--csv", action="store_true", help="also write the trajectory as a table (mm, deg)")
-    parser.add_argument("--no-figures", action="store_true", help="no pictures")
-    parser.add_argument("--no-video", action="store_true", help="no overlay video")
-    parser.add_argument("--threads", type=_positive, help="threads that read and track (default: one per core)")
-
-
-def add_calibration_options(parser: argparse.ArgumentParser) -> None:
-    """Options that `run` and `calibrate` have in common."""
-    group = parser.add_argument_group("calibration", "what is not given is chosen by held-out error")
-    group.add_argument("--distortion", default="auto", metavar="TERMS", help="Brown's terms, e.g. 'k1 k2'")
-    group.add_argument("--board", default="auto", metavar="SHAPE", help="flat, warped or free")
-
-
 def track_options(arguments: argparse.Namespace) -> TrackOptions:
-    """The options of `add_track_options` as they were given."""
+    """The options of tracking as they were given."""
     return TrackOptions(
         arguments.overwrite,
         arguments.csv,
@@ -75,24 +56,9 @@ def track_options(arguments: argparse.Namespace) -> TrackOptions:
     )
 
 
-def _frame_range(text: str) -> tuple[int | None, int | None]:
-    first, colon, last = text.partition(":")
-    try:
-        if not colon:
-            raise ValueError
-        return (int(first) if first else None), (int(last) if last else None)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no range; give first:last, e.g. 100:200 or 100:") from None
-
-
-def _positive(text: str) -> int:
-    try:
-        number = int(text)
-    except ValueError:
-        number = 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number above 0")
-    return number
+def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
+    """The options of a calibration as they were given."""
+    return CalibrationSettings(distortion=arguments.distortion, board=arguments.board)
 
 
 def track_into(
@@ -141,8 +107,6 @@ def shortcomings(findings: Mapping[str, Any]) -> list[str]:
 
 def tell_shortcomings(found: Sequence[str]) -> int:
     """Say on stderr what makes the result incomplete; returns the exit code."""
-    from disctrack.commands import DONE, INCOMPLETE
-
     if found:
         print(f"disctrack: {'; '.join(found)} (see above).", file=sys.stderr)
     return INCOMPLETE if found else DONE
@@ -176,7 +140,6 @@ def _companions(
 
 
 def _write_video(path: Path, trajectory: Trajectory, pairs: ImagePairs) -> None:
-    from disctrack.track.overlay import shown_rows, write_overlay
 
     rows = shown_rows(pairs.start, pairs.stop)
     with progress_bar("video", len(rows), "frame") as advance:

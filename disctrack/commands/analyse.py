@@ -4,60 +4,30 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
-    from disctrack.analyse.analysis import Analysis
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack analyse`."""
-    parser.add_argument("trajectory", type=Path, help="file written by disctrack track; it gets four more groups")
-    parser.add_argument(
-        "-o", "--output", type=Path, help="folder for the report (default: NAME_analysis beside the file)"
-    )
-    parser.add_argument(
-        "--window", type=_seconds, default=0.5, help="last seconds before collapse for the exponents (default: 0.5)"
-    )
-    parser.add_argument(
-        "--circle", type=_seconds, default=0.6, help="last seconds for the circle through the contact (default: 0.6)"
-    )
-    parser.add_argument(
-        "--rerun",
-        action="store_true",
-        help="also write motion.rrd for the 3-D viewer (needs rerun-sdk)",
-    )
-    parser.add_argument(
-        "--recording",
-        type=Path,
-        metavar="FOLDER",
-        help="where the images for motion.html are (default: the folder that holds results/)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an older report")
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
-    return value
+from disctrack.analyse.analysis import Analysis
+from disctrack.analyse.motion_page import write_motion_page
+from disctrack.analyse.stage import run_analyse
+from disctrack.analyse.viewer import require_rerun, write_rerun
+from disctrack.commands import DONE
+from disctrack.commands._outputs import pair_of
+from disctrack.errors import RecordingError
+from disctrack.files.reuse import origin_of, remember, reusable
+from disctrack.files.trajectory_file import read_provenance
+from disctrack.progress import stage
+from disctrack.recording.declaration import FILE_NAME, read_recording
+from disctrack.track.overlay import draw_pair
+from disctrack.track.stage import open_pairs
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
-    from disctrack.analyse.stage import run_analyse
-    from disctrack.commands import DONE
-    from disctrack.files.reuse import origin_of, remember, reusable
-    from disctrack.progress import stage
-
     path = arguments.trajectory
     folder = arguments.output or path.parent / f"{path.stem}_analysis"
     motion = folder / "motion.rrd"
     if arguments.rerun:
-        from disctrack.analyse.viewer import require_rerun, write_rerun
-
         require_rerun(motion)  # at once: the analysis takes a while
     origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
     told = None if arguments.overwrite or (arguments.rerun and not motion.exists()) else reusable(folder, origin)
@@ -84,14 +54,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
     """The interactive page, with pictures where the images of this trajectory are at hand."""
-    from disctrack.analyse.motion_page import write_motion_page
-    from disctrack.commands._outputs import pair_of
-    from disctrack.errors import RecordingError
-    from disctrack.files.trajectory_file import read_provenance
-    from disctrack.recording.declaration import FILE_NAME, read_recording
-    from disctrack.track.overlay import draw_pair
-    from disctrack.track.stage import open_pairs
-
     folder = recording or next(
         (place for place in (trajectory.parent, trajectory.parent.parent) if (place / FILE_NAME).is_file()), None
     )

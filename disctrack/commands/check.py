@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack check`."""
-    parser.add_argument("recording", type=Path, help="folder with a recording.toml")
-    parser.add_argument("-o", "--output", type=Path, help="the picture (default: RECORDING/results/check.png)")
-    parser.add_argument("--no-figures", action="store_true", help="no picture")
+from disctrack.commands import DONE, FAILED
+from disctrack.commands import _outputs as outputs
+from disctrack.first_look.check import run_check
+from disctrack.progress import steps
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Look, tell, draw; exit code 1 where a run would fail or mislead."""
-    from disctrack.commands import DONE, FAILED
-    from disctrack.commands import _outputs as outputs
-    from disctrack.first_look.check import run_check
-    from disctrack.progress import steps
-
     with steps("check") as step:
         seen = run_check(arguments.recording, step)
     print("\n".join(seen.lines()))

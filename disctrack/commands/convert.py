@@ -5,49 +5,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from calibration.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
+from calibration.opencv_yaml import export_opencv, import_opencv
+from calibration.rig_file import read_rig, write_rig
+from disctrack.commands import DONE
+from disctrack.errors import OutputError, RigFileError
+from disctrack.files.exchange.c3d import write_c3d
+from disctrack.files.exchange.matlab import write_mat
+from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.trajectory_file import read_trajectory, write_csv
+
 TRAJECTORY = (".csv", ".mat", ".c3d")
 OPENCV = (".yml", ".yaml", ".xml")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack convert`."""
-    parser.add_argument(
-        "source",
-        type=Path,
-        nargs="+",
-        help="trajectory.h5, rig.h5, or a rig of another program; two files where it keeps one per camera, left first",
-    )
-    parser.add_argument(
-        "target",
-        type=Path,
-        help="by its suffix: a trajectory to .csv, .mat (MATLAB), .c3d; a rig to .yml (OpenCV), .toml "
-        "(Caliscope), .cameramodel (mrcal; -left and -right are added), or from these to .h5",
-    )
-    parser.add_argument(
-        "--table",
-        action="store_true",
-        help="the foreign rig's reference is the table, z up (else heights mean nothing)",
-    )
-    parser.add_argument(
-        "--cameras", nargs=2, metavar=("LEFT", "RIGHT"), help="which two cameras of a Caliscope or Anipose file"
-    )
-    parser.add_argument(
-        "--image-size",
-        type=int,
-        nargs=2,
-        metavar=("WIDTH", "HEIGHT"),
-        help="[px] where an OpenCV file does not tell it",
-    )
-    parser.add_argument("--unit-mm", type=float, help="length of an OpenCV file's unit, where it does not tell it")
-    parser.add_argument("--overwrite", action="store_true", help="replace the target")
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Convert; returns the exit code."""
-    from disctrack.commands import DONE
-    from disctrack.errors import OutputError
-    from disctrack.files.inputs import keep, refuse_input
-
     target: Path = arguments.target
     for source in arguments.source:
         keep(source)
@@ -65,7 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _trajectory(arguments: argparse.Namespace) -> Path:
-    from disctrack.files.trajectory_file import read_trajectory, write_csv
 
     trajectory = read_trajectory(_single(arguments.source))
     target: Path = arguments.target
@@ -73,19 +45,12 @@ def _trajectory(arguments: argparse.Namespace) -> Path:
         write_csv(target, trajectory, overwrite=True)
         return target
     if target.suffix == ".mat":
-        from disctrack.files.exchange.matlab import write_mat
-
         return write_mat(target, trajectory, overwrite=True)
-    from disctrack.files.exchange.c3d import write_c3d
 
     return write_c3d(target, trajectory, overwrite=True)
 
 
 def _foreign_rig(arguments: argparse.Namespace) -> Path:
-    from calibration.foreign_rigs import import_caliscope, import_mrcal
-    from calibration.opencv_yaml import import_opencv
-    from calibration.rig_file import write_rig
-    from disctrack.errors import RigFileError
 
     source, first = arguments.source, arguments.source[0]
     if first.suffix == ".cameramodel":
@@ -106,10 +71,6 @@ def _foreign_rig(arguments: argparse.Namespace) -> Path:
 
 
 def _own_rig(arguments: argparse.Namespace) -> list[Path]:
-    from calibration.foreign_rigs import export_caliscope, export_mrcal
-    from calibration.opencv_yaml import export_opencv
-    from calibration.rig_file import read_rig
-    from disctrack.errors import OutputError
 
     target: Path = arguments.target
     if target.suffix not in (*OPENCV, ".toml", ".cameramodel"):
@@ -131,7 +92,6 @@ def _own_rig(arguments: argparse.Namespace) -> list[Path]:
 
 
 def _single(source: list[Path]) -> Path:
-    from disctrack.errors import OutputError
 
     if len(source) != 1:
         raise OutputError(f"{len(source)} files given; one is converted at a time")

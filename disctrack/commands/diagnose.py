@@ -5,25 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack diagnose`."""
-    parser.add_argument("trajectory", type=Path, help="trajectory file; the group diagnosis is added to it")
-    models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
-    parser.add_argument("--model", default="paper", help=models)
-    parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: NAME_diagnosis beside it)")
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier diagnosis")
+from disctrack.commands import DONE
+from disctrack.commands import _outputs as outputs
+from disctrack.diagnosis import run_diagnose
+from disctrack.files.reuse import origin_of, remember, reusable
+from disctrack.progress import stage
+from disctrack.track import summary
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; returns the exit code."""
-    from disctrack.commands import DONE
-    from disctrack.commands import _outputs as outputs
-    from disctrack.diagnosis import run_diagnose
-    from disctrack.files.reuse import origin_of, remember, reusable
-    from disctrack.progress import stage
-    from disctrack.track import summary
-
     path = arguments.trajectory
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     model = Path(arguments.model)

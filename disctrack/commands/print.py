@@ -3,34 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack print`."""
-    from disctrack.first_look.targets import PAPERS_MM
-
-    parser.add_argument(
-        "recording",
-        type=Path,
-        nargs="?",
-        help="folder with a recording.toml (default: the disc of Ma et al. 2014 and a board of 9 x 6)",
-    )
-    parser.add_argument("-o", "--output", type=Path, default=Path(), help="folder for dots.pdf and board.pdf (here)")
-    parser.add_argument("--paper", choices=sorted(PAPERS_MM), default="a4", help="size of the sheet (%(default)s)")
-    parser.add_argument("--light-dots", action="store_true", help="white dots in a black face")
-    parser.add_argument("--overwrite", action="store_true", help="replace older sheets")
+from disctrack.commands import DONE
+from disctrack.commands import _outputs as outputs
+from disctrack.disc import MA_2014
+from disctrack.errors import OutputError
+from disctrack.first_look.targets import board_figure, dots_figure, write_sheet
+from disctrack.recording.declaration import read_recording
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw both sheets; returns the exit code."""
-    from disctrack.commands import DONE
-    from disctrack.commands import _outputs as outputs
-    from disctrack.disc import MA_2014
-    from disctrack.errors import OutputError
-    from disctrack.first_look.targets import board_figure, dots_figure, write_sheet
-    from disctrack.recording.declaration import read_recording
-
     disc, corners, square_mm = MA_2014, (9, 6), 20.0
     if arguments.recording is not None:
         recording = read_recording(arguments.recording)

@@ -6,37 +6,22 @@ import argparse
 import sys
 from pathlib import Path
 
+from tqdm import tqdm
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack render`."""
-    parser.add_argument("scene", type=Path, nargs="?", help="TOML file; what it does not say takes its default")
-    parser.add_argument(
-        "-o", "--output", type=Path, help="new folder for the recording (default: SCENE beside the scene)"
-    )
-    parser.add_argument(
-        "--truth", type=Path, metavar="FILE", help="where the truth goes (default: truth.h5 in the folder)"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.add_argument("--defaults", action="store_true", help="print a scene with every key at its default and stop")
+from disctrack.commands import DONE
+from disctrack.errors import SceneError
+from disctrack.render import run_render
+from disctrack.scene.description import Scene, load_scene, scene_toml
+from disctrack.scene.motion import effects_in_words
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Render, write, and say what; returns the exit code."""
-    from disctrack.commands import DONE
-    from disctrack.errors import SceneError
-
     if arguments.defaults:
-        from disctrack.scene.description import Scene, scene_toml
-
         print(scene_toml(Scene()), end="")
         return DONE
     if arguments.scene is None:
         raise SceneError("no scene given: name a TOML file, or ask for one with --defaults")
-    from tqdm import tqdm
-
-    from disctrack.render import run_render
-    from disctrack.scene.description import load_scene
-    from disctrack.scene.motion import effects_in_words
 
     folder = arguments.output or arguments.scene.parent / arguments.scene.stem
     with tqdm(unit="image", file=sys.stderr, disable=arguments.quiet or None) as bar:

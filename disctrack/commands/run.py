@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack run`."""
-    from disctrack.commands._outputs import add_calibration_options, add_track_options
-
-    parser.add_argument("recording", type=Path, help="folder with a recording.toml")
-    parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: RECORDING/results)")
-    add_track_options(parser)
-    add_calibration_options(parser)
+from disctrack.calibrate.stage import calibrate_into, given_rig, source_of
+from disctrack.commands import _outputs as outputs
+from disctrack.files.inputs import refuse_input
+from disctrack.files.whole import write_whole
+from disctrack.recording.declaration import read_recording
+from disctrack.track import stage as pipeline
+from disctrack.track import summary
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate unless the recording names a rig, track, draw; returns the exit code."""
-    from disctrack.commands import _calibration as calibration
-    from disctrack.commands import _outputs as outputs
-    from disctrack.files.inputs import refuse_input
-    from disctrack.files.whole import write_whole
-    from disctrack.recording.declaration import read_recording
-    from disctrack.track import stage as pipeline
-    from disctrack.track import summary
-
     recording = read_recording(arguments.recording)
     folder = arguments.output or recording.folder / outputs.RESULTS
     options = outputs.track_options(arguments)
@@ -35,11 +24,11 @@ def run(arguments: argparse.Namespace) -> int:
     outputs.check_writable(folder)
     if recording.rig_file is not None:
         rig_name = str(recording.rig_file)
-        calibrated = calibration.given_rig(recording.rig_file)
+        calibrated = given_rig(recording.rig_file)
     else:
         rig_name = "the rig from this recording's own calibration views"
-        source = calibration.source_of(recording, calibration.settings_of(arguments))
-        calibrated = calibration.calibrate_into(folder / "rig.h5", source, options.overwrite, options.figures)
+        source = source_of(recording, outputs.calibration_settings(arguments))
+        calibrated = calibrate_into(folder / "rig.h5", source, options.overwrite, options.figures)
     lines, files, shortcomings = outputs.track_into(
         folder / "trajectory.h5", recording, calibrated.rig, rig_name, pairs, options
     )

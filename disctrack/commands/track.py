@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack track`."""
-    from disctrack.commands._outputs import add_track_options
-
-    parser.add_argument("recording", type=Path, help="folder with a recording.toml")
-    parser.add_argument("--rig", type=Path, help="rig file (default: the recording's own, or results/rig.h5)")
-    parser.add_argument("-o", "--output", type=Path, help="trajectory file (default: RECORDING/results/trajectory.h5)")
-    add_track_options(parser)
+from calibration.rig_file import read_rig
+from disctrack.commands import _outputs as outputs
+from disctrack.errors import RecordingError
+from disctrack.files.inputs import keep, refuse_input
+from disctrack.recording.declaration import read_recording
+from disctrack.track import stage as pipeline
+from disctrack.track import summary
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Track; returns the exit code."""
-    from calibration.rig_file import read_rig
-    from disctrack.commands import _outputs as outputs
-    from disctrack.errors import RecordingError
-    from disctrack.files.inputs import keep, refuse_input
-    from disctrack.recording.declaration import read_recording
-    from disctrack.track import stage as pipeline
-    from disctrack.track import summary
-
     recording = read_recording(arguments.recording)
     path = arguments.output or recording.folder / outputs.RESULTS / "trajectory.h5"
     rig_file = arguments.rig or recording.rig_file or recording.folder / outputs.RESULTS / "rig.h5"

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import argparse
 
+import numpy as np
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `disctrack warm-up`: none."""
+from calibration import corner_fit
+from disctrack.commands import DONE
+from disctrack.progress import compiling
+from disctrack.readers import _png as png
+from disctrack.track import _kernels as kernels
+from disctrack.track.following import prepare
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Compile what reading, calibrating and tracking use; returns the exit code."""
-    import numpy as np
-
-    from calibration import corner_fit
-    from disctrack.commands import DONE
-    from disctrack.progress import compiling
-    from disctrack.readers import _png as png
-    from disctrack.track import _kernels as kernels
-    from disctrack.track.following import prepare
-
     with compiling("readers", 1):
         png.prepare()
     with compiling("corners", 8):

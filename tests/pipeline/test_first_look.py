@@ -14,10 +14,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from calibration.chessboard import BoardNotFound, find_corners
 from disctrack.cli import main
+from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
 from disctrack.first_look.declare import board_size
 from disctrack.first_look.sequences import find_sequences, pair_cameras
-from disctrack.first_look.targets import board_figure, dots_figure
+from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
 
 DPI = 150
 
@@ -117,6 +118,7 @@ def drawn(figure):
 
 
 def test_printed_dots_lie_where_they_are_declared():
+    assert set(PAPERS_MM) == set(PAPERS)
     image, scale = drawn(dots_figure(MA_2014))
     _, _, stats, centres = cv2.connectedComponentsWithStats((image < 100).astype(np.uint8))
     diameter = 1e3 * MA_2014.marker_diameter * scale
