@@ -7,17 +7,19 @@ taken from the frames around, so that a frame is judged by its neighbours and by
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri  # scipy.stats would take a second to import
 
 from calibration.arrays import Array, Mask
-from disctrack.frames import vector_from_rotation
+from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
 from disctrack.trajectory import FrameStatus
 
+FEW = 4  # frames beside a cut that tell how large the misfit is there
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
 # Square of a centre's shift over that of the misfit, both in sigmas: a disturbance is taken for a shift in one part and
@@ -76,17 +78,74 @@ def _nanmedian(values: Array) -> Array:
     return np.where(count > 0, 0.5 * (take[0] + take[1]), np.nan)
 
 
-def outlying_frames(residual_square: Array, dots: NDArray[np.int64]) -> Mask:
+def outlying_frames(residuals: Array) -> Mask:
     """(n,) True where a frame's dots miss the tracked pose by far more than is usual: it must not teach the others.
 
-    residual_square : (n,) squared residuals of the dots in their sigmas; dots (n,) how many
-    What all frames share (printed dots, cameras) shows in all of them; a fault of some frames stands out of the rest.
+    residuals : (n, 2, m, 2) of the dots about the tracked pose, in their sigmas; NaN where a dot was not seen
+    What all frames share (printed dots, lens, a camera that moved before) shows in all of them, and changes slowly with
+    the place of the disc. A fault of some frames sets in from one frame to the next: the recording is cut where the
+    residuals jump, and a part whose misfit stands far above that of the part beside it is at fault, however long it
+    is. So it is found that a camera left out an image early on; a calibration that is off is no fault of frames.
     """
+    seen: Mask = np.asarray(np.isfinite(residuals).all(-1))
+    freedom = 2 * seen.sum((1, 2)) - 6
+    square = np.sum(np.where(seen[..., None], residuals, 0.0) ** 2, axis=(1, 2, 3))
     with np.errstate(invalid="ignore", divide="ignore"):
-        reduced = np.where(dots >= 4, residual_square / np.maximum(2 * dots - 6, 1), np.nan)
-    if not np.isfinite(reduced).any():
-        return np.zeros(len(dots), bool)
-    return np.nan_to_num(reduced) > OUTLYING * max(1.0, float(np.nanmedian(reduced)))
+        reduced = np.where(freedom >= 2, square / np.maximum(freedom, 1), np.nan)
+    late = _at_fault_since_a_jump(residuals, np.where((seen.sum(axis=2) >= 2).all(axis=1), reduced, np.nan))
+    usual = np.where(late, np.nan, reduced)
+    if not np.isfinite(usual).any():
+        return np.zeros(len(residuals), bool)
+    return late | (np.nan_to_num(reduced) > OUTLYING * max(1.0, float(np.nanmedian(usual))))
+
+
+def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
+    """(n,) True in parts of the recording that begin or end with a jump of the residuals and stand out by their misfit.
+
+    reduced : (n,) chi-square of the frames in which both cameras tell, NaN in the others
+    """
+    at_fault = np.zeros(len(reduced), bool)
+    rows = np.flatnonzero(np.isfinite(reduced))
+    if len(rows) < 2:
+        return at_fault
+    step = residuals[rows[1:]] - residuals[rows[:-1]]
+    both: Mask = np.asarray(np.isfinite(step).all(-1))
+    square = 0.5 * np.sum(np.where(both[..., None], step, 0.0) ** 2, axis=(1, 2, 3))
+    change = square / np.maximum(2 * both.sum((1, 2)) - 6, 1)
+    usual = np.fmax(_usual(change[:, None])[0][:, 0], 1.0)
+    cuts = np.flatnonzero((change > OUTLYING * usual) & (np.diff(rows) <= BLOCK)) + 1
+    if not len(cuts):
+        return at_fault
+    starts, ends = np.r_[0, cuts], np.r_[cuts, len(rows)]
+    first = np.array([np.median(reduced[rows[a : min(b, a + FEW)]]) for a, b in zip(starts, ends, strict=True)])
+    last = np.array([np.median(reduced[rows[max(a, b - FEW) : b]]) for a, b in zip(starts, ends, strict=True)])
+    long = ends - starts >= 2  # one frame alone is no measure for the others
+    if not long.any():
+        return at_fault
+    best = int(np.argmin(np.where(long, np.maximum(first, last), np.inf)))
+
+    def as_usual(left: int, right: int, kept: int) -> bool:
+        here, there = (last[left], first[right]) if kept == left else (first[right], last[left])
+        return bool(there <= OUTLYING * max(1.0, here))
+
+    for part in np.flatnonzero(~_connected(len(starts), best, as_usual)):
+        at_fault[rows[starts[part]] : rows[ends[part] - 1] + 1] = True
+    return at_fault
+
+
+def _connected(n: int, best: int, fits: Callable[[int, int, int], bool]) -> Mask:
+    """(n,) True for the parts of a recording that agree with the best of them, and those that agree with these.
+
+    fits(left, right, kept) compares a part with the nearest that is kept already, which is one of the two.
+    """
+    kept = np.zeros(n, bool)
+    kept[best] = True
+    for parts in (range(best + 1, n), range(best - 1, -1, -1)):
+        nearest = best
+        for part in parts:
+            if fits(min(part, nearest), max(part, nearest), nearest):
+                kept[part], nearest = True, part
+    return kept
 
 
 @dataclass(frozen=True)
@@ -97,118 +156,128 @@ class Verdicts:
     factor: Array  # (n,) on the pose's covariance, at least 1
 
 
-def judge_poses(fits: PoseFits, repeated: Mask, struck: NDArray[np.int64], period: float, radius: float) -> Verdicts:
+def judge_poses(
+    fits: PoseFits,
+    repeated: Mask,
+    struck: NDArray[np.int64],
+    outlying: Mask,
+    period: float,
+    radius: float,
+) -> Verdicts:
     """Judge every pose by its residuals and by the motion of its neighbours.
 
     fits : with the covariances and chi-squares scaled as they will be told; repeated (n,): both images are those of a
-    frame before; struck (n,): dots left out as outliers; period [s] of the frames; radius [m] of the disc
+    frame before; struck (n,): dots left out as outliers; outlying (n,): frames by which no other is to be judged;
+    period [s] of the frames; radius [m] of the disc
     """
     status = np.full(len(struck), FrameStatus.MEASURED, np.uint8)
     freedom = fits.degrees_of_freedom
-    reduced = fits.reduced_chi_square
+    reduced = np.where(outlying, np.nan, fits.reduced_chi_square)
+    middle = max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
     # a fault that lasts is usual where it is, but not in the rest of the recording
-    most = OUTLYING * max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
-    usual = np.clip(_usual(reduced[:, None])[0][:, 0], 1.0, most)
+    usual = np.clip(np.nan_to_num(_usual(reduced[:, None])[0][:, 0], nan=middle), 1.0, OUTLYING * middle)
     with np.errstate(invalid="ignore"):
         square = fits.chi_square / usual
         chance = np.where(freedom > 0, chdtrc(np.maximum(freedom, 1), square), 1.0)
         factor = np.where(chance < SUSPECT, square / np.maximum(freedom, 1), 1.0)
-    left, right = one_sided_jumps(fits)
-    moved = np.fmin(np.fmin(left, right), between_neighbours(fits))
+    total = fits.used.sum(axis=(1, 2)) + struck
+    contradicted = (chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))
     rest = _at_rest(fits)
+    lost = repeated & ~_still_over_the_repeats(repeated, rest)
+    good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
+    moved = np.fmin.reduce([departure(good, weights) for weights in (FROM_BEFORE, FROM_AFTER, FROM_BOTH)])
     # a disc at rest does not tell how smooth its motion will be
     usual_move = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
     quiet = np.fmax(usual_move / _USUAL_MEDIAN[6], 1.0)
     with np.errstate(invalid="ignore"):
-        jumped = moved / quiet > chdtri(6, CHANCE) * 2.0  # the smaller of two, in motion that is not quite steady
-    total = fits.used.sum(axis=(1, 2)) + struck
-    status[jumped | torn_off(fits, period, radius)] = FrameStatus.JUMPED
-    status[(chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))] = FrameStatus.CONTRADICTED
-    status[repeated & ~_still_over_the_repeats(repeated, rest)] = FrameStatus.REPEATED
+        jumped = moved / quiet > chdtri(6, CHANCE) * 2.0  # the smallest of three, in motion that is not quite steady
+    status[jumped | torn_off(good, period, radius)] = FrameStatus.JUMPED
+    status[contradicted] = FrameStatus.CONTRADICTED
+    status[lost] = FrameStatus.REPEATED
     status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge
     return Verdicts(status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0))
 
 
-def one_sided_jumps(fits: PoseFits) -> tuple[Array, Array]:
-    """Squared distance (n,) of each pose, in its sigmas, from where its predecessors and its successors lead.
+def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
+    """Squared length (n,), in its sigmas, of a sum of each frame's neighbours (and its own pose, 0): offset -> weight.
 
-    The quadratic through three neighbours on one side is carried on by a frame. A blow changes the velocity between two
-    frames, so each of them agrees with its own side; a pose that agrees with neither lies on no motion. NaN where there
-    is no pose, or no three neighbours on that side.
-    """
-    return _jumps_from(fits, -1), _jumps_from(fits, 1)
-
-
-def between_neighbours(fits: PoseFits) -> Array:
-    """Squared distance (n,) of each pose, in its sigmas, from the cubic through two neighbours on either side.
-
-    It follows a motion that changes quickly from frame to frame far better than what is carried on from one side; only
-    a blow within these five frames is not smooth enough. NaN where a neighbour has no pose.
+    The weights' sum is 0, so that the sum is a pose's distance from where the others lead: FROM_BEFORE and FROM_AFTER
+    carry the quadratic through three neighbours on by a frame. A blow changes the velocity between two frames, so each
+    of them agrees with its own side; a pose that agrees with neither lies on no motion. FROM_BOTH is the cubic through
+    two neighbours on either side, which follows a motion that changes quickly from frame to frame far better. ACROSS
+    tells how far the disc went. NaN where one of the poses is missing.
     """
     n, R, t, C = len(fits.converged), fits.R_world_body, fits.t_world_body, fits.covariance
+    offsets, weight = np.array([*weights]), np.array([*weights.values()])
     square = np.full(n, np.nan)
-    rows = np.arange(2, n - 2)
-    near = rows[:, None] + np.array([-2, -1, 1, 2])
-    good = fits.converged[near].all(axis=1) & fits.converged[rows]
+    rows = np.arange(max(-offsets.min(), 0), n - max(offsets.max(), 0))
+    near = rows[:, None] + offsets
+    good = fits.converged[near].all(axis=1)
     rows, near = rows[good], near[good]
-    if not len(rows):
-        return square
-    weights = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
-    turn = vector_from_rotation(R[near] @ np.swapaxes(R[rows], 1, 2)[:, None])  # from the frame itself
-    shift = t[near] - t[rows][:, None]
-    away = np.einsum("k,nki->ni", weights, np.concatenate([shift, turn], axis=2))
-    spread = C[rows] + np.einsum("k,nkij->nij", weights**2, C[near])
+    turn = vector_from_rotation(R[near] @ np.swapaxes(R[near[:, :1]], 2, 3))  # from the first: they differ by little
+    away = np.einsum("k,nki->ni", weight, np.concatenate([t[near], turn], axis=2))
+    spread = np.einsum("k,nkij->nij", weight**2, C[near])
     square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
     return square
 
 
-def _jumps_from(fits: PoseFits, side: int) -> Array:
-    """(n,) as `one_sided_jumps`, from the neighbours before (side -1) or after (1); NaN where three are not there."""
-    n, R, t, C = len(fits.converged), fits.R_world_body, fits.t_world_body, fits.covariance
-    square = np.full(n, np.nan)
-    rows = np.arange(3, n) if side < 0 else np.arange(n - 3)
-    near = rows[:, None] + side * np.arange(4)  # (k, 4): the frame itself, and three on the side
-    rows, near = (part[fits.converged[near].all(axis=1)] for part in (rows, near))
-    if not len(rows):
-        return square
-    i, a, b, c = near.T
-    turn = vector_from_rotation(R[near] @ np.swapaxes(R[a], 1, 2)[:, None])  # from the nearest neighbour
-    away = np.concatenate([t[i] - (3 * t[a] - 3 * t[b] + t[c]), turn[:, 0] + 3 * turn[:, 2] - turn[:, 3]], axis=1)
-    spread = C[i] + 9 * C[a] + 9 * C[b] + C[c]
-    square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
-    return square
+FROM_BEFORE = {-1: -3.0, 0: 1.0, -2: 3.0, -3: -1.0}
+FROM_AFTER = {1: -3.0, 0: 1.0, 2: 3.0, 3: -1.0}
+FROM_BOTH = {0: 1.0, -2: 1 / 6, -1: -4 / 6, 1: -4 / 6, 2: 1 / 6}
+ACROSS = {-1: -1.0, 1: 1.0}
 
 
 def torn_off(fits: PoseFits, period: float, radius: float) -> Mask:
-    """(n,) True for frames that no motion joins to their neighbours, where the neighbours are the more.
+    """(n,) True for frames that no motion joins to the longest piece of motion, or to what is joined to that.
 
     Between two frames the disc may be hit: its centre's velocity changes by GREATEST_BLOW, its turn by that over the
-    radius. A pose farther than that from where the two frames before lead begins another motion; of two motions that
-    meet, one is false: the shorter one.
+    radius. A pose farther than that from where the frames before lead, and the frames after, begins another motion.
+    Over frames without a pose, too: where a false motion ends, the true one goes on.
     """
+    refused = np.zeros(len(fits.converged), bool)
+    rows = np.flatnonzero(fits.converged)
+    if len(rows) < 2:
+        return refused
+    torn = _torn(fits, rows[:-1], rows[1:], period, radius)
+    if not torn.any():
+        return refused
+    pieces = np.split(rows, np.flatnonzero(torn) + 1)
+    longest = int(np.argmax([len(piece) for piece in pieces]))
+
+    def leads_on(left: int, right: int, kept: int) -> bool:
+        return not _torn(fits, pieces[left][-1:], pieces[right][:1], period, radius)[0]
+
+    for piece in np.flatnonzero(~_connected(len(pieces), longest, leads_on)):
+        refused[pieces[piece]] = True
+    return refused
+
+
+def _torn(fits: PoseFits, last: NDArray[np.intp], first: NDArray[np.intp], period: float, radius: float) -> Mask:
+    """(k,) True where no motion leads from frames `last` (k,) to the later frames `first` (k,).
+
+    Neither at the velocity before the gap nor at that after it; False where neither is known.
+    """
+    miss = np.full((2, len(last)), np.nan)
     n, R, t = len(fits.converged), fits.R_world_body, fits.t_world_body
-    good = fits.converged
-    near = np.arange(2, n)
-    near = near[good[near] & good[near - 1] & good[near - 2]]
-    torn = np.zeros(n + 1, bool)
-    if len(near):
-        a, b = near - 1, near - 2
-        shift = np.linalg.norm(t[near] - 2 * t[a] + t[b], axis=1)
-        carried = R[a] @ np.swapaxes(R[b], 1, 2) @ R[a]
-        turn = np.linalg.norm(vector_from_rotation(R[near] @ np.swapaxes(carried, 1, 2)), axis=1)
-        noise = 6.0 * np.sqrt(np.trace(fits.covariance[near, :3, :3], axis1=1, axis2=2))
-        reach = GREATEST_BLOW * period
-        torn[near] = (shift > reach + noise) | (turn > reach / radius + noise / radius)
-    # the frame after a tear has no velocity yet: what leads on from it is not held against the motion before the tear
-    starts = np.flatnonzero(torn[:-1] & ~np.r_[False, torn[:-2]])
-    edges = np.unique(np.r_[0, starts, n])
-    length = np.diff(edges)
-    refused = np.zeros(n, bool)
-    for start in starts:  # a handful, if any
-        piece = int(np.searchsorted(edges, start))
-        shorter = piece if length[piece] < length[piece - 1] else piece - 1
-        refused[edges[shorter] : edges[shorter + 1]] = True
-    return refused & good
+    variance = np.trace(fits.covariance[:, :3, :3], axis1=1, axis2=2)
+    turn_variance = np.trace(fits.covariance[:, 3:, 3:], axis1=1, axis2=2)
+    gap = (first - last).astype(float)
+    reach = GREATEST_BLOW * period * gap
+    for side, (here, there, beyond) in enumerate([(last, first, last - 1), (first, last, first + 1)]):
+        known = (beyond >= 0) & (beyond < n) & fits.converged[np.clip(beyond, 0, n - 1)]
+        here, there, beyond, g = here[known], there[known], beyond[known], gap[known]
+        shift = t[there] - t[here] - g[:, None] * (t[here] - t[beyond])
+        rate = vector_from_rotation(R[here] @ np.swapaxes(R[beyond], 1, 2))
+        carried = rotation_from_vector(g[:, None] * rate) @ R[here]
+        turn = vector_from_rotation(R[there] @ np.swapaxes(carried, 1, 2))
+        noise, turn_noise = (
+            6.0 * np.sqrt(v[there] + (1 + g) ** 2 * v[here] + g**2 * v[beyond]) for v in (variance, turn_variance)
+        )
+        miss[side, known] = np.maximum(
+            np.linalg.norm(shift, axis=1) / (reach[known] + noise),
+            np.linalg.norm(turn, axis=1) / (reach[known] / radius + turn_noise),
+        )
+    return np.asarray(np.nan_to_num(np.fmin(*miss)) > 1.0)
 
 
 def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
@@ -229,13 +298,8 @@ def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
 
 def _at_rest(fits: PoseFits) -> Mask:
     """(n,) True where the poses before and after differ by no more than their noise: then a repeat shows no fault."""
-    n, rest = len(fits.t_world_body), np.zeros(len(fits.t_world_body), bool)
-    if n < 3:
-        return rest
-    t, R, C = fits.t_world_body, fits.R_world_body, fits.covariance
-    step = np.column_stack([t[2:] - t[:-2], vector_from_rotation(R[2:] @ np.swapaxes(R[:-2], 1, 2))])
-    good = np.isfinite(step).all(axis=1)
-    square = np.einsum("ni,ni->n", step[good], np.linalg.solve((C[2:] + C[:-2])[good], step[good][..., None])[..., 0])
-    rest[np.flatnonzero(good) + 1] = square < chdtri(6, SUSPECT)
-    rest[-1] = rest[-2]
-    return rest
+    with np.errstate(invalid="ignore"):
+        rest = departure(fits, ACROSS) < chdtri(6, SUSPECT)
+    if len(rest) > 1:
+        rest[-1] = rest[-2]
+    return np.asarray(rest)

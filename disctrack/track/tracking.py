@@ -293,7 +293,11 @@ def _assemble(
     if settings.refine_markers and faults is not None:
         as_built = _without_false_shifts(as_built, first.setup.disc, faults)
     fits = _fit_all(tables, as_built, settings.reject_outliers)
-    ordinary = replace(fits, degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom))
+    ordinary = replace(
+        fits,
+        degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
+        used=fits.used & ~outlying[:, None, None],
+    )
     scatter = split_scatter(ordinary, tables.covariance_px2, faults)
     factor, noise_factor = scatter.whole, scatter.noise
     tables.covariance_px2 *= noise_factor  # in place: nobody else holds them
@@ -301,7 +305,9 @@ def _assemble(
     fits.covariance[...] *= noise_factor
     fits = replace(fits, chi_square=fits.chi_square / factor)
     struck = (np.isfinite(tables.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
-    verdicts = judge_poses(fits, np.asarray(repeated.all(axis=1)), struck, 1 / frame_rate, as_built.disc.radius)
+    verdicts = judge_poses(
+        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / frame_rate, as_built.disc.radius
+    )
     fits.covariance[...] *= verdicts.factor[:, None, None]
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
@@ -326,15 +332,14 @@ def _assemble(
 def _outlying(tables: Tables, setup: Setup) -> Mask:
     """(n,) True where the dots miss the pose that was tracked by far more than in the other frames."""
     n = len(tables.t)
-    square, dots = np.zeros(n), np.zeros(n, np.int64)
+    residuals = np.full(tables.pixels.shape, np.nan)
     for first in range(0, n, FITTED_AT_ONCE):
         rows = slice(first, first + FITTED_AT_ONCE)
         pixels, _ = marker_pixels(tables.R[rows], tables.t[rows], setup.rig, setup.disc.marker_centres_body)
-        residual = (whitening(tables.covariance_px2[rows]) @ (tables.pixels[rows] - pixels)[..., None])[..., 0]
-        seen = np.asarray(np.isfinite(residual).all(-1) & np.isfinite(tables.covariance_px2[rows]).all((-1, -2)))
-        square[rows] = np.sum(np.where(seen[..., None], residual, 0.0) ** 2, axis=(1, 2, 3))
-        dots[rows] = seen.sum((1, 2))
-    return outlying_frames(square, dots)
+        W = whitening(tables.covariance_px2[rows])
+        known: Mask = np.asarray(np.isfinite(tables.covariance_px2[rows]).all((-1, -2)))
+        residuals[rows] = np.where(known[..., None], (W @ (tables.pixels[rows] - pixels)[..., None])[..., 0], np.nan)
+    return outlying_frames(residuals)
 
 
 _MISFIT = "the dots miss their fitted places"
