@@ -13,9 +13,10 @@ from calibration import Board, CalibrationSettings, StereoCalibration, calibrate
 from calibration.stereo import Progress
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
-from disctrack.readers import IMAGE_SUFFIXES, FrameReader, open_frames, split_member
+from disctrack.readers import open_frames
+from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
+from disctrack.readers.decoding import decode
 from disctrack.readers.files import file_number, match_files
-from disctrack.readers.images import decode
 from disctrack.recording.declaration import Recording
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first

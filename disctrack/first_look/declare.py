@@ -21,10 +21,11 @@ from calibration.chessboard import BoardNotFound, find_corners, grey_values
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
-from disctrack.readers import FrameReader, open_frames, split_member
+from disctrack.readers import open_frames
+from disctrack.readers.base import FrameReader, split_member
 from disctrack.readers.camera_header import header_of
+from disctrack.readers.decoding import decode
 from disctrack.readers.files import match_files
-from disctrack.readers.images import decode
 from disctrack.recording.declaration import FILE_NAME, OPTIONAL
 
 VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's

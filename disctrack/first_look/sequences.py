@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.readers import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, FrameReader, open_frames
+from disctrack.readers import open_frames
+from disctrack.readers.base import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, FrameReader
 from disctrack.readers.files import natural_key
 
 DEEPEST = 4  # folders below the recording that are looked into

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Mask
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
-from disctrack.readers import FrameReader
+from disctrack.readers.base import FrameReader
 
 BLOCK_BYTES = 16 << 20  # large enough to hide the switch between blocks, small enough for six of them in 100 MB
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
-from disctrack.readers import FrameReader
+from disctrack.readers.base import FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
 CLOCK_TOLERANCE = 1e-3  # relative: cameras whose frames are stamped may run off the nominal rate; the stamps count

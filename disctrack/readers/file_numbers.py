@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.readers import NUMBER, FrameReader
+from disctrack.readers.base import NUMBER, FrameReader
 
 MOST_SLOTS_PER_FILE = 100  # a sequence with fewer of its frames is no recording, but time stamps or a slip of the pen
 _SHOWN = 3

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import keep
-from disctrack.readers import SUFFIXES
+from disctrack.readers.base import SUFFIXES
 
 
 def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:

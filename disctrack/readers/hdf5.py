@@ -20,7 +20,7 @@ import numpy as np
 
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers import FrameReader
+from disctrack.readers.base import FrameReader
 from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import struct
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Image
 from calibration.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
-from disctrack.readers import FrameReader
-from disctrack.readers._png import PngHeader, decode_plain_grey
+from disctrack.readers.base import FrameReader
+from disctrack.readers.decoding import as_grey, decode
 from disctrack.readers.file_numbers import NumberedFiles, check_continuation, number_files
-from disctrack.readers.raw import MOST_PIXELS
-
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# A header may claim any size, and decoding must not exhaust the memory. Even a black image does not shrink by more than
-# this when compressed (deflate: 1032); small ones are let pass.
-_MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
+from disctrack.readers.tiff import is_stack, open_stack
 
 
 def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameReader:
@@ -31,12 +23,9 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
 
     pattern : tells by {number} which digits of the names count the frames; "" where the names alone must
     """
-    if files[0].suffix.lower() in (".tif", ".tiff"):
-        from disctrack.readers.tiff import is_stack, open_stack
-
-        if is_stack(files[0]) or is_stack(files[-1]):
-            check_continuation(files, camera)
-            return open_stack(files, camera)
+    if files[0].suffix.lower() in (".tif", ".tiff") and (is_stack(files[0]) or is_stack(files[-1])):
+        check_continuation(files, camera)
+        return open_stack(files, camera)
     return open_image_sequence(number_files(files, camera, pattern), camera)
 
 
@@ -143,116 +132,3 @@ class ImageSequence:
                     digest = b"unreadable"
             total.update(digest)
         return total.hexdigest()
-
-
-def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
-    """Pixels of an image file's content as stored: (h, w) or (h, w, channels), any depth; in `out` where it fits.
-
-    Container and checksums are verified first: a decoder may return a torn image without a word.
-    Raises RecordingError that begins with `where`.
-    """
-    try:
-        header = _checked_container(content)
-    except _Damaged as fault:
-        raise RecordingError(f"{where}: {fault}. Copy or export this image again.") from fault
-    image = None
-    if header is not None and header.is_plain_grey:
-        image = decode_plain_grey(content, header, out)
-    else:
-        try:
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        except (cv2.error, MemoryError) as error:
-            raise RecordingError(f"{where}: not a readable image ({error.__class__.__name__}).") from error
-    if image is None:
-        raise RecordingError(f"{where}: not a readable image, or damaged. Copy or export this image again.")
-    return image
-
-
-def as_grey(image: NDArray, where: str) -> Image:
-    """(h, w) of 8 or 16 bits: equal channels become one. Raises RecordingError where something would be lost."""
-    if image.dtype not in (np.uint8, np.uint16):
-        raise RecordingError(f"{where}: pixels of type {image.dtype}; expected 8 or 16 bit grey values.")
-    if image.ndim == 2:
-        return image
-    if image.shape[2] in (2, 4) and (image[..., -1] != np.iinfo(image.dtype).max).any():
-        raise RecordingError(f"{where}: has transparent pixels; expected grey values. Export it without alpha channel.")
-    colours = image[..., : 3 if image.shape[2] >= 3 else 1]
-    if (colours != colours[..., :1]).any():
-        raise RecordingError(
-            f"{where}: a colour image; expected grey values. Export the camera's grey values: a conversion here would "
-            "mix what the sensor measured."
-        )
-    return np.ascontiguousarray(colours[..., 0])
-
-
-class _Damaged(Exception):
-    """The text says what is wrong with the file as a container."""
-
-
-def _checked_container(content: bytes) -> PngHeader | None:
-    """Header of a PNG, None for other formats; only PNG has checksums, the others an end or a length to check."""
-    if not content:
-        raise _Damaged("the file is empty")
-    if content.startswith(_PNG_SIGNATURE):
-        return _checked_png(content)
-    if content.startswith(b"\xff\xd8"):
-        if b"\xff\xd9" not in content[-1024:]:
-            raise _Damaged("the JPEG file is truncated (no end marker)")
-        _check_size(*_jpeg_size(content), len(content))
-    if content.startswith(b"BM") and len(content) >= 26:
-        declared = struct.unpack_from("<I", content, 2)[0]
-        if declared > len(content):
-            raise _Damaged(f"the BMP file ends after {len(content)} of {declared} bytes")
-        width, height = struct.unpack_from("<ii", content, 18)
-        _check_size(abs(width), abs(height), len(content))
-    if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        from disctrack.readers.tiff import size_of_first_page
-
-        _check_size(*size_of_first_page(content), len(content))
-    return None
-
-
-def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height by the frame header (ITU-T T.81, B.2.2); 0 where there is none before the scan."""
-    position = 2
-    while position + 9 <= len(content) and content[position] == 0xFF:
-        marker, length = content[position + 1], int.from_bytes(content[position + 2 : position + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", content, position + 5)
-            return width, height
-        if marker == 0xDA:
-            break
-        position += 2 + length if marker != 0xFF else 1
-    return 0, 0
-
-
-def _checked_png(content: bytes) -> PngHeader:
-    position, end, view = 8, len(content), memoryview(content)
-    ihdr: tuple[int, ...] = ()
-    data: list[tuple[int, int]] = []
-    transparent = False
-    while position + 12 <= end:
-        (length,) = struct.unpack_from(">I", content, position)
-        kind = content[position + 4 : position + 8]
-        start, stop = position + 8, position + 8 + length
-        if stop + 4 > end:
-            break
-        if zlib.crc32(view[position + 4 : stop]) != struct.unpack_from(">I", content, stop)[0]:
-            raise _Damaged(f"the PNG is damaged: wrong checksum of chunk {kind.decode('latin-1')!r} at byte {position}")
-        if kind == b"IHDR" and length == 13:
-            ihdr = struct.unpack_from(">IIBBBBB", content, start)
-            _check_size(ihdr[0], ihdr[1], end)
-        elif kind == b"IDAT":
-            data.append((start, stop))
-        elif kind == b"tRNS":
-            transparent = True
-        elif kind == b"IEND" and ihdr:
-            return PngHeader(ihdr[0], ihdr[1], ihdr[2], ihdr[3], ihdr[6] != 0, transparent, tuple(data))
-        position = stop + 4
-    raise _Damaged(f"the PNG file is truncated after {end} bytes (no end chunk)")
-
-
-def _check_size(width: int, height: int, n_bytes: int) -> None:
-    """Refuse a size that the file's n_bytes cannot hold."""
-    if width * height > min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes)):
-        raise _Damaged(f"the header claims {width} x {height} px, more than any such camera has or the file can hold")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from disctrack.frames import CAMERAS
-from disctrack.readers import FrameReader
+from disctrack.readers.base import FrameReader
 from disctrack.readers.camera_header import header_of, start_offset
 
 RATE_TOLERANCE = 0.01  # of the declared rate; a clock's error is a thousandth of that, a wrong unit far more

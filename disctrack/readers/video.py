@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.readers._ffv1 import checksums_hold
-from disctrack.readers.images import as_grey
+from disctrack.readers.decoding import as_grey
 from disctrack.readers.raw import MOST_PIXELS, check_frame_size
 
 # Nothing but containers for frames: a play list under a video's name could make the library open other files.

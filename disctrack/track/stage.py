@@ -19,7 +19,8 @@ from disctrack.errors import RecordingError
 from disctrack.files.trajectory_file import Provenance
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
-from disctrack.readers import FrameReader, open_frames
+from disctrack.readers import open_frames
+from disctrack.readers.base import FrameReader
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
 from disctrack.readers.file_numbers import check_same_numbers

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from disctrack.readers import FrameReader, open_frames
+from disctrack.readers import open_frames
+from disctrack.readers.base import FrameReader
 from tests.oracles import camera_files
 
 Frames = NDArray[np.uint8] | NDArray[np.uint16]

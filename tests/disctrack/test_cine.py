@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack.errors import RecordingError
-from disctrack.readers import FrameReader, open_frames
+from disctrack.readers import open_frames
+from disctrack.readers.base import FrameReader
 from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
 from disctrack.readers.cine import linear_from_10_bits

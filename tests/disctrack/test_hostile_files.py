@@ -15,7 +15,7 @@ import pytest
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.readers import open_frames
 from disctrack.readers.blocks import iter_pair_blocks
-from disctrack.readers.images import decode
+from disctrack.readers.decoding import decode
 
 N, HEIGHT, WIDTH = 6, 18, 22
 FRAMES = np.random.default_rng(8).integers(0, 256, (N, HEIGHT, WIDTH), dtype=np.uint8)

@@ -11,7 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack.errors import RecordingError
-from disctrack.readers import FrameReader, open_frames
+from disctrack.readers import open_frames
+from disctrack.readers.base import FrameReader
 from disctrack.readers.blocks import iter_pair_blocks
 
 N, HEIGHT, WIDTH = 30, 18, 22

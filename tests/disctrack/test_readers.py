@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from disctrack.errors import RecordingError
-from disctrack.readers import FrameReader, open_frames
+from disctrack.readers import open_frames
+from disctrack.readers.base import FrameReader
 from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.decoding import as_grey, decode
 from disctrack.readers.file_numbers import check_same_numbers
 from disctrack.readers.files import match_files
-from disctrack.readers.images import as_grey, decode
 
 
 def write_sequence(folder: Path, images, suffix="png", names=None) -> list[Path]:

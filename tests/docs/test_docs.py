@@ -119,7 +119,7 @@ def test_every_command_exists_with_its_options(page, monkeypatch):
         if command[1] == "COMMAND":
             continue
         assert command[1] in COMMANDS, command
-        parser = disctrack.cli._parser(command[1:])
+        parser = disctrack.cli._parser()
         sub = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[command[1]]
         known = {option for action in sub._actions for option in action.option_strings}
         for word in command[2:]:

@@ -1,0 +1,59 @@
+"""The interface of all readers, and which files they read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from calibration.arrays import Array, Image
+
+IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
+VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
+MRAW_SUFFIXES = frozenset({".cih", ".cihx", ".mraw"})  # Photron
+CINE_SUFFIXES = frozenset({".cine", ".cin", ".cci"})  # Phantom
+HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
+SUFFIXES = IMAGE_SUFFIXES | VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES | HDF5_SUFFIXES
+NUMBER = "{number}"  # in a pattern: these digits count the frames
+
+
+@runtime_checkable
+class FrameReader(Protocol):
+    """Frames of one camera in order. Opening it reads no more than headers; frames are read when asked for.
+
+    `read` raises disctrack.errors.RecordingError naming file, frame, what was found and what to do. It may be called
+    from several threads at once.
+    """
+
+    image_size: tuple[int, int]  # width, height [px]
+    bit_depth: int  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16)
+    timestamps: Array | None  # (n,) [s] by the camera's clock, where the file has them
+    frame_rate: float | None  # [Hz] where the file states the camera's own, not that of a player
+    notes: tuple[str, ...]  # what the user should know about how the frames were read, one sentence each
+    random_access: bool  # False where frames are read fastest in order, by one thread
+
+    def __len__(self) -> int: ...
+
+    def read(self, index: int, out: Image | None = None) -> Image:
+        """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned."""
+        ...
+
+    def describe(self, index: int) -> str:
+        """Where frame `index` lies, for messages: a file name, or a file name and an offset."""
+        ...
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """SHA-256 (hex) of what frames start..stop-1 were made from; equal if and only if the input is the same."""
+        ...
+
+
+def split_member(pattern: str) -> tuple[str, str]:
+    """Pattern of the files and what else a pattern says, "" for most.
+
+    "frames.h5:/left" is ("frames.h5", "/left"), "a/{number}.png" is ("a/*.png", "a/{number}.png").
+    """
+    if NUMBER in pattern:
+        return pattern.replace(NUMBER, "*"), pattern
+    file, colon, member = pattern.rpartition(":")
+    if colon and Path(file).suffix.lower() in HDF5_SUFFIXES:
+        return file, member
+    return pattern, ""
