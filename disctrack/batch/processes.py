@@ -18,21 +18,8 @@ from disctrack.batch.jobs import JobQueue, Share
 from disctrack.batch.plan import Job
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import Result
+from disctrack.side_by_side import ONE_THREAD
 
-# One thread each: side by side, more would wait for one another.
-ONE_THREAD = {
-    name: "1"
-    for name in (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "BLIS_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-        "NUMEXPR_NUM_THREADS",
-        "NUMBA_NUM_THREADS",
-        "OPENCV_FOR_THREADS_NUM",
-    )
-}
 _STOPPING, _ASK_AGAIN = 9.0, 2.0  # [s] that a worker has to clear up, and after which it is asked once more
 
 

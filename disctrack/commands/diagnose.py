@@ -8,14 +8,18 @@ from pathlib import Path
 from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
+from disctrack.diagnosis.together.stage import run_together
 from disctrack.files.reuse import origin_of, remember, reusable
 from disctrack.progress import stage
+from disctrack.readers.blocks import default_threads
 from disctrack.track import summary
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; returns the exit code."""
-    path = arguments.trajectory
+    if len(arguments.trajectory) > 1:
+        return _together(arguments)
+    path = arguments.trajectory[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
@@ -31,4 +35,19 @@ def run(arguments: argparse.Namespace) -> int:
     lines = [*outcome.summary, *summary.file_lines(files)]
     remember(folder, origin, lines, outcome.files)
     print("\n".join(lines))
+    return DONE
+
+
+def _together(arguments: argparse.Namespace) -> int:
+    """One answer for several files."""
+    with stage(f"diagnose {len(arguments.trajectory)} recordings together"):
+        outcome = run_together(
+            arguments.trajectory,
+            arguments.output,
+            model=arguments.model,
+            overwrite=arguments.overwrite,
+            processes=arguments.jobs or default_threads(),
+        )
+    files = [outputs.relative(file) for file in outcome.files]
+    print("\n".join([*outcome.summary, *summary.file_lines(files)]))
     return DONE

@@ -125,10 +125,14 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
 
 def add_diagnose(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack diagnose`."""
-    parser.add_argument("trajectory", type=Path, help="trajectory file; the group diagnosis is added to it")
+    files = "trajectory file; the group diagnosis is added to it. Several files are diagnosed together: one answer"
+    parser.add_argument("trajectory", type=Path, nargs="+", help=files)
     models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
     parser.add_argument("--model", default="paper", help=models)
-    parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: NAME_diagnosis beside it)")
+    where = "folder for the results (default: NAME_diagnosis beside it; of several: together_diagnosis)"
+    parser.add_argument("-o", "--output", type=Path, help=where)
+    jobs = "processes for several files (default: cores)"
+    parser.add_argument("-j", "--jobs", type=_positive, metavar="N", help=jobs)
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier diagnosis")
 
 

@@ -21,7 +21,7 @@ FILE_NAME = RECORDING_FILE
 KEYS: dict[str, tuple[str, ...]] = {
     "": ("name", "case", "surface"),
     "cameras": ("frame_rate_hz", "left", "right"),
-    "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm"),
+    "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm", "name"),
     "markers": ("diameter_mm", "centres_mm"),
     "calibration": (
         "left",
@@ -34,10 +34,13 @@ KEYS: dict[str, tuple[str, ...]] = {
     ),
     "table": ("view", "board_thickness_mm", "from", "board_thickness_tolerance_mm"),
     "gravity": ("g_m_s2",),
+    "air": ("pressure_hPa",),
 }
 
 # Keys that have a default; a calibration is either views or a rig.
 OPTIONAL = {
+    ("air", "pressure_hPa"),
+    ("disc", "name"),
     ("disc", "radius_tolerance_mm"),
     ("disc", "thickness_tolerance_mm"),
     ("calibration", "rig"),
@@ -105,6 +108,10 @@ def read_recording(path: str | Path) -> Recording:
     for label in ("case", "surface"):  # what repeats are grouped by; kept with the results in `declared`
         if label in declared:
             _Section(file, declared, "").get(label, _text)
+    if "name" in declared.get("disc", {}):  # which disc it was, where sizes and mass do not tell; also kept there
+        disc.get("name", _text)
+    if "air" in declared:
+        _Section(file, declared, "air").get("pressure_hPa", _positive)
     return Recording(
         folder=file.parent,
         name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,

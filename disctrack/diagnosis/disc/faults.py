@@ -107,6 +107,7 @@ class Fault:
     meaning: ClassVar[str]
     bounds: ClassVar[tuple[float, float]] = (-np.inf, np.inf)  # beyond which no laboratory's lies
     in_images: ClassVar[bool] = False  # adds its number times `column` to the dots' images
+    belongs_to: ClassVar[tuple[str, ...]] = ("rig",)  # what two recordings must have in common to share it
     of_poses_alone: ClassVar[bool] = True  # may show in dots about free poses, without a model of the motion
 
     @property
@@ -136,6 +137,7 @@ class Fault:
                 upper=high,
                 meaning=f"{self.meaning} ({part})" if several else self.meaning,
                 typical=TYPICAL_STEPS * self.step,
+                belongs_to=self.belongs_to,
             )
             for name, part in zip(self.names(), self.parts, strict=True)
         )
@@ -340,6 +342,7 @@ class Distortion(_OfCamera):
 class Misprint(Fault):
     """One dot out of its place."""
 
+    belongs_to = ("disc",)
     family, unit, step, parts = "misprint", "m", 1e-6, ("x", "y")
     title = "dot {} is not where it was declared"
     source, meaning = "printing", "body axes"
@@ -379,6 +382,7 @@ class Misprint(Fault):
 class PatternOffset(_Keyed):
     """The paper off the disc's centre."""
 
+    belongs_to = ("disc",)
     family, unit, step, parts = "pattern_offset", "m", 1e-6, ("x", "y")
     title = "the dots as a whole are off the disc's centre"
     source, meaning = "gluing of the paper", "body axes"
@@ -391,6 +395,7 @@ class PatternOffset(_Keyed):
 class PatternRotation(_Keyed):
     """The paper turned."""
 
+    belongs_to = ("disc",)
     family, unit, step, parts = "pattern_rotation", "rad", 1e-5, ("angle",)
     title = "the dots as a whole are turned on the face"
     source, meaning = "gluing; the same as another spin angle", "about e3"
@@ -403,6 +408,7 @@ class PatternRotation(_Keyed):
 class PatternScale(_Keyed):
     """The paper printed too large."""
 
+    belongs_to = ("disc",)
     family, unit, step, parts = "pattern_scale", "1", 1e-5, ("change",)
     title = "the dots as a whole are printed too large"
     source, meaning = "printer", "relative"
@@ -415,6 +421,7 @@ class PatternScale(_Keyed):
 class PatternHeight(_Keyed):
     """The paper above the face."""
 
+    belongs_to = ("disc",)
     family, unit, step, parts = "pattern_height", "m", 1e-6, ("offset",)
     title = "the dots lie higher than half the thickness"
     source, meaning = "paper, glue, thickness", "along e3"

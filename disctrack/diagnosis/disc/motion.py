@@ -54,6 +54,7 @@ def effect_quantity(effect: type[Effect], parameter: Parameter) -> Quantity:
         upper=parameter.upper,
         meaning=parameter.meaning,
         typical=abs(parameter.nominal),
+        belongs_to=effect.belongs_to,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,32 +130,37 @@ class DiscSystem:
         root = sigma[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
         shift = (self._whiten @ by_rig).reshape(n, -1, root.shape[0]) @ root
         _, singular, V = np.linalg.svd(triangle(shift.reshape(-1, root.shape[1])))
-        rig = shift @ V[singular > MIN_NUISANCE].T
+        self.rig_directions = np.asarray(
+            V[singular > MIN_NUISANCE], float
+        )  # by columns of `root`, the same for one rig
+        rig = shift @ self.rig_directions.T
         along = np.einsum("ncmap,npb->ncmab", by_point, R[:, :, :2])  # by the dots' places on the face
         m = self.disc.n_markers
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]
         sizes = self.systematic
         print_sigma = float(np.hypot(DOT_SIGMA, sizes.print_m))
         quantities = [
-            *_nuisances("rig", rig.shape[-1], "direction of the calibration's covariance"),
+            *_nuisances("rig", rig.shape[-1], "direction of the calibration's covariance", ("rig",)),
             *(
                 replace(_nuisances(f"dot_{i}", 1, "bias common to all images of a dot")[0], name=f"dot_{i}.{a}",
-                        unit="m", scale=1e-8, prior_sigma=print_sigma)
+                        unit="m", scale=1e-8, prior_sigma=print_sigma, belongs_to=("disc",))
                 for i in range(m)
                 for a in "xy"
             ),
         ]  # fmt: skip
         columns = [rig, dots.reshape(n, -1, 2 * m)]
         per_px = float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
+        in_common = partial(lens_columns, fields=sizes.lens_fields)
         fields = (
-            ("lens_field", sizes.lens_px, sizes.lens_length_px, lens_columns, "mode of the lenses' residual fields"),
+            ("lens_field", sizes.lens_px, sizes.lens_length_px, in_common, "mode of the lenses' residual fields"),
             ("dot_field", sizes.dot_px, sizes.dot_length_px, dot_columns, "mode of the dots' own residual fields"),
         )
         for name, size, length, of_unit_size, meaning in fields:
             if size > 0:
                 shifts = size * of_unit_size(places, self.used, length, size * per_px)
                 columns.append(np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts).reshape(n, -1, shifts.shape[-1]))
-                quantities += _nuisances(name, shifts.shape[-1], meaning)
+                belongs_to = ("rig",) if of_unit_size is in_common and sizes.lens_fields else ()
+                quantities += _nuisances(name, shifts.shape[-1], meaning, belongs_to)
         return tuple(quantities), np.concatenate(columns, axis=-1)
 
     def _measured_poses(self) -> tuple[Array, Array]:
@@ -369,9 +375,10 @@ class DiscSystem:
         return sight
 
 
-def _nuisances(name: str, k: int, meaning: str) -> list[Quantity]:
+def _nuisances(name: str, k: int, meaning: str, belongs_to: tuple[str, ...] = ()) -> list[Quantity]:
     """Linear quantities in units of their own standard deviation."""
-    return [Quantity(f"{name}.{i}", "sigma", 0.1, prior_sigma=1.0, meaning=meaning, linear=True) for i in range(k)]
+    one = Quantity(name, "sigma", 0.1, prior_sigma=1.0, meaning=meaning, linear=True, belongs_to=belongs_to)
+    return [replace(one, name=f"{name}.{i}") for i in range(k)]
 
 
 def _nowhere(n: int) -> _Path:

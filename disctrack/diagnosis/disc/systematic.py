@@ -97,6 +97,7 @@ class Systematic:
     beside: tuple[str, ...] = ()  # faults of the measurement that were fitted along
     beside_px: float = 0.0  # rms of what they do to the dots about free poses
     amounts: dict[str, float] = field(default_factory=dict)  # of their quantities
+    lens_fields: tuple[SmoothField, ...] = ()  # of each camera, where several recordings have them in common
 
     @property
     def present(self) -> bool:
@@ -109,7 +110,7 @@ class Systematic:
         return float(np.hypot(self.lens_px, self.dot_px))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SmoothField:
     """A random field with unit variance of places in the image, smooth over a length; k independent modes."""
 
@@ -148,13 +149,16 @@ def _bumps(places: Array, centres: Array, length: float) -> Array:
     return np.asarray(np.exp(-0.5 * squared / length**2), float)
 
 
-def lens_columns(places: Array, used: Mask, length: float, sigmas: float) -> Array:
-    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate, common to its dots."""
+def lens_columns(places: Array, used: Mask, length: float, sigmas: float, fields: Sequence[SmoothField] = ()) -> Array:
+    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate, common to its dots.
+
+    fields : of each camera, if they are not to be made for these places
+    """
     found = []
     for camera in range(2):
         seen = used[:, camera]
-        modes = smooth_field(places[:, camera][seen], length, sigmas).modes(places[:, camera])
-        found += _along(modes, camera, slice(None), places.shape)
+        camera_field = fields[camera] if fields else smooth_field(places[:, camera][seen], length, sigmas)
+        found += _along(camera_field.modes(places[:, camera]), camera, slice(None), places.shape)
     return np.concatenate(found, axis=-1)
 
 

@@ -32,6 +32,7 @@ class Quantity:
     meaning: str = ""
     typical: float = np.inf  # size that would surprise nobody; decides between explanations that fit alike
     linear: bool = False  # the prediction is linear in it with a derivative that is the same everywhere
+    belongs_to: tuple[str, ...] = ()  # what must be the same in two recordings for them to share it; (): never shared
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,8 @@ def measured(
     motion: Motion | None = None,
     base: Mapping[str, float] | None = None,
     laws: Sequence[type[Effect]] = (),
+    rig_seed: int | None = None,
+    disc: Disc | None = None,
 ) -> Trajectory:
     """Trajectory of a disc that rolls down with these effects ("effect.parameter") besides the paper's k_m.
 
@@ -99,16 +101,20 @@ def measured(
     motion         : in place of the rolling model's
     base           : laws that every diagnosis knows of, in place of k_m = 0.381e-7
     laws           : by formula, that `effects` may name
+    rig_seed       : of the calibration's error, equal for recordings of one calibration; without it, their own
+    disc           : in place of the scene's
     """
     rng = np.random.default_rng([20261121, seed])
-    scene = Scene(seed=seed, faults=faults or Faults())
-    f, disc, u = scene.faults, scene.declared_disc, unseen or Unseen()
+    scene = Scene(seed=seed if rig_seed is None else rig_seed, faults=faults or Faults())
+    f, u = scene.faults, unseen or Unseen()
+    disc = disc or scene.declared_disc
     u = replace(u, exposure=u.exposure or f.exposure_s)
     believed_rig = rig_of(scene)
     covariance = rig_covariance(believed_rig, scene)
     # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them
     sigma = np.sqrt(np.diag(covariance))
-    error = sigma * rng.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
+    of_rig = rng if rig_seed is None else np.random.default_rng([20261122, rig_seed])
+    error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
     u, prints = _of_the_laboratory(u, disc, rng)
     true_rig = _on_the_true_table(rig_after_faults(believed_rig.perturbed(error), scene), u)
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)

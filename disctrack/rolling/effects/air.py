@@ -16,6 +16,8 @@ class MoffattAirLayer(Effect):
     name = "air_moffatt"
     title = "viscous air layer, M_m = -f (pi mu r^3 / 4) psidot / sin^2 theta"
     source = "Moffatt 2000, Nature 404:833; mu = 1.81e-5 Pa s"
+    belongs_to = ("air",)
+    density_power = 0.0
     parameters = (Parameter("f", "1", 1.0, "factor on the lubrication layer", lower=0.0),)
     counter_rotating = True  # reads psidot, works on phidot
 
@@ -31,6 +33,8 @@ class BildstenAirLayer(Effect):
     name = "air_bildsten"
     title = "boundary-layer air drag, M_m = -beta rho sqrt(nu) r^4 |psidot|^(3/2) sgn psidot / sin theta"
     source = "Bildsten 2002, Phys. Rev. E 66:056309; rho = 1.2 kg/m^3"
+    belongs_to = ("air",)
+    density_power = 0.5
     parameters = (Parameter("beta", "1", 1.0, "factor of order one", lower=0.0),)
     counter_rotating = True
 
@@ -47,6 +51,8 @@ class QuadraticAirDrag(Effect):
     name = "air_quadratic"
     title = "quadratic air drag on the rotation, M = -a rho r^5 |Omega| Omega"
     source = "dimensional analysis; a about 0.1, rho = 1.2 kg/m^3"
+    belongs_to = ("air",)
+    density_power = 1.0
     parameters = (Parameter("a", "1", 0.1, "drag coefficient", lower=0.0),)
     airborne = True
 
@@ -67,6 +73,8 @@ class SpinAirDrag(Effect):
     name = "air_spin"
     title = "viscous air drag on the spin, M = -a omega3 e3"
     source = "Jalali, Sarebangholi and Alam 2015, Phys. Rev. E 92:032913"
+    belongs_to = ("air", "disc")
+    density_power = 0.0
     parameters = (Parameter("a", "N m s", 1e-7, "moment per spin rate", lower=0.0),)
     airborne = True
 
@@ -82,6 +90,8 @@ class RotationDrag(Effect):
     name = "drag_rotation"
     title = "linear drag on the rotation of the whole disc, M = -c Omega"
     source = "viscous drag of a fluid at rest, Stokes' law for rotation"
+    belongs_to = ("air", "disc")
+    density_power = 0.0
     parameters = (Parameter("c", "N m s", 1e-6, "moment per angular velocity", lower=0.0),)
     airborne = True
 
@@ -98,6 +108,8 @@ class LinearDrag(Effect):
     name = "drag_linear"
     title = "linear drag of the whole disc, X = -c v_O"
     source = "Stokes' law; an eddy-current brake or a draught at rest has the same form"
+    belongs_to = ("air", "disc")
+    density_power = 0.0
     parameters = (Parameter("c", "N s/m", 1e-4, "force per velocity of the centre", lower=0.0),)
     airborne = True
 

@@ -13,6 +13,7 @@ class TableTilt(Effect):
     name = "table_tilt"
     title = "tilted table: horizontal part of gravity g (tilt_x, tilt_y)"
     source = "geometry; k stays the normal of the table"
+    belongs_to = ("rig", "surface")
     parameters = (
         Parameter("tilt_x", "rad", 1e-3, "direction cosine of gravity along i", lower=-0.5, upper=0.5),
         Parameter("tilt_y", "rad", 1e-3, "direction cosine of gravity along j", lower=-0.5, upper=0.5),
@@ -33,6 +34,7 @@ class Gravity(Effect):
     name = "gravity"
     title = "gravity differs by g_error"
     source = "local value of g"
+    belongs_to = ("rig",)
     parameters = (Parameter("g_error", "m/s^2", 0.01, "gravity minus the declared one", lower=-5.0, upper=5.0),)
     passive = False
 
@@ -49,6 +51,7 @@ class CentreOfMass(Effect):
     name = "centre_of_mass"
     title = "centre of mass at (c_1, c_2, c_3) from the geometric centre, body axes"
     source = "rigid-body mechanics; c_3 along e3"
+    belongs_to = ("disc",)
     parameters = (
         Parameter("c_1", "m", 1e-4, "along the first body axis"),
         Parameter("c_2", "m", 1e-4, "along the second body axis"),
@@ -69,6 +72,7 @@ class ContactRadius(Effect):
     name = "contact_radius"
     title = "radius of the contact circle differs by r_error"
     source = "geometry (chamfer, burr, micrometer error)"
+    belongs_to = ("disc",)
     parameters = (Parameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),)
     passive = False
 
@@ -83,6 +87,7 @@ class ContactHeight(Effect):
     name = "contact_height"
     title = "half thickness at the contact differs by h_error"
     source = "geometry (paper, chamfer, micrometer error)"
+    belongs_to = ("disc",)
     parameters = (Parameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),)
     passive = False
 
@@ -97,6 +102,7 @@ class RoundedEdge(Effect):
     name = "edge_radius"
     title = "edge rounded with radius rho"
     source = "geometry: r_OA = -(r - rho) e2 - (h - rho) e3 - rho k"
+    belongs_to = ("disc",)
     parameters = (Parameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),)
     passive = False
 
@@ -111,6 +117,7 @@ class DiametralInertia(Effect):
     name = "inertia_diametral"
     title = "J1 and J2 multiplied by 1 + e"
     source = "holes, rims, inhomogeneous material"
+    belongs_to = ("disc",)
     parameters = (Parameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),)
     passive = False
 
@@ -126,6 +133,7 @@ class AxialInertia(Effect):
     name = "inertia_axial"
     title = "J3 multiplied by 1 + e"
     source = "holes, rims, inhomogeneous material"
+    belongs_to = ("disc",)
     parameters = (Parameter("e", "1", 0.01, "relative change of J3", lower=-0.5, upper=1.0),)
     passive = False
 
@@ -140,6 +148,7 @@ class InertiaProduct(Effect):
     name = "inertia_product"
     title = "products of inertia J_13, J_23"
     source = "wedge, dynamic imbalance"
+    belongs_to = ("disc",)
     parameters = (
         Parameter("J_13", "kg m^2", 1e-8, "moment of deviation between the first body axis and e3"),
         Parameter("J_23", "kg m^2", 1e-8, "moment of deviation between the second body axis and e3"),

@@ -1,0 +1,127 @@
+"""The recordings' data where the work is done: in this process, or dealt out to several.
+
+Each recording stays with one process from beginning to end, and no recording sees another: answers do not depend on
+the number of processes. They end when they are closed, and with the process that started them.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from typing import Any
+
+from disctrack.diagnosis.together.joint import Request
+from disctrack.diagnosis.together.reduction import Reduced
+from disctrack.errors import AnalysisError, DiscTrackError
+from disctrack.side_by_side import ONE_THREAD
+
+Build = Callable[[Any], Any]
+
+
+class Crew:
+    """Objects made by `build` from items, one for each, that answer calls of their methods."""
+
+    def __init__(self, build: Build, items: Sequence[Any], processes: int = 1) -> None:
+        """What `build` raises of DiscTrackErrors is kept in place of its object.
+
+        build : a module's function, as it has to be found by other processes
+        """
+        self.n = len(items)
+        self._kept = list(range(self.n))  # numbers of the objects that are asked, in their order
+        self._here: dict[int, Any] = {}
+        self._workers: list[tuple[Any, Connection]] = []
+        n = min(processes, self.n)
+        if n <= 1:
+            self._here = {i: _built(build, item) for i, item in enumerate(items)}
+            return
+        context = multiprocessing.get_context("spawn")
+        before = {name: os.environ.get(name) for name in ONE_THREAD}
+        os.environ.update(ONE_THREAD)
+        try:
+            for k in range(n):
+                ours, theirs = context.Pipe()
+                mine = {i: items[i] for i in range(k, self.n, n)}
+                process = context.Process(target=_work, args=(theirs, build, mine), daemon=True)
+                process.start()
+                theirs.close()
+                self._workers.append((process, ours))
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the processes."""
+        for process, connection in self._workers:
+            connection.close()
+            process.join(timeout=5)
+            if process.is_alive():
+                process.terminate()
+        self._workers = []
+
+    def keep(self, numbers: Sequence[int]) -> None:
+        """From now on, number objects as these are counted: the others are asked nothing any more."""
+        self._kept = list(numbers)
+
+    def call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Results of a method of every object; a DiscTrackError takes the place of the result that it prevents."""
+        numbers = self._kept
+        if not self._workers:
+            return [_answer(self._here[i], method, a) for i, a in zip(numbers, arguments, strict=True)]
+        n = len(self._workers)
+        asked: list[list[int]] = [[] for _ in range(n)]
+        for i in numbers:
+            asked[i % n].append(i)
+        by_number = dict(zip(numbers, arguments, strict=True))
+        try:
+            for mine, (_, connection) in zip(asked, self._workers, strict=True):
+                connection.send((method, [(i, by_number[i]) for i in mine]))
+            found: dict[int, Any] = {}
+            for mine, (_, connection) in zip(asked, self._workers, strict=True):
+                found.update(zip(mine, connection.recv(), strict=True))
+        except (EOFError, OSError) as error:
+            raise AnalysisError(
+                "a process that diagnosed some of the recordings has ended early, as when memory runs out: try again "
+                "with fewer processes (-j 1)"
+            ) from error
+        return [found[i] for i in numbers]
+
+    def reduce(self, requests: Sequence[Request]) -> list[Reduced | None]:
+        """As a `Reducer`."""
+        return self.call("reduce", [(values, names) for _, values, names in requests])
+
+
+def _built(build: Build, item: Any) -> Any:
+    try:
+        return build(item)
+    except DiscTrackError as error:
+        return error
+
+
+def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
+    if isinstance(thing, DiscTrackError):
+        return thing
+    try:
+        return getattr(thing, method)(*arguments)
+    except DiscTrackError as error:
+        return error
+
+
+def _work(connection: Connection, build: Build, items: dict[int, Any]) -> None:
+    objects = {i: _built(build, item) for i, item in items.items()}
+    while True:
+        try:
+            method, requests = connection.recv()
+        except (EOFError, OSError):
+            return
+        connection.send([_answer(objects[i], method, arguments) for i, arguments in requests])

@@ -1,0 +1,288 @@
+"""Many recordings, one answer: which effect do they lack, all together?
+
+Every recording is prepared and fitted alone; what is the disc's, the surface's, the rig's or the air's is then shared,
+the search over effects is made with the summed evidence, and recordings that do not fit the others are named and left
+out. The cost is linear in the number of recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from calibration.arrays import Array
+from disctrack.diagnosis.disc.model_file import PAPER
+from disctrack.diagnosis.engine.fit import Fit, triangle
+from disctrack.diagnosis.engine.score import Linearisation, score_all
+from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.engine.system import Candidate
+from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses
+from disctrack.diagnosis.together.crew import Crew
+from disctrack.diagnosis.together.fitting_in import Blocks, FitsIn, apart
+from disctrack.diagnosis.together.joint import JointSystem
+from disctrack.diagnosis.together.recordings import Alone, Item, Recorded, build, in_common, labels_of
+from disctrack.diagnosis.together.sharing import Member, Sharing
+from disctrack.errors import AnalysisError, DiscTrackError
+
+TEST_EVERY = 3  # of the recordings, every so many is foretold from the others
+ROUNDS = 3  # of leaving recordings out
+NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
+UPPER = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
+OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
+
+
+@dataclass(frozen=True)
+class OfRecording:
+    """What the joint diagnosis says of one recording."""
+
+    name: str
+    labels: dict[str, str]
+    reason: str  # why it was left out; empty where it was not
+    fits_in: FitsIn | None = None  # against all others, in the final model
+    alone: Alone | None = None  # the final model fitted to it alone
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What the recordings say of an effect, found or not."""
+
+    candidate: Candidate
+    values: Array  # (k,) fitted to first order where it was not found
+    sigma: Array  # (k,)
+    by_number: dict[int, Array]  # number of recordings, the first ones -> (k,) standard deviations
+    upper: float | None  # largest size of a single number compatible with the recordings (95 %)
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """How a law's coefficient depends on what was declared."""
+
+    quantity: str
+    unit: str
+    groups: dict[str, tuple[float, float]]  # value and standard deviation
+    hypotheses: tuple[Hypothesis, ...]
+
+
+@dataclass(frozen=True)
+class TogetherDiagnosis:
+    """Answer for many recordings."""
+
+    diagnosis: Diagnosis
+    system: JointSystem
+    recordings: tuple[OfRecording, ...]
+    bounds: tuple[Bound, ...]
+    dependences: tuple[Dependence, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the recordings that the answer rests on."""
+        return tuple(m.name for m in self.system.sharing.members)
+
+
+def diagnose_together(
+    recordings: Sequence[Recorded],
+    model: str = PAPER,
+    settings: Settings | None = None,
+    processes: int = 1,
+    progress: Callable[[str], None] = lambda text: None,
+) -> TogetherDiagnosis:
+    """What does the model lack, of all recordings together?
+
+    model : as `diagnose_trajectory`
+    processes : among which the recordings are dealt out; the answer does not depend on their number
+    Raises AnalysisError where fewer than two recordings can be used.
+    """
+    settings = replace(settings or Settings(), noise=1.0)
+    labels = labels_of(recordings)
+    items = [Item(r, label, model) for r, label in zip(recordings, labels, strict=True)]
+    progress(f"{len(items)} recordings, each alone")
+    with Crew(build, items, processes) as crew:
+        told = crew.call("told", [()] * len(items))
+        reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
+        kept = [i for i in range(len(items)) if i not in reasons]
+        _enough(kept, recordings, reasons)
+        crew.keep(kept)
+        members: list[Member] = []
+        refitted = crew.call("with_systematic", [(s,) for s in in_common([told[i] for i in kept])])
+        reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
+        members = [m for m in refitted if not isinstance(m, DiscTrackError)]
+        kept = [i for i in kept if i not in reasons]
+        for round_ in range(ROUNDS + 1):
+            _enough(kept, recordings, reasons)
+            crew.keep(kept)
+            system, diagnosis = _search(members, crew, settings, progress)
+            most = len(members) - (2 * len(items) + 2) // 3 if round_ < ROUNDS else 0
+            out = apart(system, diagnosis.after, settings.false_alarm, most)
+            if not out:
+                break
+            for k in out:
+                reasons[kept[k]] = "does not fit the others"
+            members = [m for k, m in enumerate(members) if k not in out]
+            kept = [i for k, i in enumerate(kept) if k not in out]
+        progress("each recording against the others")
+        diagnosis, alone = _with_memory(system, diagnosis, crew)
+        by_recording = _of_recordings(items, kept, reasons, system, diagnosis, alone)
+        bounds = _bounds(system, diagnosis)
+    dependences = _dependences(system, diagnosis)
+    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, _notes(by_recording))
+
+
+def _enough(kept: Sequence[int], recordings: Sequence[Recorded], reasons: dict[int, str]) -> None:
+    if len(kept) >= 2:
+        return
+    said = "; ".join(f"{recordings[i].name}: {reason}" for i, reason in list(reasons.items())[:5])
+    raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
+
+
+def _search(
+    members: Sequence[Member], crew: Crew, settings: Settings, progress: Callable[[str], None]
+) -> tuple[JointSystem, Diagnosis]:
+    sharing = Sharing(members)
+    crew.call("share", [([q.name for q in own],) for own in sharing.own])
+    system = JointSystem(sharing, crew)
+    progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
+    n = len(members)
+    training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0
+    return system, diagnose(system, sharing.start(), settings, training)
+
+
+def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Alone | None]]:
+    """Standard deviations that know the memory of what is left in each recording; and each recording fitted alone."""
+    after, sharing = diagnosis.after, system.sharing
+    extra = [n for f in diagnosis.found for n in f.candidate.names]
+    asked = [
+        (sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in range(len(sharing.members))
+    ]
+    answers = crew.call("alone", asked)
+    alone = [a if isinstance(a, Alone) else None for a in answers]
+    free = [q for q in after.quantities if not np.isfinite(q.prior_sigma)]
+    growth = np.ones(len(after.quantities))
+    for q in free:
+        weights, squares = 0.0, 0.0
+        for i, a in enumerate(alone):
+            for local in sharing.local_names(i, [q.name]):
+                sigma = a.sigmas.get(local, 0.0) if a is not None and a.converged else 0.0
+                if a is not None and np.isfinite(sigma) and sigma > 0:
+                    weights += sigma**-2
+                    squares += sigma**-2 * a.inflation[local] ** 2
+        if weights > 0:
+            growth[after.names.index(q.name)] = np.sqrt(max(squares / weights, 1.0))
+    grown = replace(after, covariance=after.covariance * np.outer(growth, growth))
+    return replace(diagnosis, after=grown), alone
+
+
+def _of_recordings(
+    items: Sequence[Item],
+    kept: Sequence[int],
+    reasons: dict[int, str],
+    system: JointSystem,
+    diagnosis: Diagnosis,
+    alone: Sequence[Alone | None],
+) -> tuple[OfRecording, ...]:
+    blocks = Blocks(system, diagnosis.after)
+    everyone = list(range(len(kept)))
+    found = []
+    for i, item in enumerate(items):
+        name, labels = item.recorded.name, dict(item.labels)
+        if i in reasons:
+            found.append(OfRecording(name, labels, reasons[i]))
+            continue
+        k = kept.index(i)
+        found.append(OfRecording(name, labels, "", blocks.fits_in(k, everyone), alone[k]))
+    return tuple(found)
+
+
+def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
+    """Every candidate to first order beside what was found, and how its sigma falls with the number of recordings."""
+    after = diagnosis.after
+    found = {f.candidate.name for f in diagnosis.found}
+    everything = [*system.candidates]
+    n = len(system.time)
+    numbers = sorted({k for k in NUMBERS if k < n} | {n})
+    whole = Linearisation(system, after, everything)
+    scores = {s.candidate.name: s for s in score_all(whole, everything)}
+    first = _sigmas_of_first(system, after, numbers)
+    bounds = []
+    for c in everything:
+        by_number = {k: first[k][c.name] for k in numbers}
+        if c.name in found:
+            values = np.array([after.values[name] for name in c.names])
+            sigma = np.array([after.sigma(name) for name in c.names])
+        else:
+            values, sigma = scores[c.name].values, scores[c.name].sigma
+        single = len(c.names) == 1 and c.name not in found and bool(np.isfinite(sigma[0]))
+        upper = float(abs(values[0] - c.quantities[0].null) + UPPER * sigma[0]) if single else None
+        bounds.append(Bound(c, values, sigma, by_number, upper))
+    return tuple(bounds)
+
+
+def _sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> dict[int, dict[str, Array]]:
+    """Standard deviations of every candidate's numbers from so many recordings, beside all that the fit moves."""
+    known = {q.name: q for q in fit_.quantities}
+    new = {q.name: q for c in system.candidates for q in c.quantities if q.name not in known}
+    everything = [*known.values(), *new.values()]
+    column = {q.name: i for i, q in enumerate(everything)}
+    _, derivative = system.linearise({q.name: q.null for q in new.values()} | fit_.values, list(column))
+    priors = np.diag([1.0 / q.prior_sigma for q in everything])
+    found: dict[int, dict[str, Array]] = {}
+    for k in numbers:
+        matrix = triangle(np.concatenate([derivative[:k].reshape(-1, len(everything)), priors]))
+        found[k] = {
+            c.name: _spread(
+                matrix[:, [column[n] for n in known if n not in c.names]], matrix[:, [column[n] for n in c.names]]
+            )
+            for c in system.candidates
+        }
+    return found
+
+
+def _spread(base: Array, mine: Array) -> Array:
+    """Standard deviations of the numbers of `mine` with those of `base` free; infinite where they are not seen."""
+    length = np.linalg.norm(base, axis=0)
+    scaled = base[:, length > 0] / length[length > 0]
+    U, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+    U = U[:, singular > 1e-10 * singular[0]] if singular.size else U
+    before = np.linalg.norm(mine, axis=0)
+    cleared = mine - U @ (U.T @ mine)
+    cleared = cleared - U @ (U.T @ cleared)
+    seen = np.linalg.norm(cleared, axis=0) > 1e-6 * np.maximum(before, 1e-300)
+    sigma = np.full(mine.shape[1], np.inf)
+    if seen.any():
+        normal = (cleared[:, seen] / before[seen]).T @ (cleared[:, seen] / before[seen])
+        sigma[seen] = np.sqrt(np.diag(np.linalg.pinv(normal))) / before[seen]
+    return sigma
+
+
+def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence, ...]:
+    """Of every law with a value for each of several groups: how these hang together."""
+    after, sharing = diagnosis.after, system.sharing
+    found = []
+    for local, groups in sharing.all_groups().items():
+        names = [n for n in groups.values() if n in after.names and after.sigma(n) > 0]
+        if len(names) < 2 or len(names) < len(groups):
+            continue
+        index = [after.names.index(n) for n in names]
+        values = np.array([after.values[n] for n in names])
+        covariance = after.covariance[np.ix_(index, index)]
+        q = after.quantities[index[0]]
+        covariates, powers = sharing.covariates_of(local)
+        tested = hypotheses(values, covariance, covariates, powers)
+        shown = {g: (after.values[n], after.sigma(n)) for g, n in groups.items()}
+        found.append(Dependence(local, q.unit, shown, tuple(tested)))
+    return tuple(found)
+
+
+def _notes(recordings: Sequence[OfRecording]) -> tuple[str, ...]:
+    notes = [f"{r.name} {r.reason}" if r.reason.startswith("does") else f"{r.name} was left out: {r.reason}"
+             for r in recordings if r.reason]  # fmt: skip
+    for r in recordings:
+        if r.alone is not None and r.alone.converged:
+            excess = (r.alone.chi_square / r.alone.degrees - 1) / np.sqrt(2 / r.alone.degrees)
+            if stats.norm.sf(excess) * len(recordings) < OWN_LEVEL and r.alone.chi_square > 1.1 * r.alone.degrees:
+                ratio = r.alone.chi_square / r.alone.degrees
+                notes.append(f"{r.name} is not described by the model even alone (chi-square {ratio:.3g})")
+    return tuple(notes)

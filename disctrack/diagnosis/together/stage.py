@@ -1,0 +1,80 @@
+"""The stage: trajectory files in; one page, one diagnosis.json and one sentence out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from disctrack.diagnosis.disc.model_file import PAPER
+from disctrack.diagnosis.together.loop import TogetherDiagnosis, diagnose_together
+from disctrack.diagnosis.together.recordings import Recorded, read_recorded
+from disctrack.errors import AnalysisError, OutputError
+from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.json_text import json_file
+from disctrack.files.whole import write_whole
+
+FOLDER = "together_diagnosis"
+
+
+@dataclass(frozen=True)
+class TogetherOutcome:
+    """What `run_together` did."""
+
+    result: TogetherDiagnosis
+    files: tuple[Path, ...]
+    summary: tuple[str, ...]
+
+
+def run_together(
+    paths: Sequence[Path],
+    output: Path | None = None,
+    *,
+    model: str = PAPER,
+    overwrite: bool = False,
+    processes: int = 1,
+    progress: Callable[[str], None] = lambda text: None,
+) -> TogetherOutcome:
+    """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
+
+    output : folder; without it `together_diagnosis` in the deepest folder that holds all files
+    Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
+    """
+    from disctrack.diagnosis.together.output import as_json, figures, lines, whole_page
+    from disctrack.pages.figures import draw, gallery  # matplotlib is wanted here only
+
+    paths = [Path(p) for p in paths]
+    for p in paths:
+        keep(p)
+    twice = sorted({str(p) for p in paths if sum(p.resolve() == q.resolve() for q in paths) > 1})
+    if twice:
+        raise AnalysisError(f"{twice[0]}: given more than once. A recording speaks once: name each file once.")
+    folder = Path(output) if output is not None else common_folder(paths) / FOLDER
+    report = folder / "diagnosis.json"
+    if report.exists() and not overwrite:
+        raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
+    refuse_input(report)
+    recordings = _told_apart([read_recorded(p) for p in paths], paths)
+    result = diagnose_together(recordings, model, processes=processes, progress=progress)
+    drawn = figures(result)
+    files, pictures = draw(folder, drawn, ["png"])
+    html = folder / "diagnosis.html"
+    write_whole(html, whole_page(result, gallery(drawn, pictures)).encode())
+    write_whole(report, json_file({"files": [str(p) for p in paths], **as_json(result)}))
+    return TogetherOutcome(result, (report, html, *files), tuple(lines(result)))
+
+
+def common_folder(paths: Sequence[Path]) -> Path:
+    """The deepest folder that holds all files."""
+    return Path(os.path.commonpath([p.resolve().parent for p in paths]))
+
+
+def _told_apart(recordings: Sequence[Recorded], paths: Sequence[Path]) -> list[Recorded]:
+    """Recordings of one name are called after their files."""
+    names = [r.name for r in recordings]
+    base = common_folder(paths)
+    return [
+        replace(r, name=p.resolve().relative_to(base).as_posix()) if names.count(r.name) > 1 else r
+        for r, p in zip(recordings, paths, strict=True)
+    ]

@@ -1,0 +1,143 @@
+"""Many recordings, one answer: shared quantities, own ones eliminated, what does not belong named."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis import Settings, diagnose
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.together.covariates import hypotheses
+from disctrack.diagnosis.together.crew import Crew
+from disctrack.diagnosis.together.fitting_in import Blocks, apart
+from disctrack.diagnosis.together.joint import JointSystem
+from disctrack.diagnosis.together.sharing import Sharing
+from tests.oracles.decaying_runs import build, fitted_at_once, renamed, runs
+
+
+def joint(items, processes=1):
+    crew = Crew(build, items, processes)
+    sharing = Sharing([build(item).member for item in items])
+    crew.call("share", [([q.name for q in own],) for own in sharing.own])
+    return JointSystem(sharing, crew), crew
+
+
+def answer(items):
+    system, _ = joint(items)
+    n = len(items)
+    return system, diagnose(system, system.sharing.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
+
+
+def test_elimination_gives_what_all_quantities_at_once_give(rng):
+    items = runs(rng, 6, drag=0.05)
+    system, _ = joint(items)
+    drag = next(c for c in system.candidates if c.name == "drag")
+    found = fit(system, (*system.base, *drag.quantities), system.sharing.start())
+    values, sigmas, cost = fitted_at_once(items, ["drag.c"])
+    assert found.converged
+    for name, sigma in zip(("friction.g", "drag.c"), sigmas, strict=True):
+        assert abs(found.values[name] - values[name]) < 0.03 * sigma  # a fit ends when 1e-3 of chi-square is left
+        assert found.sigma(name) == pytest.approx(sigma, rel=1e-3)
+    assert found.chi_square == pytest.approx(cost, abs=2e-3)
+    assert found.degrees_of_freedom == 6 * 200 - 6 * 2 - 2
+
+
+def test_an_effect_below_one_run_s_reach_is_found_in_thirty(rng):
+    items = runs(rng, 30, drag=0.06)  # 1.1 of the sigma that one run has
+    assert all(not answer([item])[1].found for item in items[:3])
+    _, together = answer(items)
+    assert [f.candidate.name for f in together.found] == ["drag"]
+    assert abs(together.after.values["drag.c"] - 0.06) < 3 * together.after.sigma("drag.c")
+
+
+def test_nothing_is_found_where_nothing_is_hidden(rng):
+    claimed = [answer(runs(rng, 30))[1].found for _ in range(5)]
+    assert sum(bool(f) for f in claimed) == 0  # 0.005 each
+
+
+def test_sigma_falls_with_the_root_of_the_number(rng):
+    items = runs(rng, 16)
+    few, many = (fit(s, s.base, s.sharing.start()) for s in (joint(items[:4])[0], joint(items)[0]))
+    assert few.sigma("friction.g") / many.sigma("friction.g") == pytest.approx(2.0, rel=0.15)  # amplitudes differ
+
+
+def test_a_run_of_another_disc_among_them_is_named(rng):
+    items = runs(rng, 12, run_7={"rate": 0.87})
+    system, found = answer(items)
+    assert apart(system, found.after, 0.005) == [7]
+    system, found = answer(runs(rng, 12))
+    assert apart(system, found.after, 0.005) == []
+
+
+def test_difference_to_the_others_is_a_chi_square(rng):
+    judged = []
+    for _ in range(15):
+        system, _ = joint(runs(rng, 8))
+        blocks = Blocks(system, fit(system, system.base, system.sharing.start()))
+        judged += [blocks.fits_in(i, list(range(8))) for i in range(8)]
+    assert {f.degrees for f in judged} == {1}
+    assert np.mean([f.statistic for f in judged]) == pytest.approx(
+        1.0, abs=3 * np.sqrt(2 / 105)
+    )  # eight of seven are free
+
+
+def test_runs_that_declare_another_disc_have_a_rate_of_their_own(rng):
+    changed = {f"run_{i}": {"rate": 0.8 * 2**-0.5, "mass": 2.0} for i in range(6, 12)}
+    changed |= {f"run_{i}": {"rate": 0.8 * 4**-0.5, "mass": 4.0} for i in range(12, 18)}
+    system, found = answer(runs(rng, 18, **changed))
+    assert found.verdict == "nothing missing"
+    groups = system.sharing.all_groups()["friction.g"]
+    assert set(groups) == {"1 kg", "2 kg", "4 kg"}
+    index = [found.after.names.index(n) for n in groups.values()]
+    values = np.array([found.after.values[n] for n in groups.values()])
+    covariates, powers = system.sharing.covariates_of("friction.g")
+    assert covariates == {"mass": [1.0, 2.0, 4.0], "pressure": [1.0, 1.0, 1.0]}
+    assert not powers
+    tested = hypotheses(values, found.after.covariance[np.ix_(index, index)], covariates, powers)
+    assert tested[0].text == "in proportion to a power of the mass"
+    exponent, sigma = tested[0].numbers["exponent of the mass"]
+    assert abs(exponent + 0.5) < 3 * sigma
+    assert sigma < 0.02
+    assert tested[0].holds
+    assert not next(h for h in tested if h.text == "the same for all").holds
+
+
+def test_law_of_the_air_is_told_from_one_that_each_pressure_has_its_own(rng):
+    changed = {f"run_{i}": {"density": 0.1, "drag": 0.3 * 0.1**0.5} for i in range(6)}
+    system, found = answer(runs(rng, 12, drag=0.3, **changed))
+    assert found.found[0].candidate.name == "drag"  # one constant, times the root of the density
+    assert found.after.values["drag.c"] == pytest.approx(0.3, abs=3 * found.after.sigma("drag.c"))
+    wrong = {f"run_{i}": {"density": 0.1, "drag": 0.4} for i in range(6)}
+    system, found = answer(runs(rng, 12, drag=0.3, **wrong))
+    assert found.found[0].candidate.name == "drag (each its own)"
+    _, powers = system.sharing.covariates_of("drag.c")
+    assert powers == {"pressure": 0.5}
+    values = np.array([found.after.values[n] for n in system.sharing.all_groups()["drag.c"].values()])
+    assert_allclose(values, [0.4, 0.3], atol=0.03)
+
+
+def test_quantities_of_an_undeclared_kind_are_shared_by_all_who_do_not_declare_it(rng):
+    items = [renamed(item, surface="") for item in runs(rng, 3)] + runs(rng, 2)
+    system, _ = joint(items)
+    assert [q.name for q in system.base] == ["friction.g[no surface declared]", "friction.g[glass]"]
+
+
+def test_hypotheses_of_exact_values():
+    x = np.array([1.0, 2.0, 3.0, 5.0])
+    tested = hypotheses(7 * x**1.5, 1e-6 * np.eye(4), {"radius": x.tolist(), "mass": [1.0] * 4}, {"radius": 1.5})
+    by_text = {h.text: h for h in tested}
+    assert by_text["in proportion to radius^1.5, as its law says"].holds
+    assert by_text["in proportion to a power of the radius"].numbers["exponent of the radius"][0] == pytest.approx(1.5)
+    assert not by_text["the same for all"].holds
+    assert len(tested) == 3  # nothing is said of a mass that does not differ
+
+
+@pytest.mark.slow
+def test_the_number_of_processes_changes_no_bit(rng):
+    items = runs(rng, 5, drag=0.05)
+    found = []
+    for processes in (1, 2):
+        system, crew = joint(items, processes)
+        with crew:
+            found.append(diagnose(system, system.sharing.start(), Settings(noise=1.0)).after)
+    assert found[0].values == found[1].values
+    assert (found[0].covariance == found[1].covariance).all()

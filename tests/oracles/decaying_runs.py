@@ -1,0 +1,115 @@
+"""Runs of one experiment with a closed form, of which many have to be taken together.
+
+y(t) = a exp(-g t) + b, a and b of each run; the rate g is the disc's and the surface's. What may be missing: a term
+c t exp(-g t), the air's, that goes with the root of its density; a hum, the rig's; a growth, the disc's.
+"""
+
+import numpy as np
+
+from disctrack.diagnosis import Candidate, Quantity
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.together.reduction import Reduction
+from disctrack.diagnosis.together.sharing import Member
+
+TIME = np.linspace(0.0, 3.0, 200)
+SIGMA = 0.01
+CONTACT, AIR, RIG, DISC = ("disc", "surface"), ("air",), ("rig",), ("disc",)
+
+
+def one(name, belongs_to, **more):
+    return (Quantity(name, "1", 0.01, belongs_to=belongs_to, typical=0.1, **more),)
+
+
+class Decay:
+    def __init__(self, observed):
+        self.time, self.observed, self.weights = TIME, observed, np.ones(len(TIME))
+        self.base = (Quantity("state.a", "1", 0.1), Quantity("state.b", "1", 0.1),
+                     Quantity("friction.g", "1/s", 0.01, null=1.0, belongs_to=CONTACT))  # fmt: skip
+        self.candidates = (
+            Candidate("drag", "drag", "motion", "drag of the air", "", one("drag.c", AIR, lower=0.0)),
+            Candidate("hum", "hum", "measurement", "hum", "", (*one("hum.c", RIG), *one("hum.s", RIG))),
+            Candidate("growth", "growth", "motion", "growth", "", one("growth.k", DISC)),
+        )
+
+    def linearise(self, values, names):
+        get = lambda n, default=0.0: values.get(n, default)  # noqa: E731
+        t, g = TIME, get("friction.g", 1.0)
+        fall = np.exp(-g * t)
+        by = {
+            "state.a": fall, "state.b": np.ones_like(t), "drag.c": t * fall, "growth.k": t**2,
+            "hum.c": np.cos(9 * t), "hum.s": np.sin(9 * t),
+        }  # fmt: skip
+        linear = {k: v for k, v in by.items() if k in values}
+        predicted = sum((get(k) * v for k, v in linear.items()), np.zeros_like(t))
+        by["friction.g"] = -t * fall * (get("state.a") + t * get("drag.c"))
+        J = np.array([by[n] for n in names]).reshape(len(names), len(t)).T / SIGMA
+        return ((self.observed - predicted) / SIGMA)[:, None], J[:, None]
+
+
+class DecayMember:
+    """As the recordings of the disc are to a crew."""
+
+    def __init__(self, item):
+        name, observed, labels, covariates, density = item
+        self.system = Decay(observed)
+        self.base = fit(self.system, self.system.base, {"state.a": 1.0, "state.b": 0.0, "friction.g": 1.0})
+        candidates = self.system.candidates
+        powers = {"drag": 0.5}
+        told = (name, self.system.base, candidates, self.base.values, len(TIME), labels, covariates, density)
+        self.member = Member(*told, density_powers=powers)
+
+    def share(self, own):
+        mine = [q for q in self.system.base if q.name in own]
+        scales = {q.name: q.scale for c in self.system.candidates for q in c.quantities} | {"friction.g": 0.01}
+        self.reduction = Reduction(self.system, mine, self.base.values, scales)
+
+    def reduce(self, values, names):
+        return self.reduction.reduce(values, names)
+
+
+def build(item):
+    return DecayMember(item)
+
+
+def runs(rng, n, drag=0.0, rate=0.8, **changed):
+    """(name, data, labels, covariates, density) of n runs; changed: run_3={"rate": 0.9, "mass": 2.0, ...}."""
+    items = []
+    for i in range(n):
+        own = {"rate": rate, "drag": drag, "growth": 0.0, "mass": 1.0, "density": 1.0, **changed.get(f"run_{i}", {})}
+        truth = {"state.a": 1 + 0.2 * rng.standard_normal(), "state.b": 0.1 * rng.standard_normal(),
+                 "friction.g": own["rate"], "drag.c": own["drag"], "growth.k": own["growth"]}  # fmt: skip
+        clean = -Decay(np.zeros_like(TIME)).linearise(truth, [])[0][:, 0] * SIGMA
+        labels = {"disc": f"{own['mass']:g} kg", "surface": "glass", "rig": "rig 1", "air": f"{own['density']:g}"}
+        covariates = {"mass": own["mass"], "pressure": own["density"]}
+        items.append((f"run {i}", clean + SIGMA * rng.standard_normal(len(TIME)), labels, covariates, own["density"]))
+    return items
+
+
+def fitted_at_once(items, extra=()):
+    """Every quantity of every run in one least-squares problem, by SciPy: values and sigmas of g and `extra`, cost."""
+    from scipy.optimize import least_squares
+
+    systems = [Decay(data) for _, data, *_ in items]
+    names = ["friction.g", *extra]
+
+    def misfit(x):
+        shared = dict(zip(names, x[: len(names)], strict=True))
+        own = x[len(names) :].reshape(-1, 2)
+        return np.concatenate(
+            [
+                s.linearise({**shared, "state.a": a, "state.b": b}, [])[0][:, 0]
+                for s, (a, b) in zip(systems, own, strict=True)
+            ]
+        )
+
+    start = np.concatenate([[1.0], np.zeros(len(extra)), np.tile([1.0, 0.0], len(items))])
+    found = least_squares(misfit, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    k = len(names)
+    return dict(zip(names, found.x[:k], strict=True)), np.sqrt(np.diag(covariance))[:k], 2 * found.cost
+
+
+def renamed(item, **labels):
+    """The same run with other labels."""
+    name, data, known, covariates, density = item
+    return (name, data, {**known, **labels}, covariates, density)
