@@ -8,7 +8,7 @@ It shares no code with the location of markers and corners, so that those can be
 from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.render.images import expected_disc, render_board, render_disc
 from disctrack.render.recording import recording_toml, run_render, true_disc_of, write_recording
-from disctrack.render.truth import Truth, read_truth, rig_parameters
+from disctrack.render.truth import Truth, read_truth
 
 __all__ = [
     "Truth",
@@ -20,7 +20,6 @@ __all__ = [
     "render_disc",
     "rig_after_faults",
     "rig_of",
-    "rig_parameters",
     "run_render",
     "true_disc_of",
     "write_recording",

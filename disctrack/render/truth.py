@@ -6,19 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
-from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
+from calibration.camera import StereoRig
+from calibration.rig_file import read_rig_group, write_rig_group
 from disctrack.disc import Disc
-from disctrack.errors import OutputError
-from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_vector, vector_from_rotation
+from disctrack.errors import OutputError, RigFileError
+from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.render.rays import View, image_of
 from disctrack.scene.description import Scene, scene_toml
 
 SCHEMA = "disctrack truth"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -51,24 +53,8 @@ class Truth:
         return np.stack(pixels, axis=1)
 
 
-def rig_parameters(rig: StereoRig) -> Array:
-    """(30,) in the order of RIG_PARAMETERS; rotations as rotation vectors from the identity."""
-    return np.concatenate(
-        [
-            rig.left.parameters,
-            rig.right.parameters,
-            vector_from_rotation(rig.R_right_left),
-            rig.t_right_left,
-            vector_from_rotation(rig.R_left_world),
-            rig.t_left_world,
-        ]
-    )
-
-
 def write_truth(path: Path, truth: Truth, scene: Scene) -> None:
     """Write `truth` and the scene it was rendered from."""
-    import h5py
-
     with h5py.File(path, "w") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["scene"] = scene_toml(scene)  # renders the same recording again
@@ -87,7 +73,7 @@ def write_truth(path: Path, truth: Truth, scene: Scene) -> None:
         _put(disc, "paper_centre_body", truth.paper_centre_body, "m", "centre of the paper on the upper face")
         _put(disc, "markers_printed", truth.markers_printed.astype(np.uint8), "1", "0: the dot has come off")
         for name, rig in (("rig", truth.rig), ("rig_while_filming", truth.rig_while_filming)):
-            _put_rig(file.create_group(name), rig)
+            write_rig_group(file.create_group(name), rig)
         board = file.create_group("board")
         _put(board, "R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views")
         _put(board, "t_world_board", truth.t_world_board, "m", "lower left inner corner in the calibration views")
@@ -101,21 +87,8 @@ def _put(group: Any, name: str, values: NDArray[Any], units: str, text: str) -> 
     data.attrs["units"], data.attrs["description"] = units, text
 
 
-def _put_rig(group: Any, rig: StereoRig) -> None:
-    _put(group, "parameters", rig_parameters(rig), "px, 1, rad, m", "in the order of the attribute names")
-    group["parameters"].attrs["names"] = list(RIG_PARAMETERS)
-    group.attrs["image_size"] = [rig.left.image_size, rig.right.image_size]
-    for name, camera in (("left", rig.left), ("right", rig.right)):
-        _put(group, f"{name}_camera_matrix", camera.camera_matrix, "px", "K")
-        _put(group, f"{name}_distortion", np.array(camera.distortion), "1", "k1, k2, p1, p2, k3")
-    for name in ("R_right_left", "t_right_left", "R_left_world", "t_left_world"):
-        _put(group, name, getattr(rig, name), "m" if name[0] == "t" else "1", "camera frames as in disctrack.frames")
-
-
 def read_truth(path: str | Path) -> Truth:
     """Truth of a file that `write_truth` wrote; raises OutputError for anything else."""
-    import h5py
-
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA:
@@ -129,8 +102,8 @@ def read_truth(path: str | Path) -> Truth:
                 qdot=file["qdot"][:],
                 q_right=file["q_right"][:],
                 frame_rate=float(file.attrs["frame_rate_hz"]),
-                rig=_get_rig(file["rig"]),
-                rig_while_filming=_get_rig(file["rig_while_filming"]),
+                rig=read_rig_group(file["rig"]),
+                rig_while_filming=read_rig_group(file["rig_while_filming"]),
                 disc=Disc(
                     radius=float(disc.attrs["radius"]),
                     half_thickness=float(disc.attrs["half_thickness"]),
@@ -144,19 +117,5 @@ def read_truth(path: str | Path) -> Truth:
                 t_world_board=file["board/t_world_board"][:],
                 effects={name: float(value) for name, value in file["effects"].attrs.items()},
             )
-    except (OSError, KeyError) as error:
+    except (OSError, KeyError, RigFileError) as error:
         raise OutputError(f"{path}: not a truth file ({error}); render the recording again") from error
-
-
-def _get_rig(group: Any) -> StereoRig:
-    p = group["parameters"][:]
-    (w_left, h_left), (w_right, h_right) = group.attrs["image_size"]
-    return StereoRig(
-        left=Camera.from_parameters(p[0:9], (int(w_left), int(h_left))),
-        right=Camera.from_parameters(p[9:18], (int(w_right), int(h_right))),
-        R_right_left=rotation_from_vector(p[18:21]),
-        t_right_left=p[21:24],
-        R_left_world=rotation_from_vector(p[24:27]),
-        t_left_world=p[27:30],
-        world_is_table=True,
-    )

@@ -1,7 +1,6 @@
 """Calibration of real photographs and of the reference recording, against figures found elsewhere."""
 
 import json
-from dataclasses import replace
 
 import cv2
 import h5py
@@ -11,13 +10,13 @@ import pytest
 from calibration import (
     Board,
     CalibrationSettings,
-    Camera,
     calibrate_from_corners,
     calibrate_stereo,
     find_corners,
     triangulate,
 )
 from calibration.images import calibrate_files, find_pairs
+from calibration.rig_file import read_rig_group
 
 
 def read_pairs(folder, pattern, indices):
@@ -66,19 +65,18 @@ def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
 
 def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
-        truth = file["rig/parameters"][()]
-        rotations = {name: file["rig"][name][()] for name in ("R_right_left", "R_left_world")}
+        truth = read_rig_group(file["rig"])
     pairs = find_pairs("left/*.png", "right/*.png", sample_clip / "calibration")
     found = calibrate_files(pairs, Board((9, 6), 6e-3), CalibrationSettings(board="flat"), 0, 3e-3)
     rig = found.rig
     error = np.concatenate(
         [
-            rig.left.parameters - truth[:9],
-            rig.right.parameters - truth[9:18],
-            vector_of(rig.R_right_left @ rotations["R_right_left"].T),
-            rig.t_right_left - truth[21:24],
-            vector_of(rig.R_left_world @ rotations["R_left_world"].T),
-            rig.t_left_world - truth[27:30],
+            rig.left.parameters - truth.left.parameters,
+            rig.right.parameters - truth.right.parameters,
+            vector_of(rig.R_right_left @ truth.R_right_left.T),
+            rig.t_right_left - truth.t_right_left,
+            vector_of(rig.R_left_world @ truth.R_left_world.T),
+            rig.t_left_world - truth.t_left_world,
         ]
     )
     free = np.diag(rig.covariance) > 0
@@ -90,13 +88,8 @@ def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     assert np.abs(error[free][-3:] / sigma[-3:]).max() < 4
     # what is wanted of it: points above the table within a micrometre
     assert found.assessment.triangulation_sigma[1] < 1e-6
-    true_rig = replace(
-        rig, left=Camera.from_parameters(truth[:9], (272, 272)), right=Camera.from_parameters(truth[9:18], (272, 272)),
-        R_right_left=rotations["R_right_left"], t_right_left=truth[21:24],
-        R_left_world=rotations["R_left_world"], t_left_world=truth[27:30],
-    )  # fmt: skip
     points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 30e-3, 0], [25e-3, 15e-3, 20e-3]])
-    assert np.abs(triangulate(true_rig.project(points), rig) - points).max() < 2e-6
+    assert np.abs(triangulate(truth.project(points), rig) - points).max() < 2e-6
 
 
 def vector_of(R):
