@@ -18,8 +18,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
+
+from calibration.compiled import njit
 
 N_CORNER = (
     9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
@@ -35,7 +36,7 @@ _SQRT_HALF = math.sqrt(0.5)
 # What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices
 # assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop.
 _OPTIONS: dict[str, Any] = {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_part = numba.njit(**_OPTIONS)
+_part = njit(**_OPTIONS)
 
 
 @_part
@@ -242,7 +243,7 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
     return sums, converged
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def fit_corners(image, windows, starts, curvatures, noise, iterations, tolerance):  # type: ignore[no-untyped-def]
     """`fit_corner` for many corners of one image: parameters (n, 9), covariances (n, 2, 2), sums (n, 9), converged."""
     n = starts.shape[0]

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from calibration.arrays import Array, Mask
 from calibration.camera import N_RIG
@@ -224,6 +223,8 @@ def _bridged_rotations(time: Array, quaternion: Array, good: Mask) -> Array:
     R = rotation_from_quaternion(np.where(good[:, None], quaternion, np.array([1.0, 0.0, 0.0, 0.0])))
     missing = ~good
     if missing.any():
+        from scipy.spatial.transform import Rotation, Slerp  # half a second, wanted where frames are missing
+
         arc = Slerp(time[good], Rotation.from_matrix(R[good]))
         R[missing] = arc(np.clip(time[missing], time[good][0], time[good][-1])).as_matrix()
     return R

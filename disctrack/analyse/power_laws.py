@@ -14,8 +14,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import find_peaks
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from calibration.arrays import Array
 from disctrack.disc import Disc
@@ -255,7 +254,7 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
         )
     if reason:
         return replace(base, reason=reason, t_f=fit.t_f, t_f_sigma=t_f_sigma)
-    quantile = float(student_t.ppf(0.975, dof))
+    quantile = float(stdtrit(dof, 0.975))
     energy, energy_at_1s, energy_rms = _energy_exponent(fit, ln_energy, t_f_sigma, quantile)
     misfit = fit.residuals().reshape(2, -1) * fit.scale[:, None]
     rms = np.sqrt(np.mean(misfit**2, axis=1))
@@ -351,6 +350,8 @@ def count_nutation(psi: Array, theta: Array, theta_sigma: Array, disc: Disc, gra
     if known.size < 8:
         return NutationCount(np.zeros(0), np.zeros(0), float("nan"), float("nan"), (float("nan"),) * 2)
     height = theta[known]
+    from scipy.signal import find_peaks  # takes a second to import, and only long recordings come here
+
     peaks, _ = find_peaks(height, prominence=6 * float(np.median(theta_sigma[known])))
     turns = (psi[known] - psi[known[0]]) / (2 * np.pi)
     at = np.array([_parabola_top(turns[i - 1 : i + 2], height[i - 1 : i + 2]) for i in peaks])

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from calibration import StereoCalibration
 from disctrack.frames import CAMERAS
+from disctrack.pages.figures import lay_out
 from disctrack.pages.palette import BLUE, COLOURS, INK
 
 COVERAGE_CELLS = 8
@@ -20,7 +21,8 @@ _SHADES = LinearSegmentedColormap.from_list("coverage", ["#dceefa", BLUE])
 
 def residuals_figure(found: StereoCalibration) -> Figure:
     """Observed - predicted corners as arrows in each image, and their root mean square per view."""
-    figure = Figure(figsize=(12, 9), layout="constrained")
+    figure = Figure(figsize=(12, 9))
+    lay_out(figure, (2, 2), gaps=(0.7, 0.7))
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     refinement = found.refinement
     lengths = np.linalg.norm(refinement.residuals[refinement.kept], axis=1)
@@ -72,7 +74,8 @@ def _views(axes: Axes, found: StereoCalibration) -> None:
 
 def coverage_figure(found: StereoCalibration) -> Figure:
     """Used corners in each image over the cells that hold any; distortion is a guess where there is none."""
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = Figure(figsize=(12, 6))
+    lay_out(figure, (1, 2))
     observations, kept = found.refinement.observations, found.refinement.kept
     for camera, (name, axes) in enumerate(zip(CAMERAS, figure.subplots(1, 2), strict=True)):
         pixels = observations.pixels[kept & (observations.camera == camera)]

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import disctrack
+from disctrack.files.software import software_version
 from disctrack.files.trajectory_file import read_setup
 from disctrack.files.whole import write_whole
 
@@ -17,14 +17,14 @@ FILE_NAME = "made_from.json"
 
 def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:
     """SHA-256 (hex) of what a result is made from. Raises TrajectoryFileError."""
-    content = [read_setup(trajectory).fingerprint, dict(settings), disctrack.__version__]
+    content = [read_setup(trajectory).fingerprint, dict(settings), software_version()]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def remember(folder: Path, origin: str, lines: Sequence[str], files: Sequence[Path]) -> None:
     """Keep beside the results what they were made from, and what was said of them. Raises OutputError."""
     names = [file.relative_to(folder).as_posix() for file in files if file.is_relative_to(folder)]
-    content = {"origin": origin, "version": disctrack.__version__, "summary": list(lines), "files": names}
+    content = {"origin": origin, "version": software_version(), "summary": list(lines), "files": names}
     write_whole(folder / FILE_NAME, (json.dumps(content, indent=1) + "\n").encode())
 
 

@@ -21,12 +21,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-import disctrack
 from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
+from disctrack.files.software import software_version
 from disctrack.files.whole import write_whole
 from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -53,7 +53,7 @@ class Provenance:
     recording: str  # name
     inputs: Mapping[str, str]  # what -> SHA-256 (hex) of its content
     settings: Mapping[str, Any]  # everything that was chosen, of JSON's types
-    version: str = disctrack.__version__
+    version: str = field(default_factory=software_version)
 
     @property
     def fingerprint(self) -> str:

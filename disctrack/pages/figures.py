@@ -44,6 +44,24 @@ def dress(axes: Axes) -> None:
     axes.yaxis.label.set_color(INK)
 
 
+def lay_out(
+    figure: Figure,
+    shape: tuple[int, int],
+    margins: tuple[float, float, float, float] = (0.8, 0.2, 0.6, 0.7),
+    gaps: tuple[float, float] = (0.9, 0.6),
+) -> None:
+    """Place a grid of axes by hand: measuring the labels, as matplotlib can, takes longer than drawing all of them.
+
+    shape : rows, columns; margins : left, right, bottom, top [in]; gaps : between columns, between rows [in]
+    """
+    (width, height), (rows, columns), (left, right, bottom, top) = figure.get_size_inches(), shape, margins
+    across = (width - left - right - (columns - 1) * gaps[0]) / columns
+    down = (height - bottom - top - (rows - 1) * gaps[1]) / rows
+    figure.subplots_adjust(
+        left / width, bottom / height, 1 - right / width, 1 - top / height, gaps[0] / across, gaps[1] / down
+    )
+
+
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure whole; the format follows from the name. Raises OutputError."""
     FigureCanvasAgg(figure)

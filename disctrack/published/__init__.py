@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtr
 
 from calibration.arrays import Array
 
@@ -78,6 +78,6 @@ def agreement(table: PublishedTable) -> tuple[Agreement, ...]:
     result = []
     for name, value, s, predicted in zip(EXPONENTS, mean, sigma, PREDICTED, strict=True):
         t = (value - predicted) / s
-        p = 2 * float(student_t.sf(abs(t), n - 1))
+        p = 2 * float(stdtr(n - 1, -abs(t)))
         result.append(Agreement(name, float(value), float(s), predicted, float(t), p))
     return tuple(result)

@@ -10,9 +10,10 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from calibration.compiled import njit
 
 try:
     import deflate  # libdeflate: 0.4 of zlib's time
@@ -91,7 +92,7 @@ def _ends_here(inflater: zlib._Decompress) -> bool:
         return False
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _undo_filters(rows: NDArray, pixel_bytes: int, out: NDArray) -> bool:  # pragma: no cover (compiled)
     """Rows (height, 1 + stride), filter type first, to pixels (height, stride); False for an unknown filter type.
 

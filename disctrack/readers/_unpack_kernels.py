@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.compiled import njit
 
-@numba.njit(nogil=True, cache=True)
+
+@njit(nogil=True, cache=True)
 def unpack_12(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compiled)
     """3 bytes to 2 pixels: packed (3 k,) uint8, out (2 k,) uint16."""
     for i in range(out.size // 2):
@@ -16,7 +17,7 @@ def unpack_12(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compi
         out[2 * i + 1] = ((b & np.uint16(0xF)) << np.uint16(8)) | c
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def unpack_10(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compiled)
     """5 bytes to 4 pixels: packed (5 k,) uint8, out (4 k,) uint16."""
     for i in range(out.size // 4):
@@ -28,7 +29,7 @@ def unpack_10(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compi
         out[4 * i + 3] = ((d & np.uint16(0x3)) << np.uint16(8)) | e
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def look_up(table: NDArray, values: NDArray) -> None:  # pragma: no cover (compiled)
     """Replace values (n,) uint16 by table[values], in place; every value must be an index of the table."""
     for i in range(values.size):

@@ -7,17 +7,17 @@ cells are many: 20 ms for a disc that fills a third of 512 x 512 with s = 5.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from calibration.arrays import Array, Array32
+from calibration.compiled import njit
 from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
 
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane ahead of the camera
 _N_FIELDS = 11
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _disc_fields(
     rx: float, ry: float, R: Array, eye: Array, radius: float, h: float, cap: float, paper: Array, dots: Array,
     dot_radius: float, out: Array,
@@ -51,7 +51,7 @@ def _disc_fields(
         out[5] = 1.0 if -h <= z <= h else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _diagonal(a: Array, b: Array, c: Array, d: Array, k: int) -> float:
     """The longer diagonal of the quadrilateral of the feet (k, k + 1) at a pixel's corners, and a fifth for safety."""
     return 1.2 * max(
@@ -60,14 +60,14 @@ def _diagonal(a: Array, b: Array, c: Array, d: Array, k: int) -> float:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _uncut(a: float, b: float, c: float, d: float, slack: float) -> bool:
     """No edge passes between four corners of one sign, but for a bulge of less than `slack`."""
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     return low > slack or high < -slack
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _fill_circle(
     cells: Array32, y0: int, x0: int, s: int, weight: float, corners: tuple[Array, Array, Array, Array], R: Array,
     eye: Array, cap: float, circle: tuple[float, float, float], inner: float, outer: float, f: Array,
@@ -86,7 +86,7 @@ def _fill_circle(
             deposit(cells, y0 + i - 1, x0 + j, weight * outer + step * area, step * m_x, step * m_y)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _circle_distance(
     corners: tuple[Array, Array, Array, Array], p: float, q: float, R: Array, eye: Array, cap: float,
     circle: tuple[float, float, float],
@@ -98,7 +98,7 @@ def _circle_distance(
     return circle[2] - np.sqrt(x * x + y * y)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def draw_disc(
     cells: Array32, background: Array32, corner: tuple[int, int], rays: Array, s: int, weight: float, R: Array,
     t: Array, radius: float, h: float, paper: Array, dots: Array, dot_radius: float, grey: Array,
@@ -180,12 +180,12 @@ def draw_disc(
                     deposit(cells, y0 + i, x0 + j, weight * value, weight * m_x, weight * m_y)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _larger(first: tuple[float, float, float], second: tuple[float, float, float]) -> tuple[float, float, float]:
     return first if first[0] >= second[0] else second
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _disc_cell(
     centre: Array, a: Array, b: Array, c: Array, d: Array, back: float, grey: Array, ring: float, upper: bool,
     cap_visible: bool,

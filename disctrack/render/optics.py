@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import numba
 import numpy as np
 from scipy.special import erf
 
 from calibration.arrays import Array, Array32
+from calibration.compiled import njit
 from disctrack.render.rays import View, table_points
 from disctrack.scene.description import Scene
 
@@ -36,7 +36,7 @@ def blur_reach(sigma: float) -> int:
     return int(np.ceil(4.5 * sigma + 0.5))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def blur_to_pixels(cells: Array32, weights: Array32, s: int) -> Array32:
     """Pixels (rows - 2 reach, columns - 2 reach) from the cells of (rows, columns) pixels."""
     taps = weights.shape[0]
@@ -82,7 +82,7 @@ def table_cells(view: View, pad: int, s: int, scene: Scene) -> Array32:
     return _textured_cells(points, s, look.table, texture)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _textured_cells(points: Array, s: int, grey: float, texture: Array) -> Array32:
     """Texture at the cells' centres, bilinear between the pixels' corners on the table and between texels; 0.1 s."""
     n = texture.shape[0]

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from calibration.arrays import Array
 from calibration.camera import Camera
+from calibration.compiled import njit
 from disctrack.errors import SceneError
 
 
@@ -26,7 +26,7 @@ class View(NamedTuple):
     t_camera_world: Array  # (3,) [m]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _undistort(xd: float, yd: float, k1: float, k2: float, p1: float, p2: float, k3: float) -> tuple[float, float]:
     """Fixed-point iteration x = (xd - tangential(x)) / radial(x) to round-off; NaN where it does not settle."""
     x, y = xd, yd
@@ -44,7 +44,7 @@ def _undistort(xd: float, yd: float, k1: float, k2: float, p1: float, p2: float,
     return np.nan, np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _corner_rays(width: int, height: int, pad: int, intrinsics: Array) -> Array:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = intrinsics
     rays = np.empty((height + 2 * pad + 1, width + 2 * pad + 1, 2))

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import cfunc, from_dtype, types
+from numba import from_dtype, types
 from numba.extending import intrinsic, register_jitable
 
+from calibration.compiled import cfunc
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
 
 
@@ -78,5 +79,6 @@ def compile_law(function: Callable[..., None], parameters: tuple[str, ...], help
     """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call."""
     for helper in helpers:
         register_jitable(helper)
+    function.compiled_with = helpers  # type: ignore[attr-defined]  # what is kept on disk depends on them, too
     records = [_record(names, scalar) for names in (parameters, KINEMATICS, WRENCH)]
     return _compile(function, types.void(*records))

@@ -26,8 +26,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from calibration.compiled import njit
 from disctrack.rolling._compiled import call_law
 
 ROLLING, SLIPPING, FLYING = 0, 1, 2

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from calibration.arrays import Array
+from calibration.compiled import njit
 from disctrack.rolling._compiled import call_system
 
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)

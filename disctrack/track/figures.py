@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from calibration.arrays import Array
 from disctrack.frames import CAMERAS, COORDINATES
+from disctrack.pages.figures import lay_out
 from disctrack.pages.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -27,7 +28,8 @@ _LABELS = {
 
 def coordinates_figure(trajectory: Trajectory) -> Figure:
     """x, y, z, psi, theta, phi over time above their sigmas; frames without a pose are marked below."""
-    figure = Figure(figsize=(13, 8.5), layout="constrained")
+    figure = Figure(figsize=(13, 8.5))
+    lay_out(figure, (4, 3), gaps=(0.9, 0.2))
     grid = figure.add_gridspec(4, 3, height_ratios=(3, 1.3, 3, 1.3))
     sigma, shared = trajectory.coordinate_sigma, trajectory.calibration_sigma
     for i in range(len(COORDINATES)):
@@ -37,6 +39,7 @@ def coordinates_figure(trajectory: Trajectory) -> Figure:
         _coordinate(axes, trajectory, i, sigma[:, i])
         _sigmas(below, trajectory, i, sigma[:, i], shared[:, i])
         axes.tick_params(labelbottom=False)
+        below.tick_params(labelbottom=row == 2)
         if row == 2:
             below.set_xlabel("time (s)")
     lost = int(np.sum(~trajectory.measured))
@@ -91,7 +94,8 @@ def _mark_lost(axes: Axes, trajectory: Trajectory) -> None:
 
 def reprojection_figure(trajectory: Trajectory) -> Figure:
     """Root mean square of observed - projected dots per camera, reduced chi-square, and the dots used, over time."""
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    figure = Figure(figsize=(11, 7.5))
+    lay_out(figure, (3, 1), gaps=(0.0, 0.2))
     error, chi, used = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.5))
     for camera, name in enumerate(CAMERAS):
         rms = trajectory.reprojection_rms_px[:, camera]
@@ -121,7 +125,8 @@ def reprojection_figure(trajectory: Trajectory) -> Figure:
 def dots_figure(trajectory: Trajectory) -> Figure:
     """Residual (observed - projected) of every dot in each camera: cloud, mean and its standard error, in px."""
     residuals, m = trajectory.markers_residual_px, trajectory.disc.n_markers
-    figure = Figure(figsize=(2.0 * m + 0.8, 4.8), layout="constrained")
+    figure = Figure(figsize=(2.0 * m + 0.8, 4.8))
+    lay_out(figure, (2, m), gaps=(0.15, 0.15))
     grid = figure.subplots(2, m, sharex=True, sharey=True, squeeze=False)
     finite = np.abs(residuals[np.isfinite(residuals)])
     reach = float(np.percentile(finite, 99.5)) * 1.3 if finite.size else 1.0
@@ -132,6 +137,7 @@ def dots_figure(trajectory: Trajectory) -> Figure:
         grid[camera, 0].set_ylabel(f"{name}: y (px)")
     for axes in grid[1]:
         axes.set_xlabel("x (px)")
+    grid[0, 0].xaxis.set_major_locator(MaxNLocator(3))  # shared by all
     figure.suptitle("Observed minus projected, per dot and camera (cross: mean ± 3 standard errors)", fontsize=10)
     return figure
 

@@ -123,24 +123,27 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     disc, rig = trajectory.disc, trajectory.rig
     R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
     h = disc.half_thickness
-    lower = _circle(np.zeros(3), disc.radius, -h) @ R.T + t
-    for picture, pixels, (R_cw, t_cw) in zip(pictures, rig.project(lower), rig.camera_poses(), strict=True):
+    centres = disc.marker_centres_body
+    circles = [_circle(np.zeros(3), disc.radius, -h), _circle(np.zeros(3), disc.radius, h)]
+    circles += [_circle(centre, disc.marker_diameter / 2, centre[2]) for centre in centres]
+    outlines = np.stack(circles) @ R.T + t
+    lower = outlines[0]
+    psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
+    e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
+    contact = t - disc.radius * e2 - h * R[:, 2]
+    for picture, seen, (R_cw, t_cw) in zip(
+        pictures, rig.project(np.vstack([outlines.reshape(-1, 3), contact])), rig.camera_poses(), strict=True
+    ):
+        pixels, *others = seen[:-1].reshape(len(circles), OUTLINE_POINTS, 2)
         # the wall is seen where its outward normal faces the camera; the other half lies behind the disc
         facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
         start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
         visible = np.roll(facing, -start)
         _polyline(picture, np.roll(pixels, -start, axis=0)[visible], _LOWER, closed=bool(facing.all()))
-    lines = [(_circle(np.zeros(3), disc.radius, h), _RIM)]
-    lines += [(_circle(centre, disc.marker_diameter / 2, centre[2]), _DOT) for centre in disc.marker_centres_body]
-    for points_body, colour in lines:
-        for picture, pixels in zip(pictures, rig.project(points_body @ R.T + t), strict=True):
-            _polyline(picture, pixels, colour)
-    psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
-    e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
-    contact = t - disc.radius * e2 - h * R[:, 2]
-    for picture, pixels in zip(pictures, rig.project(contact[None]), strict=True):
-        if np.isfinite(pixels).all():
-            _cross(picture, pixels[0], _CONTACT, cv2.MARKER_DIAMOND, 9)
+        for outline, colour in zip(others, (_RIM, *(_DOT for _ in centres)), strict=True):
+            _polyline(picture, outline, colour)
+        if np.isfinite(seen[-1]).all():
+            _cross(picture, seen[-1], _CONTACT, cv2.MARKER_DIAMOND, 9)
 
 
 def _circle(centre: Array, radius: float, height: float) -> Array:

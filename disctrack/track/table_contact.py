@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.arrays import Array
 from calibration.camera import N_RIG, StereoRig
@@ -103,7 +103,7 @@ def table_from_disc(
         np.sqrt(np.diag(stated)),
         np.sqrt(np.diag(board)),
         applied,
-        float(chi2.sf(difference, 3)),
+        float(chdtrc(3, difference)),
         scatter,
         n,
     )

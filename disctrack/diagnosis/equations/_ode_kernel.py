@@ -7,8 +7,10 @@ Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from scipy.integrate import DOP853
+
+from calibration.compiled import njit
 
 _f, _v, _m = types.float64, types.float64[::1], types.float64[:, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import sympy
-from numba import njit
 
 from calibration.arrays import Array
+from calibration.compiled import njit
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Equations, Parameter, Term
 from disctrack.diagnosis.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name

@@ -1,0 +1,68 @@
+"""Results and compiled loops belong to the sources that made them."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import calibration
+import disctrack
+
+ROOT = Path(disctrack.__file__).parents[1]
+
+
+def run(code: str, home: Path) -> str:
+    done = subprocess.run([sys.executable, "-c", code], cwd=home, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_a_result_counts_only_for_the_sources_that_made_it(tmp_path):
+    for package in (calibration, disctrack):
+        home = Path(package.__file__).parent
+        shutil.copytree(home, tmp_path / home.name, ignore=shutil.ignore_patterns("__pycache__", "*.md", "pictures"))
+    code = (
+        "from disctrack.files.trajectory_file import Provenance\n"
+        "made = Provenance('r', {}, {})\nprint(made.version, made.fingerprint)"
+    )
+    version, first = run(code, tmp_path).split()
+    assert version.startswith(f"{disctrack.__version__}+")
+    for beside in ("examples/_command.py", "render/images.py"):
+        with (tmp_path / "disctrack" / beside).open("a") as source:
+            source.write("# a remark\n")
+    assert run(code, tmp_path).split()[1] == first
+    for within in ("disctrack/track/_kernels.py", "calibration/camera.py"):
+        with (tmp_path / within).open("a") as source:
+            source.write("A_NUMBER = 1\n")
+        _, changed = run(code, tmp_path).split()
+        assert changed != first
+        first = changed
+
+
+def test_a_compiled_loop_is_compiled_anew_when_what_it_calls_in_another_file_has_changed(tmp_path):
+    inner = "from calibration.compiled import njit\n\n@njit\ndef f(x):\n    return x + {}\n"
+    outer = (
+        "from calibration.compiled import njit\nfrom disctrack.inner import f\n\n"
+        "@njit(cache=True)\ndef g(x):\n    return f(x)\n"
+    )
+    for package in ("calibration", "disctrack"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+    for name in ("compiled.py", "sources.py"):
+        shutil.copy(Path(calibration.__file__).with_name(name), tmp_path / "calibration" / name)
+    (tmp_path / "disctrack" / "outer.py").write_text(outer)
+    code = "from disctrack.outer import g; print(g(1), sum(g.stats.cache_hits.values()))"
+    for added, hits in ((1, 0), (1, 1), (2, 0)):
+        (tmp_path / "disctrack" / "inner.py").write_text(inner.format(added))
+        assert run(code, tmp_path) == f"{1 + added} {hits}"
+    kept = [file.name for file in (tmp_path / "disctrack" / "__pycache__").glob("outer.g*")]
+    assert sorted(name.rpartition(".")[2] for name in kept) == ["nbc", "nbi"]  # the old one is gone
+
+
+def test_every_compiled_loop_is_kept_by_its_sources():
+    for file in (*ROOT.glob("calibration/**/*.py"), *ROOT.glob("disctrack/**/*.py")):
+        if file.name != "compiled.py":
+            assert not re.search(
+                r"import numba|numba\.n?jit|from numba import .*\b(n?jit|cfunc)\b", file.read_text()
+            ), file
