@@ -34,12 +34,16 @@ def start_camera(
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
     guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # its threads add up their views as they end: the last digits would be others in every run
     try:
         _, K, distortion, turns, shifts = cv2.calibrateCamera(
             objects, images, image_size, guess, np.zeros(5), flags=flags
         )
     except cv2.error as error:
         raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
+    finally:
+        cv2.setNumThreads(threads)
     k1 = float(np.ravel(distortion)[0])
     if not (np.isfinite(K).all() and abs(k1) < 10):
         raise CalibrationError(f"{name} camera: the views do not determine the focal length; tilt the board more")

@@ -21,7 +21,9 @@ from calibration.compiled import njit
 # No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
 _RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
 _entry = njit(cache=True, **_RULES)  # called from Python
-_part = njit(**_RULES | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})  # called from compiled code
+# Called from compiled code, always inlined: of a function that is not, two copies may be optimised differently (its own
+# and its caller's), and which of them runs would depend on whether the code was compiled now or loaded.
+_part = njit(**_RULES | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True})
 
 # Status codes: the values of trajectory.MarkerStatus, which a test keeps equal.
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED = 0, 1, 2, 3, 4, 5
@@ -325,13 +327,15 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work):
     On convergence the first rows of work hold the Cholesky factor of J^T W J at the minimum.
     """
     M, rhs, step, previous = work[:8], work[_RHS], work[_STEP], work[_BEFORE]
-    damping, last, rejected = 1e-7, np.inf, False
+    damping, last, rejected, converged = 1e-7, np.inf, False, False
     before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
     chi2, n_clipped = 0.0, 0.0
     for i in range(8):
         previous[i] = p[i]
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS + 1):
         chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
+        if converged:
+            return True, chi2, n_clipped
         # the Jacobian leaves out how the curvature moves, so chi-square may creep by a trifle at the minimum
         if chi2 > 1.001 * last + 0.01 and not rejected:
             for i in range(8):
@@ -366,9 +370,9 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work):
         length *= px_per_unit
         contraction = min(length / before, 1.0) if before < np.inf else 1.0
         if length * contraction < _CONVERGED_PX and damping < 1e-3 and length < 0.1:
-            if gain > 0.5:  # the sums were taken before a step that mattered to them
-                chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
-            return True, chi2, n_clipped
+            if gain <= 0.5:
+                return True, chi2, n_clipped
+            converged = True  # but the sums were taken before a step that mattered to them
         before = length
     return False, last, 0.0
 
@@ -391,7 +395,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     for i in range(8):
         p[i] = 0.0
     p[SIGMA] = sigma
-    n, n_clipped, det, chi2, largest, light = 0, 0.0, 0.0, 0.0, 0.0, 1.0
+    n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
@@ -444,25 +448,30 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             s, bell = _edge_profile(pixels[_WEIGHT, i] * inv_sigma)
             pixels[_WEIGHT, i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
             pixels[_GREY, i] *= in_light  # a product in double precision, rounded once
-        converged, chi2, n_clipped = _descend(pixels, n, p, G, det, largest / abs(det), radius, np.inf, work)
-        if not converged:
-            return NOT_CONVERGED
-        moved_u = start[3] + (G[1, 1] * p[A] - G[0, 1] * p[B]) / det - u0
-        moved_v = start[4] + (G[0, 0] * p[B] - G[1, 0] * p[A]) / det - v0
-        u0 += moved_u
-        v0 += moved_v
-        if math.hypot(moved_u, moved_v) < 0.7:
+        limit = np.inf
+        while True:  # once, and again without the pixels that do not belong
+            converged, chi2, n_clipped = _descend(pixels, n, p, G, det, largest / abs(det), radius, limit, work)
+            if not converged:
+                return NOT_CONVERGED
+            if limit < np.inf:
+                chi2 -= n_clipped * limit
+                break
+            moved_u = start[3] + (G[1, 1] * p[A] - G[0, 1] * p[B]) / det - u0
+            moved_v = start[4] + (G[0, 0] * p[B] - G[1, 0] * p[A]) / det - v0
+            u0 += moved_u
+            v0 += moved_v
+            settled = math.hypot(moved_u, moved_v) < 0.7
+            if not settled and selection < _MAX_SELECTIONS - 1:
+                break
+            # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows
+            limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
+            worst = _0
+            for i in range(n):
+                worst = max(worst, abs(pixels[_RESIDUAL, i]))
+            if worst * worst <= limit:
+                break
+        if settled:
             break
-    # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows
-    limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
-    worst = _0
-    for i in range(n):
-        worst = max(worst, abs(pixels[_RESIDUAL, i]))
-    if worst * worst > limit:
-        converged, chi2, n_clipped = _descend(pixels, n, p, G, det, largest / abs(det), radius, limit, work)
-        if not converged:
-            return NOT_CONVERGED
-        chi2 -= n_clipped * limit
     # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
     M, x, y = work[:8], work[_RHS], work[_STEP]
     for i in range(8):

@@ -1,10 +1,15 @@
 """Where the compiled inner loops are kept, and what is said while they are compiled."""
 
 import os
+import subprocess
 import sys
 import time
 
+import numpy as np
+import pytest
+
 from disctrack import cli
+from disctrack.files.trajectory_file import read_trajectory
 from disctrack.progress import compiling
 
 
@@ -32,3 +37,17 @@ def test_compiling_is_announced_and_loading_is_not(capsys):
     with compiling("corners", 8):
         time.sleep(1.2)
     assert "compiling the inner loops of corners: once per installation, about 8 s" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_loops_compiled_now_and_loops_loaded_give_the_same_bits(sample_clip, tmp_path):
+    """A part that is not inlined exists twice, optimised differently: which one runs depends on who compiled it."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    found = []
+    for name in ("compiled", "loaded"):
+        words = ["run", str(sample_clip), "-o", str(tmp_path / name), "--frames", "0:24", "--no-figures", "--no-video"]
+        subprocess.run([sys.executable, "-m", "disctrack", *words], env=environment, check=True, capture_output=True)
+        found.append(read_trajectory(tmp_path / name / "trajectory.h5"))
+    np.testing.assert_array_equal(found[1].q, found[0].q)
+    np.testing.assert_array_equal(found[1].markers_px, found[0].markers_px)
+    np.testing.assert_array_equal(found[1].pose_covariance, found[0].pose_covariance)
