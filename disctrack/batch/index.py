@@ -9,6 +9,7 @@ from urllib.parse import quote
 
 from disctrack.batch.columns import LACKS_SOMETHING
 from disctrack.batch.reasons import reason_of
+from disctrack.batch.together import FOLDER
 from disctrack.files.whole import write_whole
 from disctrack.pages.html import Markup, page, paragraph, section, table, text, warning
 
@@ -22,6 +23,9 @@ def write_index(path: Path, rows: Sequence[Row], compare: bool) -> str:
     Raises OutputError.
     """
     fragment, problem = _comparison(path.parent, rows) if compare else ("", "")
+    if (path.parent / FOLDER / "diagnosis.html").is_file():
+        link = f'<p><a href="{FOLDER}/diagnosis.html">What the model lacks, all recordings together</a></p>'
+        fragment = section("All recordings together", [link]) + fragment
     write_whole(path, index_page(rows, fragment).encode())
     return problem
 

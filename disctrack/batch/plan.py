@@ -31,6 +31,7 @@ class BatchOptions:
     circle: float = 0.6  # [s] before the end, for the circle through the contact
     report: bool = True  # report.html and figures of each recording
     diagnose: bool = False
+    together: bool = False  # one diagnosis of all recordings, besides
     overwrite: bool = False  # measure anew what is done already
 
     @property

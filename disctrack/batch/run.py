@@ -16,6 +16,7 @@ from disctrack.batch.plan import BatchOptions, Job, Places, Plan, Shard, make_pl
 from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
 from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
+from disctrack.batch.together import diagnose_all
 from disctrack.errors import ClusterError, OutputError
 from disctrack.files.whole import check_writable
 from disctrack.readers.blocks import default_threads
@@ -32,6 +33,7 @@ class BatchOutcome:
     files: tuple[Path, ...]  # summary.json, summary.csv, index.html; none where they could not be written
     problems: tuple[str, ...]  # besides those of single recordings
     interrupted: bool = False
+    together: tuple[str, ...] = ()  # what the diagnosis of all recordings together says
 
     @property
     def failed(self) -> bool:
@@ -47,7 +49,7 @@ class BatchOutcome:
         """One line per recording, then the totals."""
         width = max(len(row["recording"]) for row in self.rows)
         total = ", ".join(f"{n} {status}" for status, n in counts(self.rows).items() if n)
-        return [*(line_of(row, width) for row in self.rows), f"{'total':<13} {total}"]
+        return [*(line_of(row, width) for row in self.rows), f"{'total':<13} {total}", *self.together]
 
 
 def run_batch(
@@ -83,7 +85,8 @@ def run_batch(
             client.close()
     for job in plan.recordings:
         results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, stopped)))
-    return _summed_up(places, mine, results, options, stopped == INTERRUPTED)
+    whole = shard is None  # or else whoever sums up the shards
+    return _summed_up(places, mine, results, options, stopped == INTERRUPTED, n if whole else 0)
 
 
 def summarise_batch(
@@ -91,7 +94,7 @@ def summarise_batch(
 ) -> BatchOutcome:
     """The summary of what lies on the disk; nothing is measured. Raises RecordingError."""
     places = _places(folders, output)
-    return _summed_up(places, places.found.recordings, {}, options or BatchOptions(), False)
+    return _summed_up(places, places.found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
 def _places(folders: Sequence[Path], output: Path | None) -> Places:
@@ -124,9 +127,20 @@ def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, clien
 
 
 def _summed_up(
-    places: Places, mine: Sequence[Path], results: dict[str, Result], options: BatchOptions, interrupted: bool
+    places: Places,
+    mine: Sequence[Path],
+    results: dict[str, Result],
+    options: BatchOptions,
+    interrupted: bool,
+    processes: int,
 ) -> BatchOutcome:
+    """Processes : for the diagnosis of all together; 0: not now."""
     problems = [f"not searched: {problem}" for problem in places.found.problems]
+    said: list[str] = []
+    if options.together and processes and not interrupted:
+        measured = rows_of(places, places.found.recordings, results)
+        said, problem = diagnose_all(places.common, measured, processes)
+        problems += [problem] if problem else []
     files: tuple[Path, ...] = ()
     try:
         rows, files, wrong = write_summary(places, places.found.recordings, results, options)
@@ -136,7 +150,7 @@ def _summed_up(
         rows = rows_of(places, places.found.recordings, results)
     names = {places.found.name(folder) for folder in mine}
     own = tuple(row for row in rows if row["recording"] in names)
-    return BatchOutcome(own, tuple(rows), files, tuple(problems), interrupted)
+    return BatchOutcome(own, tuple(rows), files, tuple(problems), interrupted, tuple(said))
 
 
 class _Bar:

@@ -40,6 +40,7 @@ def _options(arguments: argparse.Namespace) -> BatchOptions:
         window=arguments.window,
         report=not arguments.no_report,
         diagnose=arguments.diagnose,
+        together=arguments.together,
         overwrite=arguments.overwrite,
     )
 

@@ -23,14 +23,16 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
-    origin = origin_of(path, {"model": told_model})
+    origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))
     told = None if arguments.overwrite else reusable(folder, origin)
     if told is not None:
         reused = f"{'reused':<13} {folder}: complete result of the same trajectory, model and version"
         print("\n".join([reused, *told]))
         return DONE
     with stage("diagnose"):
-        outcome = run_diagnose(path, folder, model=arguments.model, overwrite=arguments.overwrite)
+        outcome = run_diagnose(
+            path, folder, model=arguments.model, overwrite=arguments.overwrite, settle=arguments.plan
+        )
     files = [outputs.relative(file) for file in (path, *outcome.files)]
     lines = [*outcome.summary, *summary.file_lines(files)]
     remember(folder, origin, lines, outcome.files)
@@ -46,6 +48,7 @@ def _together(arguments: argparse.Namespace) -> int:
             arguments.output,
             model=arguments.model,
             overwrite=arguments.overwrite,
+            reuse=not arguments.overwrite,
             processes=arguments.jobs or default_threads(),
         )
     files = [outputs.relative(file) for file in outcome.files]

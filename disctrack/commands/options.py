@@ -131,6 +131,8 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="paper", help=models)
     where = "folder for the results (default: NAME_diagnosis beside it; of several: together_diagnosis)"
     parser.add_argument("-o", "--output", type=Path, help=where)
+    plan = "also compute which further recordings would settle what is left open"
+    parser.add_argument("--plan", action="store_true", help=plan)
     jobs = "processes for several files (default: cores)"
     parser.add_argument("-j", "--jobs", type=_positive, metavar="N", help=jobs)
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier diagnosis")
@@ -147,6 +149,7 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--summary-only", action="store_true", help="measure nothing; sum up what there is")
     parser.add_argument("--no-report", action="store_true", help="numbers only, no report and figures per recording")
     parser.add_argument("--diagnose", action="store_true", help="also ask of each which effect the model lacks")
+    parser.add_argument("--together", action="store_true", help="also ask it of all together: one answer for many")
     parser.add_argument("--overwrite", action="store_true", help="measure anew what is done already")
     parser.add_argument(
         "--window",

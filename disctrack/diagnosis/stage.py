@@ -14,7 +14,7 @@ from disctrack.diagnosis.disc.errors import energy_balance, errors
 from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment, learn, without_idle_terms
 from disctrack.diagnosis.disc.left_over import LeftOver, left_over
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
-from disctrack.diagnosis.disc.separation import separations
+from disctrack.diagnosis.disc.plan import open_questions, plan, separations
 from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, fit
@@ -91,9 +91,19 @@ def diagnose_trajectory(
         for f in diagnosis.found
         if f.cannot_be_told_from and separate
     }
+    notes = (*answer.notes, *remarks)
     return DiscDiagnosis(
-        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, (*answer.notes, *remarks)
+        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, notes=notes
     )
+
+
+def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
+    """The diagnosis with the recordings that would settle what it leaves open; as it is where it has no answer."""
+    diagnosis = result.diagnosis
+    if result.after is None or not diagnosis.after.converged:
+        return result
+    questions = open_questions(diagnosis, result.system)
+    return replace(result, plan=plan(result.system, diagnosis.after, questions, diagnosis.noise))
 
 
 def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagnosis:
@@ -156,11 +166,12 @@ def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Mis
 
 
 def run_diagnose(
-    path: Path, output: Path | None = None, *, model: str = PAPER, overwrite: bool = False
+    path: Path, output: Path | None = None, *, model: str = PAPER, overwrite: bool = False, settle: bool = False
 ) -> DiagnoseOutcome:
     """Diagnose a trajectory file; write diagnosis.json, diagnosis.html with figures, model.toml, and the file's group.
 
     output : folder; without it `<name>_diagnosis` beside the file
+    settle : also compute which further recordings would settle what is left open
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
     from disctrack.diagnosis.disc.free_runs import evidence
@@ -181,6 +192,7 @@ def run_diagnose(
         result = diagnose_trajectory(trajectory, model)
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
+    result = with_plan(result) if settle else result
     beside = evidence(result) if result.before is not None else None
     if beside is not None and result.moment is None:
         result = replace(result, moment=beside.moment)

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from disctrack.diagnosis.disc.errors import Ahead, Errors
-from disctrack.diagnosis.disc.separation import Separation
+from disctrack.diagnosis.disc.plan import Separation
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Found, Tried
 from disctrack.diagnosis.engine.significance import as_sigmas
+from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.words import shown
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
@@ -173,6 +174,7 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
         "energy_J": result.energy,
         "energy_before_J": beside.energy_before if beside else {},
         "tried": [tried_json(t) for t in diagnosis.tried],
+        "plan": planned.as_json(result.plan),
         "settings": vars(diagnosis.settings),
     }
     return dict(plain(document))
@@ -240,4 +242,4 @@ def lines(result: DiscDiagnosis, beside: Evidence | None = None) -> list[str]:
             f"{'':<13} {a.horizon:g} s ahead: theta {a.theta_deg:.3g} -> {b.theta_deg:.3g} deg, psi {a.psi_deg:.3g} -> "
             f"{b.psi_deg:.3g} deg, position {a.position_mm:.3g} -> {b.position_mm:.3g} mm"
         )
-    return found
+    return found if result.plan is None else [*found, *planned.lines(result.plan)]

@@ -11,6 +11,7 @@ from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.disc.free_runs import Evidence
 from disctrack.diagnosis.engine.search import Found
 from disctrack.diagnosis.engine.significance import as_sigmas
+from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.figures import all_figures
 from disctrack.diagnosis.pages.words import effect_text, law_text, quantity_text
 from disctrack.files.whole import write_whole
@@ -34,6 +35,7 @@ def _page(result: DiscDiagnosis, beside: Evidence | None, recording: str, figure
         paragraph(Markup(verdict + text(_said(result.diagnosis.reason)))),
         *(paragraph(_said(note)) for note in result.notes),
         section("Missing effects", [_effects(result)]),
+        section("What would settle it", planned.html(result.plan)),
         section("Before and after", _before_after(result, beside)),
         section("In pictures", [figures]),
         section("What was tried", [_tried(result)]),

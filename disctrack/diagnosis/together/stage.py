@@ -13,6 +13,8 @@ from disctrack.diagnosis.together.recordings import Recorded, read_recorded
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
+from disctrack.files.reuse import origin_of, remember, reusable
+from disctrack.files.trajectory_file import read_setup
 from disctrack.files.whole import write_whole
 
 FOLDER = "together_diagnosis"
@@ -22,7 +24,7 @@ FOLDER = "together_diagnosis"
 class TogetherOutcome:
     """What `run_together` did."""
 
-    result: TogetherDiagnosis
+    result: TogetherDiagnosis | None  # None where an earlier result of the same files was complete
     files: tuple[Path, ...]
     summary: tuple[str, ...]
 
@@ -33,12 +35,14 @@ def run_together(
     *,
     model: str = PAPER,
     overwrite: bool = False,
+    reuse: bool = False,
     processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
 ) -> TogetherOutcome:
     """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
 
     output : folder; without it `together_diagnosis` in the deepest folder that holds all files
+    reuse : an earlier result that is complete and of the same files, model and version
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
     from disctrack.diagnosis.together.output import as_json, figures, lines, whole_page
@@ -52,6 +56,12 @@ def run_together(
         raise AnalysisError(f"{twice[0]}: given more than once. A recording speaks once: name each file once.")
     folder = Path(output) if output is not None else common_folder(paths) / FOLDER
     report = folder / "diagnosis.json"
+    known = Path(model).read_text(encoding="utf-8") if Path(model).is_file() else model
+    made_from = {"model": known, "files": [read_setup(p).fingerprint for p in paths]}
+    origin = origin_of(paths[0], made_from)
+    told = reusable(folder, origin) if reuse else None
+    if told is not None:
+        return TogetherOutcome(None, (report, folder / "diagnosis.html"), tuple(told))
     if report.exists() and not overwrite:
         raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
     refuse_input(report)
@@ -62,7 +72,9 @@ def run_together(
     html = folder / "diagnosis.html"
     write_whole(html, whole_page(result, gallery(drawn, pictures)).encode())
     write_whole(report, json_file({"files": [str(p) for p in paths], **as_json(result)}))
-    return TogetherOutcome(result, (report, html, *files), tuple(lines(result)))
+    said = lines(result)
+    remember(folder, origin, said, (report, html, *files))
+    return TogetherOutcome(result, (report, html, *files), tuple(said))
 
 
 def common_folder(paths: Sequence[Path]) -> Path:

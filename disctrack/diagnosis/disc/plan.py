@@ -1,0 +1,388 @@
+"""Which further recording would tell what this one cannot? Computed for recordings that were not made yet.
+
+The fitted model is started anew, filmed by the same cameras with the same noise, and linearised. What it would say of
+the shared quantities (laws, cameras, dots) is put beside what this recording says; initial states are each one's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from calibration.arrays import Array
+from disctrack.diagnosis.disc.motion import state_of
+from disctrack.diagnosis.disc.stretch import MIN_FRAMES, MIN_THETA, Stretch
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.engine.fit import Fit, triangle
+from disctrack.diagnosis.engine.score import Linearisation, score
+from disctrack.diagnosis.engine.search import Diagnosis
+from disctrack.diagnosis.engine.system import Candidate, Quantity
+from disctrack.diagnosis.together.reduction import Reduction
+from disctrack.disc import Disc
+from disctrack.errors import AnalysisError, DiscTrackError
+from disctrack.frames import rotation_from_euler
+from disctrack.rolling import CATALOGUE, State, simulate, steady_precession
+from disctrack.trajectory import MarkerStatus
+
+NUTATIONS_DEG = (3.0, 8.0, 15.0, 30.0)
+SPINS = (0.5, 5.0)  # omega_3 [rad/s]
+DURATIONS = (0.5, 1.0)  # [s]
+NUTATION_SHARE = 0.05  # amplitude of the nutation oscillation over the nutation angle
+SEEN = 1e-6  # share of a column that is left after clearing, below which nothing is seen of it
+ENOUGH = 5.0  # sigmas from which on a recording answers a question
+UPPER = float(stats.norm.isf(0.025))
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A recording that could be made; factors are those on what this recording had."""
+
+    theta_deg: float | None = None  # at the start; None: as in this recording
+    omega3: float | None = None  # [rad/s] spin
+    duration: float | None = None  # [s] at most: it ends where the disc comes to rest
+    mass: float = 1.0  # of a disc of the same size, from another material
+    radius: float = 1.0  # of a disc of the same material and thickness, with its dots
+    pressure: float = 1.0  # of the air
+    rate: float = 1.0  # of the frames
+    numbers: float = 1.0  # of the dots' images in a frame: more dots, or another view
+
+    @property
+    def text(self) -> str:
+        """The recording in words."""
+        start = "start as here"
+        if self.theta_deg is not None:
+            start = f"start at {self.theta_deg:g} deg with omega_3 = {self.omega3:g} rad/s"
+        changes = [f"film {self.duration:.2g} s"] if self.duration is not None else []
+        for factor, what in (
+            (self.mass, "a disc {} times as heavy"), (self.radius, "a disc {} times as large"),
+            (self.pressure, "air at {} of the pressure"), (self.rate, "{} times the frame rate"),
+        ):  # fmt: skip
+            changes += [what.format(f"{factor:g}")] if factor != 1.0 else []
+        if self.numbers != 1.0:
+            changes.append("twice the dots" if self.numbers == 2.0 else "a third view")
+        return f"{start} and {', '.join(changes)}" if changes else f"{start}, the same again"
+
+
+def starts() -> Iterator[Proposal]:
+    """Recordings of the same disc by the same cameras."""
+    for theta_deg in NUTATIONS_DEG:
+        for omega3 in SPINS:
+            for duration in DURATIONS:
+                yield Proposal(theta_deg, omega3, duration)
+
+
+CHANGES: tuple[dict[str, float], ...] = (
+    {}, {"mass": 0.35}, {"mass": 2.0}, {"radius": 0.6}, {"radius": 1.6}, {"pressure": 0.1}, {"rate": 2.0},
+    {"numbers": 1.5}, {"numbers": 2.0},
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How well a recording would tell an effect from its rival, together with this one."""
+
+    rival: str
+    theta_deg: float  # at the start
+    omega3: float  # [rad/s]
+    duration: float  # [s]; shorter than asked for where the disc comes to rest
+    angle: float  # [rad] between the predicted residuals, cleared of what other quantities absorb
+    sigmas: float  # root of the chi-square that the wrong one of the two would leave
+
+    @property
+    def text(self) -> str:
+        """The recording in words."""
+        return (
+            f"start at {self.theta_deg:g} deg with omega_3 = {self.omega3:g} rad/s and film {self.duration:.2g} s: "
+            f"{self.sigmas:.3g} sigmas apart"
+        )
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a recording leaves open: an effect and its rival, or the size of an effect that was not found."""
+
+    effect: Candidate
+    rival: Candidate | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One proposal and what it would bring to each question."""
+
+    proposal: Proposal
+    duration: float  # [s] until the disc comes to rest, at most that of the proposal
+    answers: tuple[float, ...]  # sigmas between effect and rival; or the standard deviation of the effect's size
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Recordings that would settle what this one leaves open."""
+
+    questions: tuple[Question, ...]
+    now: tuple[float, ...]  # the answers of this recording alone
+    rows: tuple[Row, ...]
+
+    def best(self, i: int) -> Row | None:
+        """The proposal that answers question i best."""
+        known = [r for r in self.rows if np.isfinite(r.answers[i])]
+        if not known:
+            return None
+        pick: Callable[..., Row] = min if self.questions[i].rival is None else max
+        return pick(known, key=lambda r: r.answers[i])
+
+
+class Planner:
+    """The say of this recording on laws, cameras and dots, and that of recordings beside it."""
+
+    def __init__(self, system: DiscSystem, fit: Fit, candidates: Sequence[Candidate], noise: float = 1.0) -> None:
+        """Fit : of the enlarged model.   candidates : whose columns will be asked for.
+
+        noise : variance of the dots over that stated
+        """
+        self.system, self.fit, self._noise = system, fit, noise
+        new = {q.name: q for c in candidates for q in c.quantities}
+        self.tested = tuple(new.values())
+        fitted = tuple(q for q in fit.quantities if not q.name.startswith("state.") and q.name not in new)
+        self._local = tuple(q for q in fitted if q.belongs_to)
+        self.own = tuple(q for q in fit.quantities if not q.belongs_to and q.name not in new)
+        n_rig = system.rig_directions.shape[1]
+        laws = [q for q in self._local if not q.name.startswith("rig.")]
+        # directions of the rig in common, laws and dots, what is tested
+        sigmas = [1.0] * n_rig + [q.prior_sigma for q in laws] + [np.inf] * len(self.tested)
+        self._priors = np.diag(1.0 / np.array(sigmas))
+        names = [f"rig.common_{j}" for j in range(n_rig)] + [q.name for q in (*laws, *self.tested)]
+        self.column = {name: j for j, name in enumerate(names)}
+        self.candidates = tuple(candidates)
+        self.now = self._said(system, fit.values, Proposal())
+
+    def amounts(self, candidate: Candidate) -> Array:
+        """(k,) fitted sizes."""
+        return np.array([self.fit.values.get(q.name, q.null) - q.null for q in candidate.quantities])
+
+    def with_(self, proposal: Proposal) -> tuple[Array, float] | None:
+        """Rows of this recording and of the proposed one, and how long that lasts; None where it cannot be made."""
+        try:
+            planned, values = self._planned(proposal)
+            said = self._said(planned, values, proposal)
+        except DiscTrackError:  # no such precession, or over at once: not a recording to propose
+            return None
+        return np.concatenate([self.now, said]), float(planned.time[-1] - planned.time[0])
+
+    def separation(self, rows: Array, effect: Candidate, rival: Candidate) -> tuple[float, float]:
+        """Sigmas by which the rival fails where the effect is true at its fitted size, and the angle between them."""
+        matrix = self._with_priors(rows)
+        signal = matrix[:, self._columns(effect)] @ self.amounts(effect)
+        base = [j for n, j in self.column.items() if n not in {q.name for q in self.tested}]
+        alone = _cleared(signal, matrix[:, base])
+        beside = _cleared(signal, matrix[:, [*base, *self._columns(rival)]])
+        length = float(np.linalg.norm(alone))
+        sigmas = float(np.linalg.norm(beside))
+        return sigmas, float(np.arcsin(min(sigmas / length, 1.0))) if length > 0 else 0.0
+
+    def sigma(self, rows: Array, candidate: Candidate) -> float:
+        """Standard deviation of its first number; infinite where nothing is seen of it."""
+        matrix = self._with_priors(rows)
+        mine, *rest = self._columns(candidate)
+        base = [j for n, j in self.column.items() if n not in {q.name for q in self.tested}]
+        column = matrix[:, mine]
+        left = float(np.linalg.norm(_cleared(column, matrix[:, [*base, *rest]])))
+        return 1.0 / left if left > SEEN * float(np.linalg.norm(column)) else float("inf")
+
+    def _columns(self, candidate: Candidate) -> list[int]:
+        return [self.column[n] for n in candidate.names]
+
+    def _with_priors(self, rows: Array) -> Array:
+        return np.concatenate([rows, self._priors])
+
+    def _said(self, system: DiscSystem, values: dict[str, float], proposal: Proposal) -> Array:
+        """(m, k) what a recording says of the shared quantities, its own at their best."""
+        known = [q for q in system.base if not q.belongs_to]
+        own = known if system is not self.system else self.own
+        scales = {q.name: q.scale for q in (*system.base, *self.tested)}
+        here = [q for q in system.base if q.belongs_to and q.name not in {t.name for t in self.tested}]
+        local = here if system is not self.system else self._local
+        names = [q.name for q in (*local, *self.tested)]
+        reduced = Reduction(system, own, values, scales).reduce(values, names)
+        if reduced is None:
+            raise AnalysisError("the motion cannot be followed")
+        mixing = np.zeros((len(names), len(self.column)))
+        another = proposal.mass != 1.0 or proposal.radius != 1.0
+        for row, q in enumerate((*local, *self.tested)):
+            if q.name.startswith("rig."):
+                mixing[row, : system.rig_directions.shape[1]] = system.rig_directions[int(q.name[4:])]
+            elif not (another and q.belongs_to == ("disc",)) and q.name in self.column:
+                mixing[row, self.column[q.name]] = _density_factor(q, proposal.pressure)
+        return np.asarray(triangle(reduced.matrix @ mixing) / np.sqrt(self._noise), float)
+
+    def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
+        """The system of a recording as proposed, and the values at which it would be found."""
+        system = self.system
+        disc = _changed(system.disc, proposal)
+        values = {k: v for k, v in self.fit.values.items() if not k.startswith(("state.", "rig.", "dot_"))}
+        for q in self.tested:
+            if q.name in values:
+                values[q.name] = q.null + (values[q.name] - q.null) * _density_factor(q, proposal.pressure)
+        start = state_of(self.fit.values)
+        if proposal.theta_deg is not None:
+            start = steady_precession(
+                np.radians(proposal.theta_deg),
+                disc,
+                system.model.gravity,
+                omega3=proposal.omega3,
+                nutation_amplitude=np.radians(NUTATION_SHARE * proposal.theta_deg),
+                x=float(np.nanmean(system.trajectory.q[:, 0])),
+                y=float(np.nanmean(system.trajectory.q[:, 1])),
+            )
+        duration = proposal.duration or float(system.time[-1] - system.time[0])
+        planned = planned_recording(system, values, start, duration, disc, proposal)
+        names = [q.name for q in planned.base]
+        state = {n: float(v) for n, v in zip(names[:8], start.array[:8], strict=False)}
+        return planned, dict.fromkeys(names, 0.0) | values | state
+
+
+def planned_recording(
+    system: DiscSystem,
+    values: dict[str, float],
+    start: State,
+    duration: float,
+    disc: Disc | None = None,
+    proposal: Proposal | None = None,
+) -> DiscSystem:
+    """The same cameras and noise, another motion; raises DiscTrackError where that motion is too short."""
+    old, proposal, disc = system.trajectory, proposal or Proposal(), disc or system.disc
+    model = replace(system.model_with(values), disc=disc)
+    rate = old.frame_rate * proposal.rate
+    motion = simulate(model, start, duration, rate=rate, theta_end=MIN_THETA)
+    n, m = len(motion), disc.n_markers
+    if n < MIN_FRAMES:
+        raise AnalysisError(f"the motion is over after {n} frames")
+    R = rotation_from_euler(*motion.q[:, 3:].T)
+    pixels = system.rig.project(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + motion.q[:, None, :3])
+    pixels = np.moveaxis(pixels, -3, 1)
+    usual = np.nanmedian(old.markers_covariance_px2.reshape(-1, 2, 2), axis=0) / proposal.numbers
+    inside = np.isfinite(pixels).all(-1)
+    trajectory = replace(
+        old,
+        time=motion.time,
+        frame=np.arange(n),
+        q=motion.q,
+        pose_covariance=np.broadcast_to(np.eye(6), (n, 6, 6)),
+        calibration_sensitivity=np.zeros((n, 6, old.calibration_sensitivity.shape[2])),
+        quaternion=np.zeros((n, 4)),
+        frame_status=np.zeros(n, np.uint8),
+        reprojection_rms_px=np.zeros((n, 2)),
+        reduced_chi_square=np.ones(n),
+        markers_px=pixels,
+        markers_covariance_px2=np.broadcast_to(usual, (n, 2, m, 2, 2)),
+        markers_residual_px=np.zeros((n, 2, m, 2)),
+        marker_status=np.where(inside, MarkerStatus.MEASURED, MarkerStatus.OUTSIDE).astype(np.uint8),
+        disc=disc,
+        frame_rate=rate,
+    )
+    stretch = Stretch(slice(0, n))
+    return DiscSystem(trajectory, replace(system.model, disc=disc), stretch=stretch, systematic=system.systematic)
+
+
+def _changed(disc: Disc, proposal: Proposal) -> Disc:
+    """Another disc: of another material, or larger from the same plate, its dots with it."""
+    return replace(
+        disc,
+        mass=disc.mass * proposal.mass * proposal.radius**2,
+        radius=disc.radius * proposal.radius,
+        marker_centres_body=disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0],
+    )
+
+
+def _density_factor(q: Quantity, pressure: float) -> float:
+    effect = CATALOGUE.get(q.name.partition(".")[0])
+    power = effect.density_power if effect is not None else None
+    return 1.0 if power is None else float(pressure**power)
+
+
+def _cleared(column: Array, others: Array) -> Array:
+    """The column without what the others can absorb."""
+    length = np.linalg.norm(others, axis=0)
+    scaled = others[:, length > 0] / length[length > 0]
+    U, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+    U = U[:, singular > 1e-9 * singular[0]] if singular.size else U
+    for _ in range(2):
+        column = column - U @ (U.T @ column)
+    return column
+
+
+def separations(
+    system: DiscSystem, fit: Fit, effect: Candidate, rivals: Sequence[Candidate], noise: float = 1.0
+) -> dict[str, Separation | None]:
+    """For each rival, of the starts looked at, the one that would tell it best from the effect at its fitted size.
+
+    None where no such recording can be simulated.
+    """
+    best: dict[str, Separation | None] = {r.name: None for r in rivals}
+    planner = Planner(system, fit, [effect, *rivals], noise)
+    for proposal in starts():
+        made = planner.with_(proposal)
+        if made is None or proposal.theta_deg is None or proposal.omega3 is None:
+            continue
+        rows, duration = made
+        for rival in rivals:
+            sigmas, between = planner.separation(rows, effect, rival)
+            previous = best[rival.name]
+            if previous is None or sigmas > previous.sigmas:
+                best[rival.name] = Separation(
+                    rival.name, proposal.theta_deg, proposal.omega3, duration, between, sigmas
+                )
+    return best
+
+
+def plan(system: DiscSystem, fit: Fit, questions: Sequence[Question], noise: float = 1.0) -> Plan:
+    """What each of many recordings would bring to the questions: starts first, then changes of the best of them."""
+    candidates = {c.name: c for q in questions for c in (q.effect, q.rival) if c is not None}
+    planner = Planner(system, fit, list(candidates.values()), noise)
+
+    def answers(rows: Array) -> tuple[float, ...]:
+        return tuple(
+            planner.sigma(rows, q.effect) if q.rival is None else planner.separation(rows, q.effect, q.rival)[0]
+            for q in questions
+        )
+
+    now = answers(planner.now)
+    rows = []
+    for proposal in starts():
+        made = planner.with_(proposal)
+        if made is not None:
+            rows.append(Row(proposal, made[1], answers(made[0])))
+    first = Plan(tuple(questions), now, tuple(rows))
+    bases = {Proposal(): None} | {b.proposal: None for i in range(len(questions)) if (b := first.best(i)) is not None}
+    for base in list(bases)[:3]:
+        for change in CHANGES:
+            if not change and base != Proposal():
+                continue
+            made = planner.with_(replace(base, **change))
+            if made is not None:
+                rows.append(Row(replace(base, **change), made[1], answers(made[0])))
+    return Plan(tuple(questions), now, tuple(rows))
+
+
+def open_questions(diagnosis: Diagnosis, system: DiscSystem, most: int = 6) -> tuple[Question, ...]:
+    """What a diagnosis leaves open: effects and their rivals, then effects of the motion with an upper bound only.
+
+    Of the latter those whose standard deviation is largest beside their usual size.
+    """
+    found = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
+    named = {f.candidate.name for f in diagnosis.found}
+    single = [
+        c
+        for c in system.candidates
+        if c.kind == "motion" and len(c.quantities) == 1 and not c.threshold and c.name not in named
+    ]
+    linear = Linearisation(system, diagnosis.after, single)
+
+    def share(c: Candidate) -> float:
+        sigma = float(score(linear, c).sigma[0])
+        return sigma / c.quantities[0].typical if np.isfinite(sigma) else 0.0
+
+    unsettled = sorted(single, key=share, reverse=True)
+    return tuple([*found[:most], *(Question(c) for c in unsettled[: max(most - len(found), 2)])])

@@ -1,0 +1,97 @@
+"""What would settle it, in words: recordings that would answer what one leaves open."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from disctrack.diagnosis.disc.plan import ENOUGH, UPPER, Plan, Question
+from disctrack.diagnosis.pages.words import quantity_text
+from disctrack.pages.html import paragraph, table
+
+SHOWN = 24  # proposals in the table
+SAID = (
+    "Computed from the fitted model: each recording is simulated with the same cameras and noise, and put beside "
+    "this one; laws, cameras and dots are shared, the initial state is its own. With another disc the laws' "
+    "coefficients are taken to stay, with another pressure air drag to go with the density as its law says. More dots "
+    "and a third view count as numbers of the same kind."
+)
+
+
+def question_text(q: Question) -> str:
+    """What is open."""
+    if q.rival is not None:
+        return f"{q.effect.name} or {q.rival.name}"
+    return f"size of {q.effect.name}"
+
+
+def _answer(q: Question, value: float) -> str:
+    if q.rival is not None:
+        return f"{value:.3g} sigmas"
+    size = q.effect.quantities[0]
+    return f"sigma {quantity_text(value, 0.0, size.unit)}" if np.isfinite(value) else "unseen"
+
+
+def lines(plan: Plan) -> list[str]:
+    """For the terminal: of every question, what this recording says, and the one that would say most."""
+    said = []
+    for i, q in enumerate(plan.questions):
+        best = plan.best(i)
+        text = f"{question_text(q)}: now {_answer(q, plan.now[i])}"
+        if best is not None:
+            text += f"; {best.proposal.text}: {_answer(q, best.answers[i])}"
+            if q.rival is not None and best.answers[i] < ENOUGH:
+                text += " (not enough: no recording looked at tells them apart)"
+        said.append(f"{'plan':<13} {text}")
+    return said
+
+
+def html(plan: Plan | None) -> list[str]:
+    """For the page."""
+    if plan is None or not plan.questions:
+        return []
+    header = ("recording", "s", *(question_text(q) for q in plan.questions))
+    rows = [("this one alone", "", *(_answer(q, x) for q, x in zip(plan.questions, plan.now, strict=True)))]
+    best = {id(plan.best(i)) for i in range(len(plan.questions))}
+    shown = sorted(plan.rows, key=lambda r: id(r) not in best)[:SHOWN]
+    rows += [
+        (
+            r.proposal.text,
+            f"{r.duration:.2g}",
+            *(_answer(q, x) for q, x in zip(plan.questions, r.answers, strict=True)),
+        )
+        for r in shown
+    ]
+    said = " ".join(_sentence(plan, i) for i in range(len(plan.questions)))
+    return [paragraph(said), paragraph(SAID), table("", header, rows)]
+
+
+def _sentence(plan: Plan, i: int) -> str:
+    q, best = plan.questions[i], plan.best(i)
+    if best is None:
+        return f"For {question_text(q)} no recording looked at can be made."
+    if q.rival is None:
+        unit = q.effect.quantities[0].unit
+        limit = quantity_text(UPPER * best.answers[i], 0.0, unit)
+        return f"The {question_text(q)} would be known to {limit} (95 %): {best.proposal.text}."
+    if best.answers[i] < ENOUGH:
+        return f"No recording looked at tells {q.effect.name} from {q.rival.name}."
+    return f"To tell {q.effect.name} from {q.rival.name}: {best.proposal.text} ({best.answers[i]:.3g} sigmas)."
+
+
+def as_json(plan: Plan | None) -> dict[str, Any] | None:
+    """For diagnosis.json."""
+    if plan is None:
+        return None
+    return {
+        "questions": [
+            {"effect": q.effect.name, "rival": None if q.rival is None else q.rival.name, "now": x}
+            for q, x in zip(plan.questions, plan.now, strict=True)
+        ],
+        "recordings": [
+            {**vars(r.proposal), "text": r.proposal.text, "lasts_s": r.duration, "answers": list(r.answers)}
+            for r in plan.rows
+        ],
+        "meaning": "answers: sigmas between effect and rival; without a rival the standard deviation of the size",
+    }
