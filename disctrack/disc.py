@@ -69,6 +69,36 @@ def disc_from_mm(
     )
 
 
+def symmetry_order(disc: Disc, tolerance: float = 0.1) -> int:
+    """Number of turns about e3 that map the layout of the dots onto itself (1: none but the full turn).
+
+    With an order n > 1 the spin angle phi is known only modulo 2 pi / n. tolerance: part of a dot's diameter.
+    """
+    centres = disc.marker_centres_body[:, :2]
+    reach = tolerance * disc.marker_diameter
+    order = 1
+    for n in range(2, 2 * disc.n_markers + 1):
+        angle = 2 * np.pi / n
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        distance = np.linalg.norm((centres @ turn.T)[:, None] - centres[None], axis=-1)
+        if np.all(distance.min(axis=1) < reach):
+            order = n
+    return order
+
+
+def has_mirror_axis(disc: Disc, tolerance: float = 0.1) -> bool:
+    """True where the layout of the dots looks the same in a mirror, so that the dots do not tell left from right.
+
+    tolerance : part of a dot's diameter
+    """
+    z = disc.marker_centres_body[:, 0] + 1j * disc.marker_centres_body[:, 1]
+    far = z[np.argmax(np.abs(z))]  # goes to a dot as far out, or stays
+    twice = np.angle(far) + np.angle(z[np.abs(np.abs(z) - np.abs(far)) < tolerance * disc.marker_diameter])
+    mirrored = np.exp(1j * twice)[:, None] * np.conj(z)
+    gap = np.abs(mirrored[:, :, None] - z).min(axis=2).max(axis=1)
+    return bool(np.any(gap < tolerance * disc.marker_diameter))
+
+
 _HEXAGON = np.radians(60.0 * np.arange(6))
 
 # Radius, thickness and mass as in Ma et al. 2014, section 3a. The layout of the dots is not published; this one has

@@ -9,23 +9,26 @@ Three laws hold whatever the friction is, and each contains declared numbers:
 - rigidity: dots seen by both cameras are as far apart as their declared centres, on the scale of the chessboard.
 - geometry: the centre of a disc on its rim rises by r sin(theta) + h cos(theta).
 
+A mirrored world obeys all three. It is told by what has a left and a right: dots without an axis of symmetry, which are
+not found in it; and the cameras, of which the left one stands on the left.
+
 A finding names what was seen, what was expected, and the declared numbers that could be wrong, best explanation first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calibration.arrays import Array
-from calibration.camera import triangulate
+from calibration.camera import StereoRig, triangulate
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import Motion, differentiate
 from disctrack.analyse.propagation import state_of
-from disctrack.disc import Disc
+from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.trajectory import MarkerStatus, Trajectory, part
 
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     from disctrack.recording.declaration import Recording
 
 
+SIDEWAYS = 0.5  # cosine of the angle up to which a baseline is one from left to right
 STANDARD_GRAVITY = 9.81  # [m/s^2]; 9.78 to 9.83 on the Earth's surface
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
 STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, frames whose median is one estimate
@@ -50,6 +54,7 @@ SCALE = 5e-3  # of printed dots against a printed board, paper and toner include
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
 SEEN_RARELY = 0.1  # share of the images
+MIN_DOTS_LEFT = 4  # that are seen
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Suspect:
 class Finding:
     """A contradiction between what was declared and what was seen."""
 
-    check: str  # "gravity and rate", "energy", "scale", "radius", "dot"
+    check: str  # "gravity and rate", "energy", "scale", "radius", "dot", "board", "handedness"
     observed: str
     expected: str
     suspects: tuple[Suspect, ...]  # best explanation first
@@ -109,6 +114,7 @@ def contradictions(
     declared = declared or trajectory.disc
     found = [*scale_of_dots(trajectory, declared, square), *unseen_dots(trajectory, declared)]
     if trajectory.rig.world_is_table:
+        found += handedness(trajectory.rig, declared)
         found += [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
     return tuple(found)
 
@@ -280,6 +286,35 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     return (Finding("radius", seen, f"the radius, {1e3 * disc.radius:.2f} mm", suspects, spoils=True),)
 
 
+def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+    """Whether the left camera stands on the left as both look at the table, where the dots do not tell left from right.
+
+    In a mirrored world it stands on the right. No verdict where the cameras stand one behind the other, or face each
+    other.
+    """
+    if not has_mirror_axis(disc):
+        return ()  # the dots would not have been found
+    (R_left, t_left), (R_right, t_right) = rig.camera_poses()
+    baseline = R_left.T @ t_left - R_right.T @ t_right  # from the left camera to the right one
+    to_the_right = np.cross(R_left[2] + R_right[2], K)
+    along = baseline @ to_the_right / max(float(np.linalg.norm(baseline) * np.linalg.norm(to_the_right)), 1e-12)
+    if along > -SIDEWAYS or np.linalg.norm(to_the_right) < SIDEWAYS:
+        return ()
+    suspects = (
+        Suspect("[cameras] left, right (and [calibration])", "so named", "exchanged, and all is well", 0.0),
+        Suspect("[cameras] left, right (and [calibration])", "as stored", "mirrored: then psi and phi turn round", 0.0),
+    )
+    return (
+        Finding(
+            "handedness",
+            f"the left camera stands {1e3 * rig.baseline:.0f} mm to the right of the right one, as they look at it",
+            "the left camera on the left; the dots do not tell, as their layout looks the same in a mirror",
+            suspects,
+            spoils=True,
+        ),
+    )
+
+
 def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
     """Distances of the dots, by both cameras alone, over those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
@@ -320,6 +355,9 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
         return ()
     share = np.mean(status == MarkerStatus.MEASURED, axis=0).max(axis=0)
     found = []
+    rest = replace(declared, marker_centres_body=declared.marker_centres_body[share >= SEEN_RARELY])
+    # three dots fit nearly anything; those of a symmetric layout do not tell how far the disc has turned
+    spoils = rest.n_markers < MIN_DOTS_LEFT or symmetry_order(rest) > symmetry_order(declared)
     for dot in np.flatnonzero(share < SEEN_RARELY) if (share > 0.5).sum() >= 3 else ():
         kinds, counts = np.unique(status[:, :, dot], return_counts=True)
         reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")
@@ -330,7 +368,7 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
                 f"dot {dot} of [markers] centres_mm is measured in {100 * share[dot]:.0f} % of the images ({reason})",
                 "a dot there, as round and dark as the others (numbers count from 0)",
                 (Suspect(f"[markers] centres_mm, entry {dot}", f"[{x:g}, {y:g}]", "", 0.0),),
-                spoils=False,
+                spoils=spoils,
             )
         )
     return tuple(found)
@@ -347,6 +385,6 @@ def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
             f"inner_corners = [{first}, {second}] counts along the short side first: x runs along the short side",
             "the long side first, so that x runs along it",
             (Suspect("[calibration] inner_corners", f"[{first}, {second}]", f"[{second}, {first}]", 0.0),),
-            spoils=False,
+            spoils=True,
         ),
     )

@@ -29,7 +29,7 @@ from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
 from disctrack.track.tracking import PairBlock, Tracking, TrackingSettings, track
-from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+from disctrack.trajectory import MarkerStatus, Trajectory
 
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
 PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
@@ -98,7 +98,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
     seen.say("fine", "declaration", f"{recording.file} is complete")
     if recording.chessboard is not None:
         for finding in turned_board(recording.chessboard.inner_corners):
-            seen.say("look", "declaration", finding.sentence)
+            seen.say("fix", "declaration", finding.sentence)
     pairs = _frames(seen, recording)
     progress("chessboard")
     rig = _rig(seen, recording)
@@ -246,26 +246,13 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         seen.say(level, "declaration", finding.sentence)
     _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
     _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
-    if _exchanged(recording, rig, pairs, *done[0]):
-        seen.say("fix", "cameras", "left and right are exchanged: the dots of both make sense the other way round",
-                 "exchange left and right in [cameras], or in [calibration]")  # fmt: skip
-        return
-    told = {text[:40]: text for _, tracking in done for text in tracking.warnings}  # numbers differ from place to place
+    doubts = {text[:40]: text for _, tracking in done for text in tracking.doubts}  # numbers differ from place to place
+    for text in doubts.values():
+        seen.say("fix", "cameras", text)
+    told = {text[:40]: text for _, tracking in done for text in tracking.warnings}
     for text in told.values():
-        seen.say("look", "physics", text)
-
-
-def _exchanged(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, tracking: Tracking) -> bool:
-    """True where one camera's dots make no sense as declared, and both cameras' do with the images exchanged."""
-    status = tracking.trajectory.frame_status
-    if np.mean(status == FrameStatus.MEASURED) > 0.5:
-        return False
-    some = frames[:SLIP_FRAMES]
-    try:
-        other = _track(recording, rig, replace(pairs, left=pairs.right, right=pairs.left), some).trajectory
-    except DiscTrackError:
-        return False
-    return bool(np.mean(other.frame_status == FrameStatus.MEASURED) > 0.9)
+        if text[:40] not in doubts:
+            seen.say("look", "physics", text)
 
 
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:

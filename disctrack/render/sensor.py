@@ -7,6 +7,8 @@ import numpy as np
 from calibration.arrays import Array32, Image
 from disctrack.scene.description import SensorSettings
 
+MOST_ELECTRONS = np.float32(1e12)  # in a pixel; the generator takes no more than 1e18
+
 
 def digitise(
     expected: Array32,
@@ -22,9 +24,10 @@ def digitise(
     """
     grey = expected if hot is None else expected + hot
     if rng is not None:
-        if settings.gain_e_per_dn > 0:
-            electrons = rng.poisson(np.maximum(grey, 0.0) * np.float32(settings.gain_e_per_dn))
-            grey = electrons.astype(np.float32) / np.float32(settings.gain_e_per_dn)
+        gain = np.float32(settings.gain_e_per_dn)
+        if gain > 0:
+            electrons = rng.poisson(np.minimum(np.maximum(grey, 0.0) * gain, MOST_ELECTRONS))
+            grey = electrons.astype(np.float32) / gain
         grey = grey + np.float32(settings.read_noise_dn) * rng.standard_normal(grey.shape, dtype=np.float32)
     top = 2**bit_depth - 1
     levels = np.rint((grey + np.float32(settings.black_level_dn)) * np.float32(top / 255.0))

@@ -9,7 +9,8 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -303,8 +304,47 @@ def scene_toml(scene: Scene) -> str:
     return "\n".join(toml_lines(scene)).lstrip() + "\n"
 
 
+MOST = 1e7  # of a real number: no length, angle, rate or grey value of a laboratory is larger in its unit
+MOST_PIXELS = 16384  # a side
+_NOT_NEGATIVE = {
+    "rig.variation",
+    "optics.vignetting",
+    *(f"sensor.{name}" for name in ("gain_e_per_dn", "read_noise_dn", "hot_pixels", "hot_pixel_dn")),
+    *(f"board.{name}" for name in ("margin_mm", "thickness_mm", "max_tilt_deg", "max_turn_deg", "shift_mm")),
+    *(f"appearance.{name}" for name in ("table_streaks", "table_blotches", "rim_width_mm")),
+    *(f"imperfections.{name}" for name in ("lens_field_px", "pixel_gain", "column_offset_dn")),
+    "cameras.exposure_s",
+    "faults.exposure_s",
+    "faults.frame_rate_hz",
+    "faults.misprint_sigma_mm",
+    "render.png_compression",
+    "seed",
+}
+
+
+def _numbers(item: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of a scene with its key, but those that say by nan that they are not given."""
+    if is_dataclass(item):
+        for entry in fields(item):
+            value = getattr(item, entry.name)
+            if not (isinstance(value, float) and math.isnan(value) and entry.name == "omega3_rad_s"):
+                yield from _numbers(value, f"{path}.{entry.name}" if path else entry.name)
+    elif isinstance(item, dict):
+        for name, value in item.items():
+            yield from _numbers(value, f"{path}.{name}")
+    elif isinstance(item, tuple | list):
+        for value in item:
+            yield from _numbers(value, path)
+    elif isinstance(item, int | float) and not isinstance(item, bool):
+        yield path, item
+
+
 def _check(scene: Scene, where: str) -> None:
     """Raise SceneError for values that no recording can have."""
+    for key, value in _numbers(scene):
+        least, most = 0.0 if key in _NOT_NEGATIVE else -MOST, math.inf if isinstance(value, int) else MOST
+        if not least <= value <= most:  # nan, too
+            raise SceneError(f"{where}: {key} = {value}; expected a number from {least:g} to {most:g}")
     cameras, disc, board = scene.cameras, scene.disc, scene.board
     reach_mm = max((math.hypot(x, y) for x, y in scene.markers.centres_mm), default=0.0) + scene.markers.diameter_mm / 2
     positive = {
@@ -333,17 +373,17 @@ def _check(scene: Scene, where: str) -> None:
         ),
         (scene.cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", scene.cameras.bit_depth, "8, 10, 12, 16"),
         (scene.cameras.n_frames < 1, "cameras.n_frames", scene.cameras.n_frames, "at least 1"),
-        (scene.cameras.exposure_s < 0, "cameras.exposure_s", scene.cameras.exposure_s, "0 or more"),
-        (scene.faults.exposure_s < 0, "faults.exposure_s", scene.faults.exposure_s, "0 or more"),
         (min(scene.cameras.image_size) < 16, "cameras.image_size", scene.cameras.image_size, "at least 16 x 16"),
         (min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"),
+        (scene.render.png_compression > 9, "render.png_compression", scene.render.png_compression, "0 to 9"),
+        (scene.render.threads < 1, "render.threads", scene.render.threads, "1 or more"),
         (
-            min(scene.imperfections.lens_field_px, scene.imperfections.pixel_gain, scene.imperfections.column_offset_dn)
-            < 0,
-            "imperfections",
-            "a negative rms",
-            "0 or more",
+            scene.sensor.hot_pixels > math.prod(cameras.image_size) or max(cameras.image_size) > MOST_PIXELS,
+            "sensor.hot_pixels or cameras.image_size",
+            f"{scene.sensor.hot_pixels} of {cameras.image_size}",
+            f"images of at most {MOST_PIXELS} pixels a side, and no more hot pixels than pixels",
         ),
+        (board.height_mm[0] > board.height_mm[1], "board.height_mm", board.height_mm, "the lower, then the higher"),
         (scene.render.subpixels < 2, "render.subpixels", scene.render.subpixels, "2 or more"),
         (
             scene.motion.kind not in ("static", "table", "rolling"),

@@ -89,23 +89,6 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> tuple[float, float]:
     return result[0], result[1]
 
 
-def symmetry_order(disc: Disc, tolerance: float = 0.1) -> int:
-    """Number of turns about e3 that map the layout of the dots onto itself (1: none but the full turn).
-
-    With an order n > 1 the spin angle phi is known only modulo 2 pi / n. tolerance: part of a dot's diameter.
-    """
-    centres = disc.marker_centres_body[:, :2]
-    reach = tolerance * disc.marker_diameter
-    order = 1
-    for n in range(2, 2 * disc.n_markers + 1):
-        angle = 2 * np.pi / n
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        distance = np.linalg.norm((centres @ turn.T)[:, None] - centres[None], axis=-1)
-        if np.all(distance.min(axis=1) < reach):
-            order = n
-    return order
-
-
 def acquire(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRig, disc: Disc) -> Acquisition:
     """Find the disc in one pair of images, wherever it is and however it is turned."""
     diameters = expected_diameter_px(rig, disc)

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack import frames
-from disctrack.disc import Disc
+from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
-from disctrack.track.acquisition import symmetry_order
+from disctrack.track.arrangement import arrangement_found
 from disctrack.track.as_printed import MIN_MARKER_SHIFT, AsBuilt, refine_as_built
 from disctrack.track.dots import NoiseModel, TemplateLimits, normalised_maps
 from disctrack.track.following import (
@@ -41,6 +41,7 @@ from disctrack.track.following import prepare as prepare
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
+from disctrack.track.slips import slips_in_words
 from disctrack.track.table_contact import TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -196,12 +197,31 @@ def track(
             carry_on(followers[k - 1], followers[k], edges[k], edges[k + 1])
     if not np.isfinite(tables.t).any():
         reason = next((f.first_reason for f in followers if f.first_reason), "no image could be read")
+        arranged = _arrangement(read_blocks, rig, disc, pairs)
         raise TrackingError(
-            f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. First search: {reason}"
+            f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. "
+            + (f"It is there if {arranged}" if arranged else f"First search: {reason}")
         )
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
-    return _assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
+    tracking = _assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
+    if any(doubt.startswith(_ONE_SIDED) for doubt in tracking.doubts):
+        one_sided = np.flatnonzero(tracking.trajectory.frame_status == FrameStatus.ONE_CAMERA)
+        if arranged := _arrangement(read_blocks, rig, disc, pairs[one_sided[0] :]):
+            told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
+            tracking = replace(tracking, doubts=(told, *tracking.doubts))
+    return tracking
+
+
+def _arrangement(
+    read_blocks: Callable[[int, int], Iterable[PairBlock]], rig: StereoRig, disc: Disc, pairs: range
+) -> str:
+    """Whether the images are mirrored or exchanged, in words: by the first of the pairs, and by one in their middle."""
+    for pair in dict.fromkeys([pairs[0], pairs[len(pairs) // 2]]):
+        for block in read_blocks(pair, pair + 1):
+            if block.readable.all() and (told := arrangement_found(block.images[0], rig, disc)):
+                return told
+    return ""
 
 
 def stretch_edges(pairs: range, disc: Disc) -> list[int]:
@@ -308,6 +328,10 @@ def _assemble(
     verdicts = judge_poses(
         fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / frame_rate, as_built.disc.radius
     )
+    contradicted = verdicts.status == FrameStatus.CONTRADICTED
+    slips = slips_in_words(
+        contradicted, fits, tables.pixels, tables.covariance_px2, as_built.rig, as_built.disc.marker_centres_body, pairs
+    )
     fits.covariance[...] *= verdicts.factor[:, None, None]
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
@@ -325,7 +349,11 @@ def _assemble(
         table=table,
         acquisitions=sum(f.acquisitions for f in followers),
         warnings=warnings,
-        doubts=(*_repeats_in_words(repeated, pairs), *(text for text in warnings if text.startswith(_MISFIT))),
+        doubts=(
+            *_repeats_in_words(repeated, pairs),
+            *slips,
+            *(text for text in warnings if text.startswith((_MISFIT, _ONE_SIDED))),
+        ),
     )
 
 
@@ -342,6 +370,7 @@ def _outlying(tables: Tables, setup: Setup) -> Mask:
     return outlying_frames(residuals)
 
 
+_ONE_SIDED = "the dots of only one camera make sense"
 _MISFIT = "the dots miss their fitted places"
 
 
@@ -468,7 +497,7 @@ def _warnings(
     one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
     if one > both:
         warnings.append(
-            f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
+            f"{_ONE_SIDED} in {one} of {one + both} measured frames: are left and right "
             "exchanged, does the rig belong to this recording, does one camera look at the underside?"
         )
     order = symmetry_order(follower.setup.disc)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disctrack import frames
-from disctrack.disc import MA_2014, disc_from_mm
-from disctrack.track.acquisition import acquire, acquire_from_blobs, dot_blobs, symmetry_order
+from disctrack.disc import MA_2014, disc_from_mm, has_mirror_axis, symmetry_order
+from disctrack.track.acquisition import acquire, acquire_from_blobs, dot_blobs
 from disctrack.track.pose import marker_pixels
 
 
@@ -93,3 +93,13 @@ def test_the_default_layout_has_no_symmetry():
     moved = MA_2014.marker_centres_body.copy()
     moved[5] *= (2, 2, 1)  # the sixth dot out to the others: a hexagon
     assert symmetry_order(replace(MA_2014, marker_centres_body=moved)) == 6
+
+
+def test_layouts_that_look_the_same_in_a_mirror_are_recognised():
+    rng = np.random.default_rng(2)
+    for angle in rng.uniform(0, 2 * np.pi, 5):  # the default one has an axis, whichever way it is turned
+        turned = MA_2014.marker_centres_body @ frames.rotation_from_vector(np.array([0, 0, angle])).T
+        assert has_mirror_axis(replace(MA_2014, marker_centres_body=turned))
+        turned[0, :2] *= 0.7
+        assert not has_mirror_axis(replace(MA_2014, marker_centres_body=turned))
+    assert not has_mirror_axis(disc_from_mm(37.5, 6, 200, rng.uniform(-25, 25, (6, 2)), 7))

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.analyse.declaration import balance, contradictions, told, turned_board
-from disctrack.frames import rotation_from_quaternion
+from calibration.camera import Camera, StereoRig
+from disctrack.analyse.declaration import balance, contradictions, handedness, told, turned_board, unseen_dots
+from disctrack.frames import rotation_from_quaternion, rotation_from_vector
 from disctrack.trajectory import MarkerStatus, Trajectory
 
+SIXTHS = np.radians(60.0 * np.arange(6))
 HONEST = [  # theta [deg], seconds, losses, nutation, spin [rad/s]
     (3.3, 0.3, 0.381e-7, 0.05, 0.0),
     (10.0, 0.2, 0.381e-7, 0.2, 1.0),
@@ -135,6 +137,57 @@ def test_a_dot_that_is_never_seen_is_named(honest):
 def test_corners_counted_along_the_short_side_first_turn_the_table():
     assert turned_board((9, 6)) == turned_board((7, 7)) == ()
     assert "[9, 6]" in turned_board((6, 9))[0].sentence
+    assert turned_board((6, 9))[0].spoils, "x and y of every pose"
+
+
+def test_a_dot_without_which_the_layout_repeats_spoils_the_spin_angle(honest):
+    assert not contradictions(with_dots(honest, 1.0, unseen=(1,)))[0].spoils
+    hexagon = honest.disc.marker_centres_body.copy()
+    hexagon[:, :2] = 0.03 * np.column_stack([np.cos(SIXTHS), np.sin(SIXTHS)])
+    seventh = np.vstack([hexagon, hexagon[:1] * [0.4, 0.4, 1.0]])
+    (finding,) = unseen_dots(
+        with_dots(replace(honest, disc=replace(honest.disc, marker_centres_body=seventh)), 1.0, unseen=(6,)),
+        replace(honest.disc, marker_centres_body=seventh),
+    )
+    assert finding.spoils, "six dots in a hexagon are left"
+
+
+def camera_rig(left, right):
+    """Cameras at two places [m] that look at the origin, on the table."""
+    target = np.zeros(3)
+    poses = []
+    for place in map(np.asarray, (left, right)):
+        forward = (target - place) / np.linalg.norm(target - place)
+        across = np.cross(forward, [0, 0, 1.0])
+        across /= np.linalg.norm(across)
+        R = np.stack([across, np.cross(forward, across), forward])
+        poses.append((R, -R @ place))
+    (R_left, t_left), (R_right, t_right) = poses
+    R = R_right @ R_left.T
+    camera = Camera(1000.0, 1000.0, 255.5, 255.5, (0.0,) * 5, (512, 512))
+    return StereoRig(camera, camera, R, t_right - R @ t_left, R_left, t_left, world_is_table=True)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0])
+def test_a_mirrored_world_is_told_by_the_cameras_places_or_by_dots_without_an_axis(azimuth, honest):
+    turn = rotation_from_vector(np.array([0.0, 0.0, azimuth]))
+    left, right = np.array([[-0.15, -0.4, 0.5], [0.15, -0.4, 0.5]]) @ turn.T
+    assert handedness(camera_rig(left, right), honest.disc) == ()
+    mirror = [1.0, -1.0, 1.0]
+    (finding,) = handedness(camera_rig(left * mirror, right * mirror), honest.disc)
+    assert finding.spoils
+    assert "mirrored" in finding.sentence
+    assert "exchanged" in finding.sentence
+    asymmetric = honest.disc.marker_centres_body.copy()
+    asymmetric[0, :2] *= 0.6
+    lopsided = replace(honest.disc, marker_centres_body=asymmetric)
+    assert handedness(camera_rig(left * mirror, right * mirror), lopsided) == ()
+
+
+def test_cameras_that_face_each_other_tell_no_left_and_right(honest):
+    across = camera_rig((0.5, 0.0, 0.5), (-0.5, 0.01, 0.5))
+    above = camera_rig((0.0, -0.01, 0.6), (0.0, -0.4, 0.6))
+    assert handedness(across, honest.disc) == handedness(above, honest.disc) == ()
 
 
 def test_findings_carry_what_is_wrong_into_warnings_and_doubts(honest):

@@ -1,8 +1,11 @@
 """Faults that gave a result that looked good and was not: each is told, flagged or refused (docs/faults.md)."""
 
 import errno
+import json
 import os
 import shutil
+import tomllib
+from dataclasses import fields, is_dataclass
 
 import h5py
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 from disctrack.cli import main
 from disctrack.errors import DiscTrackError, OutputError
 from disctrack.files.trajectory_file import read_findings, read_trajectory
+from disctrack.render import read_truth
 from disctrack.render import recording as render_recording
 from disctrack.scene.description import Scene
 from disctrack.trajectory import FrameStatus
@@ -200,3 +204,84 @@ def test_random_command_lines_end_with_an_exit_code_and_no_internal_error(tmp_pa
         except SystemExit as stop:
             code = stop.code
         assert code in (0, 1, 2), (words, capsys.readouterr().err)
+
+
+SMALL = """
+[cameras]
+image_size = [128, 128]
+n_frames = 3
+[rig]
+mm_per_px = 1.0
+[board]
+n_views = 2
+max_tilt_deg = 20
+[motion]
+kind = "{kind}"
+"""
+COUNTS = {"n_frames", "n_views", "subpixels", "threads"}  # large ones are lawful, and only take long
+WRONG_KINDS = ("word", True, [], [[]], [1.0], "", "\0", {})
+
+
+def leaves(item, path=()):
+    """Keys of a scene, with their defaults."""
+    for entry in fields(item):
+        value = getattr(item, entry.name)
+        if is_dataclass(value):
+            yield from leaves(value, (*path, entry.name))
+        elif entry.name != "folder":
+            yield (*path, entry.name), value
+
+
+def some_value(rng, key, like):
+    """A value in place of one like this: another number, or numbers, or a thing of another kind."""
+    if rng.random() < 0.1:
+        return WRONG_KINDS[rng.integers(len(WRONG_KINDS))]
+    if isinstance(like, tuple) and like:
+        at = int(rng.integers(len(like)))
+        return [some_value(rng, key, entry) if i == at else entry for i, entry in enumerate(like)]
+    if isinstance(like, bool) or not isinstance(like, int | float):
+        return WRONG_KINDS[rng.integers(len(WRONG_KINDS))]
+    if isinstance(like, int):
+        return int(rng.choice([-1, 0, 1, 2, 7] if key in COUNTS else [-(10**9), -1, 0, 1, 2, 7, 65, 10**9]))
+    return float(rng.choice([*VALUES, 1e-3, 0.5, 2.0, -2.0, 1e3]) if rng.random() < 0.7 else like * rng.normal(1, 3))
+
+
+def as_toml(value):
+    if isinstance(value, bool | str | dict):
+        return {True: "true", False: "false"}[value] if isinstance(value, bool) else json.dumps(value)
+    return f"[{', '.join(map(as_toml, value))}]" if isinstance(value, list | tuple) else repr(value)
+
+
+@pytest.mark.parametrize("n", [12, pytest.param(500, marks=pytest.mark.slow)])
+def test_random_scenes_end_in_a_recording_or_a_sentence(tmp_path, capsys, n):
+    """One or two values of a small scene are replaced; what is rendered has its truth in numbers."""
+    rng = np.random.default_rng(1414)
+    keys = list(leaves(Scene()))
+    for i in range(n):
+        lines = tomllib.loads(SMALL.format(kind=rng.choice(["static", "rolling"])))
+        for j in rng.integers(0, len(keys), rng.integers(1, 3)):
+            path, default = keys[j]
+            part = lines
+            for name in path[:-1]:
+                part = part.setdefault(name, {})
+            part[path[-1]] = some_value(rng, path[-1], default)
+        scene, out = tmp_path / f"{i}.toml", tmp_path / f"{i}"
+        scene.write_text("\n".join(written(lines)))
+        code = main(["render", str(scene), "-o", str(out), "--truth", str(tmp_path / f"{i}.h5"), "--quiet"])
+        said = capsys.readouterr().err
+        assert code in (0, 1), (scene.read_text(), said)
+        assert "internal error" not in said, (scene.read_text(), said)
+        if code == 0:
+            assert np.isfinite(read_truth(tmp_path / f"{i}.h5").q).all(), scene.read_text()
+            shutil.rmtree(out)
+
+
+def written(tree, prefix=""):
+    """Lines of a TOML file."""
+    yield from (
+        f"{name} = {as_toml(value)}" for name, value in tree.items() if not isinstance(value, dict) or not value
+    )
+    for name, value in tree.items():
+        if isinstance(value, dict) and value:
+            yield f"[{prefix}{name}]"
+            yield from written(value, f"{prefix}{name}.")

@@ -95,6 +95,34 @@ def test_a_repeated_image_is_found_by_its_pixels_and_its_frame_measured_by_the_o
     assert measure(images, clip.rig, clip.disc).trajectory.frame_status[20] == FrameStatus.REPEATED
 
 
+MIRRORED = {
+    "both cameras are mirrored left to right": lambda images: images[..., ::-1],
+    "right camera's images are mirrored top to bottom": lambda images: np.stack(
+        [images[:, 0], images[:, 1, ::-1]], axis=1
+    ),
+}
+
+
+@pytest.mark.parametrize("said", MIRRORED)
+def test_images_mirrored_since_the_calibration_are_named(clip, said):
+    images = np.ascontiguousarray(MIRRORED[said](clip.images[:8]))
+    try:
+        told = " ".join(measure(images, clip.rig, clip.disc).doubts)
+    except TrackingError as error:
+        told = str(error)
+    assert said in told
+
+
+def test_a_camera_that_left_out_an_image_is_named_with_the_frame(clip):
+    images = clip.images.copy()
+    images[9:-1, 1] = images[10:, 1]
+    found = measure(images[:-1], clip.rig, clip.disc)
+    assert (found.trajectory.frame_status == np.where(np.arange(N - 1) < 9, 0, FrameStatus.CONTRADICTED)).all()
+    assert "frames 9-46 are refused" in found.doubts[0]
+    assert "the right camera were 1.0" in found.doubts[0] or "the right camera were 0.9" in found.doubts[0]
+    assert "left out 1 image(s) at frame 9" in found.doubts[0]
+
+
 def test_exchanged_frames_of_both_cameras_lie_on_no_motion(clip):
     images = clip.images.copy()
     images[[20, 22]] = images[[22, 20]]
