@@ -8,6 +8,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.camera import N_INTRINSIC, StereoRig
+from calibration.causes import causes
 from calibration.errors import CalibrationError
 from calibration.model_choice import Candidate
 from calibration.normal_equations import Problem, minimise
@@ -47,6 +48,7 @@ class Assessment:
     projection_sigma_px: tuple[float, float]  # root mean square and greatest, over the table view's volume
     triangulation_sigma: tuple[float, float]  # the same for points [m], all of the calibration's uncertainty
     length_sigma: tuple[float, float]  # relative, of a length or displacement: by the views; and with the board's size
+    place_sigma: tuple[tuple[float, str], ...]  # of x, y, z of points [m], with the board's sizes; most of it from what
     pairs: int  # views that both cameras saw and the fit uses
     motion: Motion | None  # of the board between the exposures of a pair
     verdict: str
@@ -172,13 +174,24 @@ def point_uncertainty(rig: StereoRig, points_world: Array) -> tuple[Array, Array
 
     points_world : (n, 3) [m]. A point's error is what a perfect image of it would give through this rig.
     """
-    _, d_world, d_rig = rig.project_with_jacobians(points_world)
+    d_rig = rig.project_with_jacobians(points_world)[2]
     pixel_variance = np.einsum("cnip,pq,cniq->cni", d_rig, rig.covariance, d_rig)
-    J = np.moveaxis(d_world, 0, 1).reshape(len(points_world), 4, 3)
-    K = np.moveaxis(d_rig, 0, 1).reshape(len(points_world), 4, -1)
-    shift = -np.linalg.solve(np.swapaxes(J, 1, 2) @ J, np.swapaxes(J, 1, 2) @ K)
+    shift = _shifts_of_points(rig, points_world)
     point_variance = np.einsum("nip,pq,niq->ni", shift, rig.covariance, shift)
     return np.sqrt(np.maximum(pixel_variance, 0)), np.sqrt(np.maximum(point_variance, 0))
+
+
+def place_causes(rig: StereoRig, points_world: Array) -> tuple[Array, list[str]]:
+    """Of coordinates of points (n, 3) [m] seen through the rig: standard deviation (3,) [m], and what most is from."""
+    return causes(rig, _shifts_of_points(rig, points_world))
+
+
+def _shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
+    """(n, 3, 30) d point / d RIG_PARAMETERS at fixed pixels."""
+    _, d_world, d_rig = rig.project_with_jacobians(points_world)
+    J = np.moveaxis(d_world, 0, 1).reshape(len(points_world), 4, 3)
+    K = np.moveaxis(d_rig, 0, 1).reshape(len(points_world), 4, -1)
+    return np.asarray(-np.linalg.solve(np.swapaxes(J, 1, 2) @ J, np.swapaxes(J, 1, 2) @ K), np.float64)
 
 
 def measurement_volume(refinement: Refinement, rig: StereoRig, table_view: int | None) -> Array:
@@ -209,6 +222,8 @@ def assess(
     volume = measurement_volume(refinement, rig, table_view)
     pixel_sigma, point_sigma = point_uncertainty(rig, volume)
     lengths = (length_uncertainty(rig, volume), length_uncertainty(rig_with_board, volume))
+    sigma, most = place_causes(rig_with_board, volume)
+    place = tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
     pairs = len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1]))
     chosen = next((c for c in reversed(candidates) if c.terms == refinement.terms), None)
     n_views = len(np.unique(kept.view))
@@ -235,6 +250,7 @@ def assess(
         projection_sigma_px=(float(np.sqrt(np.mean(pixel_length**2))), float(pixel_length.max())),
         triangulation_sigma=triangulation,
         length_sigma=lengths,
+        place_sigma=place,
         pairs=pairs,
         motion=motion,
         verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, motion, chosen),

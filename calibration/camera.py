@@ -131,6 +131,15 @@ def normalise(pixels: Array, camera: Camera, iterations: int = 20) -> Array:
     return np.where(good[..., None], np.stack([a, b], axis=-1), np.nan)
 
 
+@dataclass(frozen=True)
+class Allowance:
+    """A part of a rig's covariance that no image tells: what the sizes of a board or a disc may be off by."""
+
+    cause: str  # as in "the board's thickness"
+    shift: Array  # (30,) of RIG_PARAMETERS by one standard deviation
+    assumed: bool = False  # neither declared nor measured: a default, which other evidence may narrow
+
+
 @dataclass(frozen=True, repr=False)
 class StereoRig(Brief):
     """Two calibrated cameras and the world (lab) frame they look at.
@@ -151,6 +160,7 @@ class StereoRig(Brief):
     world_is_table: bool = False
     # What the lenses do beyond the polynomial: measured points are corrected by it before anything else (`splines`)
     lens_field: LensField | None = None
+    allowances: tuple[Allowance, ...] = ()  # parts of the covariance, by cause; the views' own is what is left
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""

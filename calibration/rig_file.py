@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.board import Board
-from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Camera, StereoRig
+from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Allowance, Camera, StereoRig
 from calibration.errors import RigFileError
 from calibration.splines import LensField
 from calibration.stereo import StereoCalibration
@@ -185,6 +185,11 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
         "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
     )
     group["covariance"].attrs["parameters"] = ", ".join(RIG_PARAMETERS)
+    if rig.allowances:
+        told = "parts of the covariance that no image tells, one row for one standard deviation of each cause"
+        _put(group, "allowances", np.stack([a.shift for a in rig.allowances]), "px, 1, rad, m", told)
+        group["allowances"].attrs["causes"] = json.dumps([a.cause for a in rig.allowances])
+        group["allowances"].attrs["assumed"] = json.dumps([a.assumed for a in rig.allowances])
     if rig.lens_field is not None:
         told = (
             "coefficients of cubic B-splines (camera, axis, y, x): displacement of image points beyond the polynomial"
@@ -309,7 +314,16 @@ def read_rig_group(group: h5py.Group) -> StereoRig:
         covariance=covariance,
         world_is_table=bool(group.attrs.get("world_is_table", 0)),
         lens_field=_lens_field(group) if "lens_field" in group else None,
+        allowances=_allowances(group) if "allowances" in group else (),
     )
+
+
+def _allowances(group: h5py.Group) -> tuple[Allowance, ...]:
+    shifts = _get(group, "allowances", (None, N_RIG))
+    causes, assumed = (json.loads(group["allowances"].attrs[name]) for name in ("causes", "assumed"))
+    if not len(shifts) == len(causes) == len(assumed) <= N_RIG:
+        raise RigFileError(f"{group.name}/allowances: {len(shifts)} rows, {len(causes)} causes, {len(assumed)} marks")
+    return tuple(Allowance(str(c), s, bool(a)) for c, s, a in zip(causes, shifts, assumed, strict=True))
 
 
 def _lens_field(group: h5py.Group) -> LensField:

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.assessment import Assessment, assess, consistency_factor, half_set_differences, stereo_covariance
+from calibration.assessment import (
+    Assessment,
+    assess,
+    consistency_factor,
+    half_set_differences,
+    stereo_covariance,
+)
 from calibration.board import Board
 from calibration.brief import Brief
 from calibration.camera import StereoRig
@@ -23,7 +29,7 @@ from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
 from calibration.table_frame import rig_with_covariance
-from calibration.tolerances import BoardTolerances, with_tolerances
+from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
 
 CAMERA_NAMES = ("left", "right")
 SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
@@ -66,6 +72,7 @@ class StereoCalibration(Brief):
     candidates: tuple[Candidate, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
+    shape: BoardShape | None = None  # of the board against the declared one, as far as the views tell
     lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
     def facts(self) -> dict[str, str]:
@@ -250,13 +257,17 @@ def calibrate_from_corners(
         refinement = lens.refinement
     report("judging")
     inflation = max(consistency_factor(refinement), 1.0)
-    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, stereo_covariance(refinement))
+    shape = board_shape(refinement, board.points, inflation)
+    refinement = as_made(refinement, board.points, shape)
+    origin = on_the_table(board.points, shape)
+    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, stereo_covariance(refinement), origin)
     with_board = with_tolerances(
         replace(rig, lens_field=lens.field if lens else None),
         board.points,
         table_view,
         board_thickness,
         settings.tolerances,
+        shape,
     )
     halves = half_set_differences(refinement, inflation)
     motion = motion_between_exposures(refinement)
@@ -276,6 +287,7 @@ def calibrate_from_corners(
         assessment=assessment,
         warnings=(*warnings, *assessment.warnings),
         lens=lens,
+        shape=shape,
     )
 
 

@@ -20,6 +20,7 @@ DISTORTION_MODELS: dict[str, tuple[str, ...]] = {
     "k1 k2 p1 p2 k3": ("k1", "k2", "p1", "p2", "k3"),
 }
 BOARD_MODELS = ("flat", "warped", "free")
+N_WARP = 5  # shape parameters of a warped board
 N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
 
 
@@ -99,7 +100,8 @@ class Terms:
 def board_basis(nominal: Array, board: str) -> Array:
     """(n, 3, n_shape): displacement of the target's points [m] per unit of each shape parameter [m].
 
-    flat: none. warped: out of the plane as x^2, x y, y^2 over the half size. free: every coordinate of every point.
+    flat: none. warped: out of the plane as x^2, x y, y^2 over the half size, and in it longer along one side or
+    sheared, as a print that the paper's feed has drawn out. free: every coordinate of every point.
     Shift, turn and scale of the target as a whole are taken out: no image can tell them from a changed pose and
     baseline, so the mean plane and the mean size stay those declared.
     """
@@ -115,10 +117,12 @@ def board_basis(nominal: Array, board: str) -> Array:
     if board == "free":
         return q[:, 7:].reshape(n, 3, 3 * n - 7)
     x, y = (d / np.abs(d).max(0).clip(1e-12))[:, :2].T
-    warp = np.zeros((n, 3, 3))
-    warp[:, 2] = np.stack([x * x, x * y, y * y], axis=-1)
-    flat = warp.reshape(3 * n, 3)
-    return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(n, 3, 3)
+    warp = np.zeros((n, 3, N_WARP))
+    warp[:, 2, :3] = np.stack([x * x, x * y, y * y], axis=-1)
+    warp[:, :2, 3] = d[:, :2] * [0.5, -0.5] / size
+    warp[:, :2, 4] = d[:, 1::-1] * 0.5 / size
+    flat = warp.reshape(3 * n, N_WARP)
+    return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(n, 3, N_WARP)
 
 
 def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:

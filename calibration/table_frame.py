@@ -24,10 +24,12 @@ def rig_with_covariance(
     board_thickness: float,
     inflation: float,
     stereo: Array | None = None,
+    origin: Array | None = None,
 ) -> StereoRig:
     """The rig at the minimum, its world on the table of one view, with the covariance of all RIG_PARAMETERS.
 
     inflation : factor on the covariance that follows from the points' noise
+    origin : (3,) [m] that lies one thickness above the world's, in board axes; corner 0 without
     stereo : covariance of the free stereo parameters where it is known better, see `assessment.stereo_covariance`
     """
     model, normal = refinement.model, refinement.normal
@@ -45,6 +47,7 @@ def rig_with_covariance(
     R_left_world, t_left_world = np.eye(3), np.zeros(3)
     if table_view is not None:
         R, t = model.R_left_board[table_view], model.t_left_board[table_view]
+        t = t if origin is None else t + R @ origin
         R_left_world, t_left_world = table_pose(R, t, board_thickness)
         # t_world = t - h R k: turning R by v shifts it by -v x (h R k) = (h R k) x v
         arm = board_thickness * R[:, 2]

@@ -22,9 +22,9 @@ class Disc:
     mass: float  # m [kg]
     marker_centres_body: Array  # (n_markers, 3) [m]; third component +h for dots on the upper face
     marker_diameter: float  # [m]
-    # Standard deviations of what was declared [m], radius and thickness 2h: what a micrometer tells
-    radius_tolerance: float = 7.5e-6
-    thickness_tolerance: float = 3e-6
+    # Standard deviations of radius and thickness 2h as declared [m]; None: not declared
+    radius_tolerance: float | None = None
+    thickness_tolerance: float | None = None
 
     @property
     def moment_diametral(self) -> float:
@@ -52,8 +52,8 @@ def disc_from_mm(
     mass_g: float,
     marker_centres_mm: list[list[float]] | Array,
     marker_diameter_mm: float,
-    radius_tolerance_mm: float = 7.5e-3,
-    thickness_tolerance_mm: float = 3e-3,
+    radius_tolerance_mm: float | None = None,
+    thickness_tolerance_mm: float | None = None,
 ) -> Disc:
     """Disc from the millimetres and grams of a recording.toml; centres are (n, 2) on the upper face."""
     centres = np.asarray(marker_centres_mm, float).reshape(-1, 2) * 1e-3
@@ -64,8 +64,8 @@ def disc_from_mm(
         mass=mass_g * 1e-3,
         marker_centres_body=np.column_stack([centres, height]),
         marker_diameter=marker_diameter_mm * 1e-3,
-        radius_tolerance=radius_tolerance_mm * 1e-3,
-        thickness_tolerance=thickness_tolerance_mm * 1e-3,
+        radius_tolerance=None if radius_tolerance_mm is None else radius_tolerance_mm * 1e-3,
+        thickness_tolerance=None if thickness_tolerance_mm is None else thickness_tolerance_mm * 1e-3,
     )
 
 

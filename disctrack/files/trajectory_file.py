@@ -361,13 +361,16 @@ def _disc(disc: Disc) -> dict[str, Variable]:
 
 
 def _disc_attributes(disc: Disc) -> dict[str, float]:
+    declared = {
+        "radius_tolerance_m": disc.radius_tolerance,
+        "thickness_tolerance_m": disc.thickness_tolerance,
+    }
     return {
         "radius_m": disc.radius,
         "half_thickness_m": disc.half_thickness,
         "mass_kg": disc.mass,
         "marker_diameter_m": disc.marker_diameter,
-        "radius_tolerance_m": disc.radius_tolerance,
-        "thickness_tolerance_m": disc.thickness_tolerance,
+        **{key: value for key, value in declared.items() if value is not None},
     }
 
 

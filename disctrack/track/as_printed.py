@@ -10,6 +10,11 @@ P, C: whitened Jacobians by the pose and by s. Priors: the rig's own covariance;
 of the face. Gauge: moving or turning the whole pattern on the disc cannot be told from moving the disc. The pattern is
 moved and turned to where the sum of the dots' displacements is smallest: if one dot is misprinted, the others stay
 where they were declared, and the centre of mass with them; the cameras do not see it.
+
+The pattern of the dots is a second ruler beside the board: by how much it comes out larger than declared is the error
+of the rig's size or of the pattern's. Each has a variance, the rig's in its allowance for the board's size, the
+pattern's from how regular it is: one that is stretched or sheared by little was hardly drawn to a wrong size. The rig's
+size is moved by its share.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ import numpy as np
 
 from calibration.arrays import Array, Mask
 from calibration.camera import N_RIG, StereoRig
+from calibration.tolerances import SIZE
 from disctrack.disc import Disc
 from disctrack.track.pose import fit_poses, marker_pixels, whitening
 
@@ -27,6 +33,7 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
 # not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
 SYSTEMATIC_PX = 0.002
+SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
 # Dots that are found this near their declared places (rms) are left there: SYSTEMATIC_PX alone makes 0.5 um.
 MIN_MARKER_SHIFT = 2e-6  # [m]
 ITERATIONS = 4
@@ -45,6 +52,9 @@ class AsBuilt:
     reduced_chi_square_before: float
     reduced_chi_square_after: float
     n_frames: int  # that entered
+    size: float = 0.0  # relative, by which dots that are as declared make all lengths longer than the board does
+    size_sigma: float = float("nan")  # of the dots as a ruler
+    size_share: float = 0.0  # of that, which the rig has been made larger by
 
 
 def refine_as_built(
@@ -108,20 +118,28 @@ def refine_as_built(
     remaining = np.zeros((len(shift), len(shift)))
     remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
     sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
-    rig_covariance = remaining[:N_RIG, :N_RIG] if refine_rig else rig.covariance
-    if refine_markers and not refine_rig and np.sqrt(np.mean(shift[N_RIG:] ** 2)) < MIN_MARKER_SHIFT:
-        return replace(
-            unchanged,
-            marker_shift_sigma=sigma,
-            reduced_chi_square_before=before,
-            reduced_chi_square_after=before,
-        )
-    kept = declared_places_kept(disc, shift[N_RIG:].reshape(m, 2))
+    if refine_rig:
+        current_rig = replace(current_rig, covariance=remaining[:N_RIG, :N_RIG], allowances=())
+    moved = shift[N_RIG:].reshape(m, 2)
+    size, size_sigma, size_share = 0.0, float("nan"), 0.0
+    if refine_markers and not refine_rig:
+        size, size_sigma = pattern_size(disc, moved, remaining[N_RIG:, N_RIG:])
+        current_rig, size_share = sized_by_pattern(rig, size, size_sigma)
+        moved = moved + size_share * size * _from_middle(disc)
+        unchanged = replace(unchanged, rig=current_rig, size=size, size_sigma=size_sigma, size_share=size_share)
+        if np.sqrt(np.mean(moved**2)) < MIN_MARKER_SHIFT:
+            return replace(
+                unchanged,
+                marker_shift_sigma=sigma,
+                reduced_chi_square_before=before,
+                reduced_chi_square_after=after if size_share * abs(size) > size_sigma else before,
+            )
+    kept = declared_places_kept(disc, moved)
     current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
     return AsBuilt(
-        rig=replace(current_rig, covariance=rig_covariance),
+        rig=current_rig,
         disc=current_disc,
         marker_shift=kept,
         marker_shift_sigma=sigma,
@@ -129,7 +147,54 @@ def refine_as_built(
         reduced_chi_square_before=before,
         reduced_chi_square_after=after,
         n_frames=len(rows),
+        size=size,
+        size_sigma=size_sigma,
+        size_share=size_share,
     )
+
+
+def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, float]:
+    """By how much lengths are too short, relative, if the dots are as declared; and the dots' sigma as a ruler.
+
+    shift : (m, 2) [m] refined minus declared places of covariance (2m, 2m); SIZE_FLOOR is added
+
+    The sigma has three parts: of the refinement; of dots that are misplaced at random, as those left by displacement,
+    turn, size, stretch and shear are; and of a pattern whose two sides are off by what stretch and shear show.
+    """
+    d = _from_middle(disc)
+    columns = np.stack([d, d * [0.5, -0.5], 0.5 * d[:, ::-1]], axis=-1).reshape(-1, 3)
+    columns = np.concatenate([columns, _pattern_motions(disc).reshape(-1, 3)], axis=1)
+    inverse = np.linalg.pinv(columns)
+    size, stretch, shear = (inverse @ shift.reshape(-1))[:3]
+    C = (inverse @ covariance @ inverse.T)[:3, :3]
+    left = shift.reshape(-1) - columns @ (inverse @ shift.reshape(-1))
+    freedom = max(len(left) - 6, 1)
+    random = float(left @ left) / freedom / float(np.sum(d**2))
+    # stretch and shear have the variance 2 v of two sides, the size, their mean, has v / 2
+    drawn = (stretch**2 + shear**2 + C[1, 1] + C[2, 2]) / 8.0
+    return -float(size), float(np.sqrt(C[0, 0] + random + drawn + SIZE_FLOOR**2))
+
+
+def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoRig, float]:
+    """The rig with all lengths longer by its share of `size` +- `sigma`, and that share; see the module."""
+    by_size = [i for i, a in enumerate(rig.allowances) if a.cause == SIZE and a.shift[21:24].any()]
+    if not by_size:
+        return rig, 0.0
+    shift = rig.allowances[by_size[0]].shift
+    own = float(np.linalg.norm(shift[21:24])) / rig.baseline
+    share = own**2 / (own**2 + sigma**2)
+    left = np.sqrt(1.0 - share)
+    allowances = list(rig.allowances)
+    allowances[by_size[0]] = replace(allowances[by_size[0]], shift=left * shift)
+    covariance = rig.covariance - (1.0 - left**2) * np.outer(shift, shift)
+    grown = rig.perturbed(share * size / own * shift)
+    return replace(grown, covariance=covariance, allowances=tuple(allowances)), share
+
+
+def _from_middle(disc: Disc) -> Array:
+    """(m, 2) [m] from the middle of the dots."""
+    d: Array = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
+    return d
 
 
 def _prior_information(rig_covariance: Array, free: Mask, m: int) -> Array:

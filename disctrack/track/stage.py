@@ -195,6 +195,12 @@ def findings_of(tracking: Tracking) -> dict[str, Any]:
         "variance_factor": tracking.variance_factor,
         "noise_factor": tracking.noise_factor,
         "systematic_px": list(tracking.systematic_px),
+        "shared_sigma": [[sigma, cause] for sigma, cause in tracking.shared_sigma],
+        "size": {
+            "by_dots": tracking.as_built.size,
+            "sigma": tracking.as_built.size_sigma,
+            "share": tracking.as_built.size_share,
+        },
         **(
             {}
             if tracking.table is None
@@ -274,6 +280,8 @@ def rig_sha256(rig: StereoRig) -> str:
     digest.update(bytes([rig.world_is_table]))
     if rig.lens_field is not None:
         digest.update(np.ascontiguousarray(rig.lens_field.coefficients).tobytes())
+    for allowance in rig.allowances:
+        digest.update(f"{allowance.cause} {allowance.assumed}".encode() + allowance.shift.tobytes())
     return digest.hexdigest()
 
 

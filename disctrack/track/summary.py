@@ -15,6 +15,7 @@ from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 
 _SHOWN_RANGES = 6
+LEAST_SIZE = 1e-5  # relative: a change of the rig's size that is worth a line
 
 
 def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) -> list[str]:
@@ -31,6 +32,7 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
         _line("rig", _rig_text(found.rig)),
         _line("model", _model_text(found)),
         _line("", assessment.verdict),
+        _line("place", _mostly(assessment.place_sigma, "the calibration alone, of a point over the table's board")),
     ]
     if found.lens is not None:
         (left, right), gain = found.lens.rms_px, found.lens.gain
@@ -61,6 +63,12 @@ def _rig_text(rig: StereoRig) -> str:
         f"baseline {rig.baseline * 1e3:.3f} ± {baseline:.2g} mm, cameras turned by {angle:.3f} ± {turn:.2g} deg, "
         f"focal lengths [px] {', '.join(focal)}"
     )
+
+
+def _mostly(sigma: Sequence[tuple[float, str]], what: str) -> str:
+    """Each coordinate's sigma and what most of it comes from."""
+    parts = [f"{axis} {1e6 * value:.2g} um from {cause}" for axis, (value, cause) in zip("xyz", sigma, strict=False)]
+    return f"{', '.join(parts)} (1 sigma, and its largest part: {what})"
 
 
 def _model_text(found: StereoCalibration) -> str:
@@ -95,6 +103,7 @@ def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> lis
         lines += [
             _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
             _sigma_line("", trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats"),
+            *_shared_lines(findings),
             _fit_line(trajectory),
         ]
         if any(repeats := findings.get("systematic_px", ())):
@@ -107,6 +116,18 @@ def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> lis
     lines += [_line("note", note) for note in findings.get("notes", [])]
     lines += [_line("warning", warning) for warning in findings.get("warnings", [])]
     return lines
+
+
+def _shared_lines(findings: Mapping[str, Any]) -> Iterable[str]:
+    if shared := findings.get("shared_sigma"):
+        yield _line("", _mostly(shared, "shared by frames"))
+    size = findings.get("size", {})
+    if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > LEAST_SIZE:
+        yield _line(
+            "size",
+            f"by the disc's dots lengths are {100 * size['by_dots']:+.4f} +- {100 * size['sigma']:.4f} % longer than "
+            f"by the board; {100 * size['share']:.0f} % of that is taken over",
+        )
 
 
 def file_lines(files: Sequence[Path]) -> list[str]:

@@ -10,6 +10,9 @@ thickness and its bow. Both have a covariance (the cameras' errors are in both, 
 to the rig), and they are combined as those say. Only the world frame is moved; the cameras stay as calibrated relative
 to each other.
 
+How far board and disc differ also tells how well both were made: two errors hardly cancel. So what was assumed of the
+board, and apart from it of the disc, without being declared, is narrowed to the difference that is seen.
+
 This is geometry alone. A table that is not level leans in the world and against gravity; here the world leans with it.
 """
 
@@ -21,7 +24,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calibration.arrays import Array
-from calibration.camera import N_RIG, StereoRig
+from calibration.camera import N_RIG, Allowance, StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits
@@ -32,6 +35,8 @@ MIN_FRAMES = 30
 THETA_RANGE = np.radians(0.7), np.radians(85.0)
 MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
 NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that is more
+# Standard deviations [m] of radius and thickness where none is declared: 0.02 %, and a micrometer's
+ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
 _CAMERAS = slice(24, 30)  # of RIG_PARAMETERS: the world as the left camera sees it
@@ -83,10 +88,14 @@ def table_from_disc(
     M[27:30] = turn[:, 2:] * np.array([1.0, *-middle])
 
     # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
-    V = noise + np.outer(by_radius, by_radius) + 4.0 * np.outer(by_thickness, by_thickness)
-    stated = V - 3.0 * np.outer(by_thickness, by_thickness)
-    board = H @ rig.covariance @ H.T
+    by_disc = np.stack([by_radius, 2.0 * by_thickness], axis=1)
+    V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
     difference = np.linalg.solve(board + V, plane) @ plane
+    told_sigma, told_board = np.sqrt(np.diag(V - 3.0 * np.outer(by_thickness, by_thickness))), np.sqrt(np.diag(board))
+    if source == "both":
+        rig, by_disc = _narrowed(rig, by_disc, disc, plane, H, noise)
+        V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
+    stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
     # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
     allowed = np.diag(board + V)
     more = board + np.diag(np.where(plane**2 > 9.0 * allowed, plane**2 - allowed, 0.0))
@@ -100,22 +109,71 @@ def table_from_disc(
         source,
         plane,
         middle,
-        np.sqrt(np.diag(stated)),
-        np.sqrt(np.diag(board)),
+        told_sigma,
+        told_board,
         applied,
         float(chdtrc(3, difference)),
         scatter,
         n,
     )
     # of the disc's thickness, what the board's share of the height leaves
-    left = (1.0 - gain[0, 0]) ** 2 * disc.thickness_tolerance**2 / 4.0
+    left = (1.0 - gain[0, 0]) ** 2 * (thickness_tolerance(disc) * _ratio(by_disc[:, 1], 2.0 * by_thickness) / 2.0) ** 2
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic = systematic.copy()
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source == "board":
         return fits, systematic, rig, told
     moved, systematic, rig = _on_plane(fits, systematic, rig, applied, middle)
-    return moved, systematic, replace(rig, covariance=0.5 * (covariance + covariance.T)), told
+    allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
+    for cause, column in (("the disc's radius", by_disc[:, 0]), ("the disc's thickness", 0.5 * by_disc[:, 1])):
+        allowances.append(Allowance(cause, M @ gain @ column))
+    covariance = 0.5 * (covariance + covariance.T)
+    return moved, systematic, replace(rig, covariance=covariance, allowances=tuple(allowances)), told
+
+
+def radius_tolerance(disc: Disc) -> float:
+    """Standard deviation of the disc's radius [m], as declared or assumed."""
+    return ASSUMED_RADIUS if disc.radius_tolerance is None else disc.radius_tolerance
+
+
+def thickness_tolerance(disc: Disc) -> float:
+    """Standard deviation of the disc's thickness [m], as declared or assumed."""
+    return ASSUMED_THICKNESS if disc.thickness_tolerance is None else disc.thickness_tolerance
+
+
+def _ratio(part: Array, whole: Array) -> float:
+    return float(np.sqrt((part @ part) / max(float(whole @ whole), 1e-300)))
+
+
+def _narrowed(
+    rig: StereoRig, by_disc: Array, disc: Disc, plane: Array, H: Array, noise: Array
+) -> tuple[StereoRig, Array]:
+    """Rig and departures of the plane by the disc's sizes (3, 2), what was assumed of either as small as `plane` is.
+
+    Height and slopes each tell of the assumptions that act on them most; nothing becomes larger.
+    """
+    shifts = np.array([a.shift for a in rig.allowances]).reshape(-1, N_RIG)
+    of_board = np.array([a.assumed for a in rig.allowances], bool)
+    of_disc = np.array([disc.radius_tolerance is None, disc.thickness_tolerance is None])
+    assumed = shifts[of_board].T @ shifts[of_board]
+    declared = by_disc[:, ~of_disc]
+    told = np.diag(H @ (rig.covariance - assumed) @ H.T + noise + declared @ declared.T)
+    seen = np.maximum(plane**2, told)  # less than what can be told is not known
+
+    def factors(columns: Array) -> Array:
+        whole = np.maximum(np.sum(columns**2, axis=1), 1e-300)  # (3,)
+        most = np.argmax(columns**2 / whole[:, None], axis=0)
+        found: Array = np.sqrt(np.minimum(1.0, seen / whole))[most]
+        return found
+
+    scale = np.ones(len(shifts))
+    scale[of_board] = factors(H @ shifts[of_board].T)
+    narrower = (shifts * scale[:, None])[of_board]
+    allowances = tuple(replace(a, shift=a.shift * k) for a, k in zip(rig.allowances, scale, strict=True))
+    covariance = rig.covariance - assumed + narrower.T @ narrower
+    by_disc = by_disc.copy()
+    by_disc[:, of_disc] *= factors(by_disc[:, of_disc])
+    return replace(rig, covariance=covariance, allowances=allowances), by_disc
 
 
 def _contacts(
@@ -158,8 +216,8 @@ def _contacts(
     covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
     by_rig = -gain @ np.einsum("ni,nij->nj", by_pose, fits.sensitivity[rows])
     sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
-    by_radius = gain @ sine * disc.radius_tolerance
-    by_thickness = gain @ R[:, 2, 2] * 0.5 * disc.thickness_tolerance
+    by_radius = gain @ sine * radius_tolerance(disc)
+    by_thickness = gain @ R[:, 2, 2] * 0.5 * thickness_tolerance(disc)
     return plane, middle, by_rig, covariance, by_radius, by_thickness, spread, int(kept.sum())
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
+from calibration.causes import causes
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
@@ -101,6 +102,7 @@ class Tracking:
     noise_factor: float  # the part of it that changes from frame to frame (`own_scatter`), by which the covariances of
     # dots and poses are multiplied; what is left of the other makes `Trajectory.systematic_covariance`
     systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
+    shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
     table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     warnings: tuple[str, ...]
@@ -311,7 +313,7 @@ def _assemble(
         max_frames=SHARED_FRAMES,
     )
     if settings.refine_markers and faults is not None:
-        as_built = _without_false_shifts(as_built, first.setup.disc, faults)
+        as_built = _without_false_shifts(as_built, first.setup.rig, first.setup.disc, faults)
     fits = _fit_all(tables, as_built, settings.reject_outliers)
     ordinary = replace(
         fits,
@@ -335,7 +337,9 @@ def _assemble(
     fits.covariance[...] *= verdicts.factor[:, None, None]
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
-    as_built = replace(as_built, rig=replace(rig, lens_field=None))  # what the dots have been corrected by
+    shared = _shared_sigma(fits, systematic, rig)
+    # what the dots have been corrected by, and what has gone into the covariance
+    as_built = replace(as_built, rig=replace(rig, lens_field=None, allowances=()))
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     warnings = _warnings(first, factor, faults, scatter, table, trajectory)
     return Tracking(
@@ -345,6 +349,7 @@ def _assemble(
         as_built=as_built,
         variance_factor=factor,
         noise_factor=noise_factor,
+        shared_sigma=shared,
         systematic_px=scatter.systematic_px,
         table=table,
         acquisitions=sum(f.acquisitions for f in followers),
@@ -388,7 +393,7 @@ def _repeats_in_words(repeated: Mask, pairs: range) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _without_false_shifts(as_built: AsBuilt, declared: Disc, faults: SharedFaults) -> AsBuilt:
+def _without_false_shifts(as_built: AsBuilt, rig: StereoRig, declared: Disc, faults: SharedFaults) -> AsBuilt:
     """Where cameras and clock are wrong, dots refined alone would be moved to make up for that: take the joint ones."""
     if not as_built.reduced_chi_square_after > FAULTY * max(1.0, faults.reduced_chi_square):
         return as_built
@@ -396,7 +401,8 @@ def _without_false_shifts(as_built: AsBuilt, declared: Disc, faults: SharedFault
     if np.sqrt(np.mean(shift**2)) < MIN_MARKER_SHIFT:
         shift = np.zeros_like(shift)
     disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
-    return replace(as_built, disc=disc, marker_shift=shift, marker_shift_sigma=faults.marker_shift_sigma)
+    sigma = faults.marker_shift_sigma
+    return replace(as_built, rig=rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
 
 
 def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFits:
@@ -418,6 +424,17 @@ def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFi
                 whole[name] = np.empty((n, *value.shape[1:]), value.dtype)
             whole[name][rows] = value
     return PoseFits(**whole)
+
+
+def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig) -> tuple[tuple[float, str], ...]:
+    """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what."""
+    rows = np.flatnonzero(fits.converged & np.isfinite(systematic).all(axis=(1, 2)))
+    if not rows.size:
+        return ()
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(SHARED_FRAMES, len(rows))).astype(int))]
+    repeats = np.mean(np.diagonal(systematic[rows], axis1=1, axis2=2), axis=0)
+    sigma, most = causes(rig, fits.sensitivity[rows], {"what repeats in the dots": repeats})
+    return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
 
 
 def _trajectory(

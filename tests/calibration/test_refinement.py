@@ -241,7 +241,7 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, r
 def test_a_bent_board_is_chosen_and_recovered_by_held_out_error(scene_maker, rng):
     flat = scene_maker(n_views=12)
     basis = board_basis(flat.board.points, "warped")
-    deviation = basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3])
+    deviation = basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3, 0.0, 0.0])
     scene = scene_maker(n_views=12, deviation=deviation)
     o = scene.observations(0.02, rng)
     start, usable = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), 12)

@@ -1,16 +1,31 @@
-"""What a board's declared sizes may be off by, in the covariance of the rig."""
+"""What a board's sizes may be off by, as declared or as its views tell, in the covariance of the rig."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board
 from calibration.camera import N_RIG
-from calibration.tolerances import BoardTolerances, with_tolerances
+from calibration.refinement import refine_stereo
+from calibration.rig_file import read_rig, write_rig
+from calibration.stereo_model import Terms
+from calibration.table_frame import rig_with_covariance
+from calibration.tolerances import (
+    BoardShape,
+    BoardTolerances,
+    as_made,
+    board_shape,
+    on_the_table,
+    with_tolerances,
+)
 from disctrack.render import rig_of
 from disctrack.scene.description import Scene
 
 BOARD = Board((9, 6), 8e-3)
 THICK = 3e-3
+AS_DRAWN = BoardShape(0.0, 0.0, 0.0, 0.0, 0.0, refined=False)
 POINTS = np.random.default_rng(5).uniform([0, 0, 0], [0.06, 0.04, 0.02], (20, 3))
 
 
@@ -18,9 +33,8 @@ def covariance_of(**only):
     """Rig, and what one tolerance adds to its covariance."""
     rig = rig_of(Scene())
     none = {"square": 0.0, "flatness": 0.0, "thickness": 0.0}
-    return rig, with_tolerances(
-        rig, BOARD.points, 0, THICK, BoardTolerances(**(none | only))
-    ).covariance - rig.covariance
+    board = BoardTolerances(**(none | only))
+    return rig, with_tolerances(rig, BOARD.points, 0, THICK, board, AS_DRAWN).covariance - rig.covariance
 
 
 def test_longer_squares_make_everything_longer():
@@ -32,9 +46,6 @@ def test_longer_squares_make_everything_longer():
     face = np.array([0.0, 0.0, THICK])
     seen = rig.perturbed(step).project((POINTS - face) * (1 + s) + face)
     assert_allclose(seen, rig.project(POINTS), atol=1e-7)
-    # a stretch along a side moves the middle of the board against its corner, the world's origin, by as much
-    world = rig.R_left_world.T @ (C - np.outer(step, step))[27:30, 27:30] @ rig.R_left_world
-    assert_allclose(np.sqrt(np.diag(world))[:2], s * BOARD.points.mean(0)[:2], rtol=1e-6)
 
 
 def test_a_thicker_board_lifts_the_table():
@@ -47,8 +58,61 @@ def test_a_thicker_board_lifts_the_table():
 
 
 def test_without_a_table_view_only_the_scale_is_uncertain():
-    rig = rig_of(Scene())
-    added = with_tolerances(rig, BOARD.points, None, THICK, BoardTolerances()).covariance - rig.covariance
+    rig, tolerances = rig_of(Scene()), BoardTolerances(square=2e-4)
+    added = with_tolerances(rig, BOARD.points, None, THICK, tolerances, AS_DRAWN).covariance - rig.covariance
     assert_allclose(np.delete(np.delete(added, np.s_[21:24], 0), np.s_[21:24], 1), 0.0, atol=0)
     assert added.shape == (N_RIG, N_RIG)
     assert_allclose(np.sqrt(2 * np.trace(added)), 2e-4 * rig.baseline)
+
+
+def found_shape(scene_maker, board, rng, stretch=0.0, bow=0.0, sigma=0.005):
+    """The board's shape from noisy corners, with a model of the board; stretch along i, middle higher by bow."""
+    d = BOARD.points - BOARD.points.mean(0)
+    deviation = np.zeros_like(d)
+    deviation[:, 0] = stretch * BOARD.points[:, 0]
+    deviation[:, 2] = bow * (1 - (d[:, 0] / (5 * BOARD.square)) ** 2)
+    scene = scene_maker(n_views=14, deviation=deviation)
+    refinement = refine_stereo(scene.observations(sigma, rng), scene.model, BOARD.points, Terms("k1 k2 p1 p2", board))
+    return scene, refinement, board_shape(refinement, BOARD.points, 1.0)
+
+
+@pytest.mark.parametrize("board", ["warped", "free"])
+def test_stretch_and_bow_are_seen_by_the_views(scene_maker, rng, board):
+    scene, refinement, shape = found_shape(scene_maker, board, rng, stretch=2e-4, bow=60e-6)
+    assert abs(shape.stretch - 2e-4) < 4 * shape.stretch_sigma < 1e-4
+    # the face as bent touches the table with its ends, one square beyond the corners
+    d = (BOARD.points - BOARD.points.mean(0))[:, 0] / (5 * BOARD.square)
+    assert abs(shape.lift - 60e-6 * np.mean(1 - d**2)) < 5 * shape.lift_sigma < 5e-6
+    # both sides are as likely to be off: half of the stretch is taken for each, so lengths are 0.01 % short
+    likeliest = as_made(refinement, BOARD.points, shape)
+    truth = np.linalg.norm(scene.model.t_right_left)
+    sigma = 4 * np.sqrt(rig_with_covariance(refinement, 0, THICK, 1.0).covariance[21, 21]) / truth
+    assert_allclose(np.linalg.norm(likeliest.model.t_right_left) / truth - 1, -1e-4, atol=sigma + 2e-5)
+    # and the world's origin lies below corner 0
+    corner = likeliest.model.points[0] - on_the_table(BOARD.points, shape)
+    assert_allclose(corner[:2], 0.0, atol=4 * (shape.stretch_sigma * 0.032 + 0.005 * 0.25e-3))
+    rig = rig_with_covariance(likeliest, 0, THICK, 1.0)
+    told = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(), shape).allowances
+    size = np.linalg.norm(told[0].shift[21:24]) / rig.baseline
+    assert_allclose(size, 1e-4, rtol=0.3)  # as large as the error is
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_board_that_looks_exact_is_taken_for_exact(scene_maker, seed, tmp_path):
+    _, refinement, shape = found_shape(scene_maker, "flat", np.random.default_rng(seed))
+    assert abs(shape.stretch) < 4 * shape.stretch_sigma < 5e-5
+    rig = rig_with_covariance(refinement, 0, THICK, 1.0)
+    told = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(), shape).allowances
+    assert np.linalg.norm(told[0].shift[21:24]) / rig.baseline < 3 * shape.stretch_sigma
+    assert next(a.cause for a in told if a.assumed) == "the board's thickness"
+    assert as_made(refinement, BOARD.points, shape) is refinement or not shape.refined
+    # what was declared counts as declared
+    declared = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(2e-4, 20e-6, 0.0), shape)
+    assert_allclose(np.linalg.norm(declared.allowances[0].shift[21:24]), 2e-4 / np.sqrt(2) * rig.baseline)
+    assert not any(a.assumed for a in declared.allowances)
+    write_rig(tmp_path / "rig.h5", declared)
+    read = read_rig(tmp_path / "rig.h5").allowances
+    assert [(a.cause, a.assumed) for a in read] == [(a.cause, a.assumed) for a in declared.allowances]
+    assert_allclose([a.shift for a in read], [a.shift for a in declared.allowances], rtol=0)
+    grown = replace(rig, covariance=declared.covariance - sum(np.outer(a.shift, a.shift) for a in declared.allowances))
+    assert_allclose(grown.covariance, rig.covariance, atol=1e-9)

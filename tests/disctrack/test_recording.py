@@ -191,7 +191,8 @@ def _read_or_refuse(folder: Path) -> None:
 def test_tolerances_and_source_of_the_table_may_be_declared(tmp_path):
     plain = read_recording(write(tmp_path, REFERENCE))
     assert plain.table.source == "both"
-    assert 0 < plain.disc.thickness_tolerance < 1e-5
+    assert plain.disc.thickness_tolerance is None  # not declared
+    assert plain.board_tolerances.square is None
     text = REFERENCE.replace("mass_g", "thickness_tolerance_mm = 0.02\nradius_tolerance_mm = 0\nmass_g", 1)
     text = text.replace("[table]", '[table]\nfrom = "disc"')
     read = read_recording(write(tmp_path, text))
