@@ -10,9 +10,9 @@ from calibration.arrays import Array
 from calibration.camera import N_INTRINSIC, StereoRig
 from calibration.causes import causes
 from calibration.errors import CalibrationError
-from calibration.model_choice import Candidate
+from calibration.model_choice import TermsTried
 from calibration.normal_equations import Problem, minimise
-from calibration.pairs import Motion
+from calibration.pairs import PairMotion
 from calibration.refinement import Refinement
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
@@ -50,7 +50,7 @@ class Assessment:
     length_sigma: tuple[float, float]  # relative, of a length or displacement: by the views; and with the board's size
     place_sigma: tuple[tuple[float, str], ...]  # of x, y, z of points [m], with the board's sizes; most of it from what
     pairs: int  # views that both cameras saw and the fit uses
-    motion: Motion | None  # of the board between the exposures of a pair
+    motion: PairMotion | None  # of the board between the exposures of a pair
     verdict: str
     warnings: tuple[str, ...]
 
@@ -207,13 +207,13 @@ def measurement_volume(refinement: Refinement, rig: StereoRig, table_view: int |
 
 def assess(
     refinement: Refinement,
-    candidates: tuple[Candidate, ...],
+    candidates: tuple[TermsTried, ...],
     rig: StereoRig,
     rig_with_board: StereoRig,
     table_view: int | None,
     inflation: float,
     halves: HalfSets | None,
-    motion: Motion | None,
+    motion: PairMotion | None,
 ) -> Assessment:
     """Collect the figures and judge them; the second rig has the tolerances of the board in its covariance."""
     kept = refinement.observations[refinement.kept]
@@ -266,7 +266,7 @@ def _warnings(
     n_views: int,
     inflation: float,
     halves: HalfSets | None,
-    chosen: Candidate | None,
+    chosen: TermsTried | None,
 ) -> tuple[str, ...]:
     found = []
     for name, value in zip(("left", "right"), share, strict=True):
@@ -331,8 +331,8 @@ def _verdict(
     lengths: tuple[float, float],
     pairs: int,
     halves: HalfSets | None,
-    motion: Motion | None,
-    chosen: Candidate | None,
+    motion: PairMotion | None,
+    chosen: TermsTried | None,
 ) -> str:
     """The worst of what the figures say, with the reason, then the figures."""
     rms = refinement.rms()

@@ -29,7 +29,7 @@ SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler
 
 
 @dataclass(frozen=True)
-class Candidate:
+class TermsTried:
     """One row of the cross-validation table."""
 
     terms: Terms
@@ -89,12 +89,12 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
     return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7).model
 
 
-def candidate(refinement: Refinement, sigma: float, good: Mask) -> Candidate:
+def candidate(refinement: Refinement, sigma: float, good: Mask) -> TermsTried:
     """The row of one fitted model; see `held_out`."""
     chi2, square, count, good_count = held_out(refinement, sigma, good)
     with np.errstate(invalid="ignore"):
         per_view = chi2 / np.where(count > 0, count, np.nan)
-    return Candidate(
+    return TermsTried(
         terms=refinement.terms,
         n_parameters=refinement.problem.stereo_basis.shape[1] + refinement.problem.shape_basis.shape[-1],
         rms_px=refinement.rms(),
@@ -105,7 +105,7 @@ def candidate(refinement: Refinement, sigma: float, good: Mask) -> Candidate:
     )
 
 
-def best(candidates: list[Candidate]) -> int:
+def best(candidates: list[TermsTried]) -> int:
     """Least held-out chi-square; a simpler model that is not clearly worse comes first."""
     winner = min(candidates, key=lambda c: c.held_out_chi_square)
     for i in sorted(range(len(candidates)), key=lambda i: candidates[i].n_parameters):
@@ -125,7 +125,7 @@ def choose_terms(
     boards: tuple[str, ...] = BOARD_MODELS,
     equal_aspect: bool = False,
     progress: Callable[[str], None] = lambda _: None,
-) -> tuple[Refinement, tuple[Candidate, ...]]:
+) -> tuple[Refinement, tuple[TermsTried, ...]]:
     """Choose distortion terms, then the board's shape, then the distortion again if the board is not flat.
 
     Returns the refinement of the chosen terms and the table of everything that was compared: up to three comparisons
@@ -136,7 +136,7 @@ def choose_terms(
     richest = max(distortions, key=lambda name: len(DISTORTION_MODELS[name]))
     board = boards[0]
     fits = {(richest, board): refine_stereo(observations, start, nominal, Terms(richest, board, equal_aspect))}
-    table: list[Candidate] = []
+    table: list[TermsTried] = []
 
     def compare(keys: list[tuple[str, str]], begin: Refinement) -> tuple[str, str]:
         for key in keys:

@@ -47,7 +47,7 @@ def readmitted(
 
 
 @dataclass(frozen=True)
-class Motion:
+class PairMotion:
     """How far the board moved between the two exposures of a pair: root median square over the pairs."""
 
     distance: float  # [m]
@@ -61,7 +61,7 @@ class Motion:
         return self.pixels > MOVED * max(self.scatter, self.at_rest)
 
 
-def motion_between_exposures(refinement: Refinement) -> Motion | None:
+def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
     """What the two images of each pair, each with a pose of its own, say of the board's motion between them.
 
     To first order at the common minimum; None with fewer than three pairs.
@@ -96,4 +96,4 @@ def motion_between_exposures(refinement: Refinement) -> Motion | None:
     freedom = max(freedom, 1)
     at_rest = float(np.sqrt(np.median(noise) * whitened / freedom))
     scatter = float(np.sqrt(2 * rest / freedom))
-    return Motion(float(np.median(distances)), float(np.median(shifts)), scatter, at_rest)
+    return PairMotion(float(np.median(distances)), float(np.median(shifts)), scatter, at_rest)

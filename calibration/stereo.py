@@ -23,7 +23,7 @@ from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
-from calibration.model_choice import Candidate, choose_terms
+from calibration.model_choice import TermsTried, choose_terms
 from calibration.pairs import motion_between_exposures, readmitted
 from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
@@ -69,7 +69,7 @@ class StereoCalibration(Brief):
     view_names: tuple[tuple[str, str], ...]  # (n_views,) left and right name
     corner_views: tuple[tuple[CornerView | BoardNotFound, ...], tuple[CornerView | BoardNotFound, ...]]
     rejected_views: dict[int, str]  # view -> reason
-    candidates: tuple[Candidate, ...]  # cross-validation table; the chosen terms are refinement.terms
+    candidates: tuple[TermsTried, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
     shape: BoardShape | None = None  # of the board against the declared one, as far as the views tell

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.brief import Brief
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.declaration import contradictions
-from disctrack.analyse.derivatives import GROUP_NAMES, Motion, differentiate
+from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
 from disctrack.analyse.energy import Energy, analyse_energy
 from disctrack.analyse.power_laws import (
     WINDOW,
@@ -21,7 +21,7 @@ from disctrack.analyse.power_laws import (
     fit_power_laws,
     power_law_end,
 )
-from disctrack.analyse.propagation import RATES, Series, propagate, rates
+from disctrack.analyse.propagation import RATES, DerivedSeries, propagate, rates
 from disctrack.errors import AnalysisError
 from disctrack.trajectory import Trajectory
 
@@ -45,8 +45,8 @@ class Analysis(Brief):
     """Everything that the analysis of one trajectory gives."""
 
     trajectory: Trajectory
-    motion: Motion
-    rates: tuple[Series, ...]
+    motion: MeasuredMotion
+    rates: tuple[DerivedSeries, ...]
     contact: Contact
     energy: Energy
     scaling: Scaling
@@ -64,7 +64,7 @@ class Analysis(Brief):
             told |= {"t_f": f"{laws.t_f:.4f} s", "n_theta": f"{laws.n_theta.value:.4f} ± {laws.n_theta.sigma:.4f}"}
         return told
 
-    def series(self, name: str) -> Series:
+    def series(self, name: str) -> DerivedSeries:
         """The derived quantity of this name."""
         for item in (*self.rates, *self.contact.series, *self.energy.series):
             if item.name == name:
@@ -127,7 +127,7 @@ def _tracked_part(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory, **per_frame)
 
 
-def _end_of_rolling(motion: Motion) -> tuple[float, float]:
+def _end_of_rolling(motion: MeasuredMotion) -> tuple[float, float]:
     """Instant [s] at which the precession is stopped (or the recording ends), and the sense of the precession."""
     psidot = propagate(motion, rates).value[:, 0]
     known = np.isfinite(psidot)
@@ -137,7 +137,7 @@ def _end_of_rolling(motion: Motion) -> tuple[float, float]:
     return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 
-def _warnings(trajectory: Trajectory, motion: Motion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
+def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
     """What an experimenter should know before using the numbers, in plain words."""
     found = [f"{finding.sentence}." for finding in contradictions(trajectory)]
     asked = trajectory.looked_for

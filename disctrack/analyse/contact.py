@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from disctrack.analyse.derivatives import Motion
-from disctrack.analyse.propagation import Propagated, Series, State, propagate
+from disctrack.analyse.derivatives import MeasuredMotion
+from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
 from disctrack.disc import Disc
 
 K = np.array([0.0, 0.0, 1.0])
@@ -71,18 +71,18 @@ class Circle:
     end: float  # [s]
 
 
-def r_OA(state: State, disc: Disc) -> Array:
+def r_OA(state: MotionState, disc: Disc) -> Array:
     """Arm (n, 3) from the centre to the contact, world axes [m]."""
     _, e2, e3 = state.axes()
     return -disc.radius * e2 - disc.half_thickness * e3
 
 
-def contact_velocity_material(state: State, disc: Disc) -> Array:
+def contact_velocity_material(state: MotionState, disc: Disc) -> Array:
     """Velocity (n, 3) of the disc's own point at the contact, world axes [m/s]: v_O + omega x r_OA, eq. (2.3)."""
     return state.velocity + np.cross(state.omega_world, r_OA(state, disc))
 
 
-def contact_velocity_locus(state: State, disc: Disc) -> Array:
+def contact_velocity_locus(state: MotionState, disc: Disc) -> Array:
     """Velocity (n, 3) of the moving point of touch, world axes [m/s]: v_O + Omega_R x r_OA.
 
     Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant.
@@ -94,12 +94,12 @@ def contact_velocity_locus(state: State, disc: Disc) -> Array:
     return state.velocity + np.cross(thetadot * e1 + psidot * K, r_OA(state, disc))
 
 
-def contact_force(state: State, disc: Disc, gravity: float) -> Array:
+def contact_force(state: MotionState, disc: Disc, gravity: float) -> Array:
     """Force (n, 3) of the table on the disc, world axes [N], from Newton's law with nothing else acting: eq. (2.6)."""
     return disc.mass * (state.acceleration + gravity * K)
 
 
-def contact_quantities(state: State, disc: Disc, gravity: float) -> Array:
+def contact_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
     """All of CONTACT, (n, 12)."""
     n0, _, _ = state.axes()
     m0 = np.cross(K, n0)
@@ -117,13 +117,13 @@ def contact_quantities(state: State, disc: Disc, gravity: float) -> Array:
 class Contact:
     """Contact of a recording."""
 
-    series: tuple[Series, ...]
+    series: tuple[DerivedSeries, ...]
     onset: RollingOnset
     circle: Circle
     propagated: Propagated
 
 
-def analyse_contact(motion: Motion, circle_duration: float = 0.6, until: float = np.inf) -> Contact:
+def analyse_contact(motion: MeasuredMotion, circle_duration: float = 0.6, until: float = np.inf) -> Contact:
     """Contact point, slip, locus, forces; onset of rolling; circle through the locus of the last `circle_duration`.
 
     until : end of the rolling motion [s]; a disc that is being stopped, or lies still, says nothing about rolling
@@ -138,7 +138,7 @@ def analyse_contact(motion: Motion, circle_duration: float = 0.6, until: float =
 
 
 def rolling_onset(
-    motion: Motion, found: Propagated, tolerance: float = SLIP_TOLERANCE, until: float = np.inf
+    motion: MeasuredMotion, found: Propagated, tolerance: float = SLIP_TOLERANCE, until: float = np.inf
 ) -> RollingOnset:
     """Change from slip to rolling: posterior over the first rolling frame, flat prior, slip of unknown size before it.
 
@@ -173,7 +173,7 @@ def _log_normal(v: Array, C: Array, extra: float) -> Array:
 
 
 def _describe_onset(
-    motion: Motion,
+    motion: MeasuredMotion,
     frames: NDArray[np.int64],
     v: Array,
     C: Array,
@@ -228,7 +228,7 @@ def _no_onset(reason: str) -> RollingOnset:
     return RollingOnset(nan, nan, nan, nan, nan, nan, nan, 0, f"not determined: {reason}")
 
 
-def locus_circle(motion: Motion, found: Propagated, duration: float, until: float = np.inf) -> Circle:
+def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, until: float = np.inf) -> Circle:
     """Circle through the contact points of the last `duration` seconds before `until`, least squares of distances.
 
     Its sigma comes from the scatter about the circle with as many independent points as half turns; radii of arcs

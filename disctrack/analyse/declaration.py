@@ -26,7 +26,7 @@ import numpy as np
 from calibration.arrays import Array
 from calibration.camera import StereoRig, triangulate
 from disctrack.analyse.contact import K
-from disctrack.analyse.derivatives import Motion, differentiate
+from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.propagation import state_of
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
@@ -228,7 +228,7 @@ def _stretches(trajectory: Trajectory) -> list[slice]:
     return [found[i] for i in chosen]
 
 
-def _blocks(motion: Motion, size: int) -> tuple[Array, Array]:
+def _blocks(motion: MeasuredMotion, size: int) -> tuple[Array, Array]:
     """Medians of gravity and energy over blocks of frames of one stretch, where the balance determines gravity."""
     disc, state = motion.disc, state_of(motion)
     m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial

@@ -55,7 +55,7 @@ KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: a
 
 
 @dataclass(frozen=True)
-class Motion:
+class MeasuredMotion:
     """Pose and its first two derivatives in every frame; NaN where the samples do not determine them."""
 
     time: Array  # (n,) [s]
@@ -104,7 +104,7 @@ class Motion:
         return self.position, self.R_world_body, self.velocity, self.omega_world, self.acceleration, self.alpha_world
 
 
-def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Motion:
+def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> MeasuredMotion:
     """Velocities and accelerations of a measured trajectory.
 
     breaks : instants [s] at which the acceleration jumps (slip ends, something is hit); before and after are
@@ -133,7 +133,7 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Motio
     covariance *= np.outer(scale, scale)
     sensitivity *= scale[:, None]
     _rates_of_turned_frame(sensitivity, state[:, 1, 3:], state[:, 2, 3:])
-    return Motion(
+    return MeasuredMotion(
         time=time,
         position=state[:, 0, :3],
         R_world_body=R,

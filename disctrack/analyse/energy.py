@@ -13,8 +13,8 @@ import numpy as np
 
 from calibration.arrays import Array
 from disctrack.analyse.contact import K
-from disctrack.analyse.derivatives import Motion
-from disctrack.analyse.propagation import Propagated, Series, State, propagate
+from disctrack.analyse.derivatives import MeasuredMotion
+from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
 from disctrack.disc import Disc
 from disctrack.errors import ModelError
 from disctrack.regular_precession import precession_rate
@@ -36,7 +36,7 @@ ENERGY = (
 class Energy:
     """Energy of a recording."""
 
-    series: tuple[Series, ...]
+    series: tuple[DerivedSeries, ...]
     propagated: Propagated
     loss: float  # [J] from the first to the last known frame, positive when lost
     loss_sigma: float  # [J] noise
@@ -46,7 +46,7 @@ class Energy:
     level_ratio_steady: float  # what steady precession of this disc with its centre at rest has at the median theta
 
 
-def energy_quantities(state: State, disc: Disc, gravity: float) -> Array:
+def energy_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
     """All of ENERGY, (n, 9)."""
     m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
     e1, e2, e3 = state.axes()
@@ -67,7 +67,7 @@ def energy_quantities(state: State, disc: Disc, gravity: float) -> Array:
     )
 
 
-def analyse_energy(motion: Motion) -> Energy:
+def analyse_energy(motion: MeasuredMotion) -> Energy:
     """Energies with both uncertainties, loss over the recording, and the adiabatic level."""
     found = propagate(motion, lambda state: energy_quantities(state, motion.disc, motion.gravity))
     loss, noise, common = _loss(found)
@@ -101,7 +101,7 @@ def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:
     )
 
 
-def _level_ratio(motion: Motion, level: Array) -> tuple[float, float]:
+def _level_ratio(motion: MeasuredMotion, level: Array) -> tuple[float, float]:
     """Mean of level / (4 g / r) weighted evenly over the turns of precession, and its scatter per turn."""
     known = np.flatnonzero(np.isfinite(level))
     if known.size < 2:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from calibration.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
-from disctrack.analyse.propagation import Series
+from disctrack.analyse.propagation import DerivedSeries
 from disctrack.disc import MA_2014
 from disctrack.pages.figures import Drawn, dress
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
@@ -52,7 +52,7 @@ def _axes(width: float = 7.2, height: float = 3.6) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _band(axes: Axes, time: Array, series: Series, scale: float, colour: str, label: str) -> None:
+def _band(axes: Axes, time: Array, series: DerivedSeries, scale: float, colour: str, label: str) -> None:
     """Line with its band of BAND sigmas, noise and calibration together."""
     sigma = np.hypot(series.sigma, series.sigma_calibration)
     low, high = series.value - BAND * sigma, series.value + BAND * sigma

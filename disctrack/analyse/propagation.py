@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from disctrack.analyse.derivatives import N_STATE, Motion
+from disctrack.analyse.derivatives import N_STATE, MeasuredMotion
 from disctrack.frames import nodal_axes_world, rotation_from_vector
 
 # Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
@@ -25,8 +25,8 @@ RESOLVED_TILT_SIGMAS = 5.0  # below this many sigmas of theta, the direction of 
 
 
 @dataclass(frozen=True)
-class State:
-    """Motion of the disc at n instants, world axes; see Motion."""
+class MotionState:
+    """Motion of the disc at n instants, world axes; see MeasuredMotion."""
 
     position: Array  # (n, 3)
     R_world_body: Array  # (n, 3, 3)
@@ -50,7 +50,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Series:
+class DerivedSeries:
     """One derived quantity over the recording."""
 
     name: str
@@ -70,7 +70,7 @@ class Propagated:
 
     value: Array  # (n, k)
     jacobian: Array  # (n, k, 18) d value / d STATE
-    motion: Motion
+    motion: MeasuredMotion
 
     @property
     def covariance(self) -> Array:
@@ -125,7 +125,7 @@ class Propagated:
 
         return _by_parts(some, frames)
 
-    def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[Series, ...]:
+    def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
         """The columns as Series; names are (name, unit, long_name)."""
         frames, all_columns = np.arange(len(self.value)), slice(None)
 
@@ -135,12 +135,12 @@ class Propagated:
 
         both = _by_parts(sigmas, frames)
         return tuple(
-            Series(name, unit, text, self.value[:, i], both[:, 0, i], both[:, 1, i])
+            DerivedSeries(name, unit, text, self.value[:, i], both[:, 0, i], both[:, 1, i])
             for i, (name, unit, text) in enumerate(names)
         )
 
 
-def shared_sigma(motion: Motion, jacobian: Array, frames: NDArray[np.int64] | None = None) -> Array:
+def shared_sigma(motion: MeasuredMotion, jacobian: Array, frames: NDArray[np.int64] | None = None) -> Array:
     """Standard deviations (f, k) of quantities of derivative (f, k, 18) by STATE, from all that does not average out.
 
     frames : (f,) that the derivatives belong to; all without
@@ -162,9 +162,9 @@ def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np
     return np.concatenate(parts)
 
 
-def state_of(motion: Motion) -> State:
+def state_of(motion: MeasuredMotion) -> MotionState:
     """The motion without its uncertainty."""
-    return State(
+    return MotionState(
         motion.position,
         motion.R_world_body,
         motion.velocity,
@@ -174,10 +174,10 @@ def state_of(motion: Motion) -> State:
     )
 
 
-def displaced(state: State, step: Array) -> State:
+def displaced(state: MotionState, step: Array) -> MotionState:
     """The state after a small change (18,) or (n, 18) in the order of derivatives.STATE."""
     d = np.broadcast_to(step, (len(state.position), N_STATE))
-    return State(
+    return MotionState(
         state.position + d[:, 0:3],
         rotation_from_vector(d[:, 3:6]) @ state.R_world_body,
         state.velocity + d[:, 6:9],
@@ -187,7 +187,7 @@ def displaced(state: State, step: Array) -> State:
     )
 
 
-def propagate(motion: Motion, function: Callable[[State], Array]) -> Propagated:
+def propagate(motion: MeasuredMotion, function: Callable[[MotionState], Array]) -> Propagated:
     """Values (n, k) of a function of the state, with noise and calibration carried through its derivative.
 
     NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
@@ -195,7 +195,7 @@ def propagate(motion: Motion, function: Callable[[State], Array]) -> Propagated:
     whole = state_of(motion)
 
     def some(rows: NDArray[np.int64]) -> Array:
-        state = State(*(part[rows] for part in vars(whole).values()))
+        state = MotionState(*(part[rows] for part in vars(whole).values()))
         jacobian = np.stack(
             [(function(displaced(state, e)) - function(displaced(state, -e))) / (2 * e.sum()) for e in np.diag(STEPS)],
             axis=-1,
@@ -221,7 +221,7 @@ RATES = (
 )
 
 
-def rates(state: State) -> Array:
+def rates(state: MotionState) -> Array:
     """Euler rates and components of the angular velocity, (n, 7) in the order of RATES, from omega itself."""
     e1, e2, e3 = state.axes()
     omega_1, omega_2, omega_3 = (np.sum(state.omega_world * e, axis=1) for e in (e1, e2, e3))

@@ -10,7 +10,7 @@ import numpy as np
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.figures import all_figures
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
-from disctrack.analyse.propagation import Series
+from disctrack.analyse.propagation import DerivedSeries
 from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import write_whole
 from disctrack.pages.figures import Drawn, draw, gallery
@@ -145,7 +145,7 @@ def _on_page(unit: str) -> tuple[str, float]:
     return _UNITS.get(unit, (unit, 1.0))
 
 
-def _measured(series: Series, frame: int) -> str:
+def _measured(series: DerivedSeries, frame: int) -> str:
     """Value with two digits of its noise, then the noise and the calibration's part."""
     factor = _on_page(series.unit)[1]
     value, sigma, common = (factor * float(a[frame]) for a in (series.value, series.sigma, series.sigma_calibration))

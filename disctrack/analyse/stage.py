@@ -14,7 +14,7 @@ from disctrack.analyse.power_laws import (
     WINDOW,
     Exponent,
 )
-from disctrack.analyse.propagation import Series, shared_sigma
+from disctrack.analyse.propagation import DerivedSeries, shared_sigma
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
@@ -153,7 +153,7 @@ def _at_full_length(item: Variable, n: int, first: int) -> Variable:
     return replace(item, data=out)
 
 
-def _series_variables(series: tuple[Series, ...]) -> dict[str, Variable]:
+def _series_variables(series: tuple[DerivedSeries, ...]) -> dict[str, Variable]:
     variables = {}
     for s in series:
         variables[s.name] = Variable(s.value, ("time",), s.unit, s.long_name)
@@ -185,7 +185,7 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
     common = shared_sigma(motion, np.broadcast_to(np.eye(len(STATE)), motion.covariance.shape))
     for name, values, unit, text, first in vectors:
         for i, axis in enumerate("xyz"):
-            item = Series(
+            item = DerivedSeries(
                 f"{name}_{axis}", unit, f"{text}, {axis}", values[:, i], sigma[:, first + i], common[:, first + i]
             )
             variables |= _series_variables((item,))
@@ -196,7 +196,7 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
     shared = shared_sigma(motion, by_state)
     for i, name in enumerate(("psi", "theta", "phi")):
         noise = np.sqrt(np.maximum(angle_variance[:, i], 0.0))
-        item = Series(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared[:, i])
+        item = DerivedSeries(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared[:, i])
         variables |= _series_variables((item,))
     return variables | {
         "covariance": Variable(

@@ -15,7 +15,7 @@ RESULTS = "results"  # beside a recording's images
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundRecordings:
     """Recordings below some folders."""
 
     base: Path  # the deepest folder that holds all folders searched
@@ -28,7 +28,7 @@ class Found:
         return recording.name if relative == "." and len(self.recordings) == 1 else relative
 
 
-def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> Found:
+def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> FoundRecordings:
     """Folders at and below `folders` that hold a recording.toml; links are followed, each folder is looked at once.
 
     leave_out : folders that are not searched (those that results go to); a recording's own `results` never is
@@ -49,7 +49,7 @@ def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> 
         )
     base = Path(os.path.commonpath(roots))
     order = sorted(found, key=lambda place: [natural_key(part) for part in place.parts])
-    return Found(base, tuple(order), tuple(problems))
+    return FoundRecordings(base, tuple(order), tuple(problems))
 
 
 def _search(folder: Path, seen: set[Path], problems: list[str]) -> Iterator[Path]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration import CalibrationSettings
-from disctrack.batch.find import RESULTS, Found
+from disctrack.batch.find import RESULTS, FoundRecordings
 from disctrack.batch.reasons import reason_of
 from disctrack.calibrate.stage import source_of
 from disctrack.recording.declaration import Recording, read_recording
@@ -87,7 +87,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BatchPlan:
     """Jobs of a batch, and the recordings that fail before they begin."""
 
     rigs: tuple[Job, ...]
@@ -99,7 +99,7 @@ class Plan:
 class Places:
     """Where results go."""
 
-    found: Found
+    found: FoundRecordings
     output: Path | None  # None: beside each recording
 
     @property
@@ -112,7 +112,7 @@ class Places:
         return recording / RESULTS if self.output is None else self.output / self.found.name(recording)
 
 
-def make_plan(places: Places, recordings: Sequence[Path], options: BatchOptions) -> Plan:
+def make_plan(places: Places, recordings: Sequence[Path], options: BatchOptions) -> BatchPlan:
     """Read every recording.toml, count the images, and find who shares a rig by the content of the views."""
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
@@ -124,7 +124,7 @@ def make_plan(places: Places, recordings: Sequence[Path], options: BatchOptions)
         except Exception as error:  # whatever is wrong with one recording, the others are measured
             failures[name] = reason_of(error)
     needed = {job.rig for job in jobs}
-    return Plan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures)
+    return BatchPlan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures)
 
 
 def _job(places: Places, folder: Path, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:

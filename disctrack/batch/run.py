@@ -12,7 +12,7 @@ from tqdm import tqdm
 from disctrack.batch.cluster import connect, run_on_cluster
 from disctrack.batch.find import find_recordings
 from disctrack.batch.jobs import JobQueue
-from disctrack.batch.plan import BatchOptions, Job, Places, Plan, Shard, make_plan, with_threads
+from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
 from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
 from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
@@ -103,7 +103,7 @@ def _places(folders: Sequence[Path], output: Path | None) -> Places:
     return Places(found, output)
 
 
-def _do(plan: Plan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> str:
+def _do(plan: BatchPlan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> str:
     """Fill `results` with what becomes of the plan's recordings; returns why some have none."""
     recordings = with_threads(plan.recordings, cores, n) if n is not None else plan.recordings
     with _Bar(plan, len(results)) as bar:
@@ -156,7 +156,7 @@ def _summed_up(
 class _Bar:
     """One bar for the whole batch, on stderr, where that is a terminal. What was skipped does not spoil the rate."""
 
-    def __init__(self, plan: Plan, n_failed: int) -> None:
+    def __init__(self, plan: BatchPlan, n_failed: int) -> None:
         self._jobs = (*plan.rigs, *plan.recordings)
         self._share: dict[tuple[str, str], float] = {}
         self._n, self._n_failed, self._finished = len(plan.recordings) + n_failed, n_failed, n_failed

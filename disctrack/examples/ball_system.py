@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.arrays import Array, Mask
-from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, SmoothNoise, estimate
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 
@@ -275,13 +275,13 @@ def height_noise(drops: Sequence[Drop]) -> SmoothNoise:
     return estimate([_shared_acceleration(group) for group in takes.values()], SmoothNoise(0.05, 0.15, 0.5))
 
 
-def _shared_acceleration(drops: Sequence[Drop]) -> Stretch:
+def _shared_acceleration(drops: Sequence[Drop]) -> SampleStretch:
     time = np.concatenate([d.time - d.time[0] for d in drops])
     part = np.concatenate([np.full(len(d.time), i) for i, d in enumerate(drops)])
     own = (part[:, None] == np.arange(len(drops))).astype(float)
     u = time[:, None] / time.max()
     basis = np.concatenate([own, own * u, *(u**k for k in range(2, ACCELERATION_DEGREE + 3))], axis=1)
-    return Stretch(time, np.concatenate([d.height for d in drops])[:, None], basis, part)
+    return SampleStretch(time, np.concatenate([d.height for d in drops])[:, None], basis, part)
 
 
 def candidates(balls: Sequence[Ball]) -> tuple[Candidate, ...]:

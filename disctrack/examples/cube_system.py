@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.arrays import Array, Mask
-from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, SmoothNoise, estimate
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies
@@ -193,14 +193,16 @@ def _measured_noise(rows: Sequence[_Rows]) -> dict[str, SmoothNoise]:
     return noise
 
 
-def _by_length(rows: Sequence[_Rows], left: Sequence[Array], channels: Sequence[int]) -> list[Stretch]:
+def _by_length(rows: Sequence[_Rows], left: Sequence[Array], channels: Sequence[int]) -> list[SampleStretch]:
     """Flights of one length share instants, so that their samples stand side by side."""
     found: dict[int, list[Array]] = {}
     lines: dict[int, _Rows] = {}
     for r, x in zip(rows, left, strict=True):
         found.setdefault(len(x), []).append(x[:, list(channels)])
         lines[len(x)] = r
-    return [Stretch(lines[n].flight.time, np.concatenate(v, axis=1), _line(lines[n].flight)) for n, v in found.items()]
+    return [
+        SampleStretch(lines[n].flight.time, np.concatenate(v, axis=1), _line(lines[n].flight)) for n, v in found.items()
+    ]
 
 
 def white_chi_square(system: CubeTosses, values: Values) -> dict[str, float]:

@@ -171,7 +171,7 @@ def read_group(
 
 
 @dataclass(frozen=True)
-class Setup:
+class FilmedSetup:
     """What was filmed, by which cameras and when, without the measurement itself."""
 
     time: Array  # (n,) [s]
@@ -181,10 +181,10 @@ class Setup:
     fingerprint: str  # of the trajectory: equal for equal inputs, settings and version
 
 
-def read_setup(path: Path) -> Setup:
+def read_setup(path: Path) -> FilmedSetup:
     """Time, disc and rig of a trajectory file. Raises TrajectoryFileError."""
     with _Reading(path) as file:
-        return Setup(
+        return FilmedSetup(
             time=read_variables(file, names=("time",))["time"],
             disc=_read_disc(file["disc"]),
             rig=_rig(

@@ -28,7 +28,7 @@ from disctrack.recording.declaration import ChessboardViews, Recording, read_rec
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
-from disctrack.track.tracking import PairBlock, Tracking, TrackingSettings, track
+from disctrack.track.tracking import BlockOfPairs, Tracking, TrackingSettings, track
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
@@ -258,7 +258,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:
     """Track a stretch; slip: frames by which the right camera's are taken later than the left one's."""
 
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+    def read_blocks(start: int, stop: int) -> Iterator[BlockOfPairs]:
         if slip == 0:
             yield from iter_pair_blocks(pairs.left, pairs.right, start, stop)
             return

@@ -35,7 +35,7 @@ OPTIONS = ("frame_rate_hz", "square_mm", "board_thickness_mm", "radius_mm", "thi
 
 
 @dataclass(frozen=True)
-class Found:
+class FolderContent:
     """What the files of a folder tell."""
 
     folder: Path
@@ -52,15 +52,15 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Declared:
+class WrittenDeclaration:
     """What `run_init` wrote."""
 
     file: Path
-    found: Found
+    found: FolderContent
     missing: tuple[str, ...]  # keys that the user has to fill in
 
 
-def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None) -> Declared:
+def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None) -> WrittenDeclaration:
     """Write recording.toml into a folder of frames.
 
     known : values of `OPTIONS` that the user gave; like : another recording.toml, or its folder, of the same disc,
@@ -75,10 +75,10 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     found = look_into(folder)
     text, missing = declaration(found, known or {}, example)
     write_whole(file, text.encode())
-    return Declared(file, found, missing)
+    return WrittenDeclaration(file, found, missing)
 
 
-def look_into(folder: Path) -> Found:
+def look_into(folder: Path) -> FolderContent:
     """What the frames of a folder tell. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
     pairs = pair_cameras(sequences)
@@ -107,7 +107,7 @@ def look_into(folder: Path) -> Found:
         notes.append(f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left")
     rig_file = None if views is not None else _rig_beside(folder)
     width, height = left.image_size
-    return Found(
+    return FolderContent(
         folder,
         frames,
         f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit",
@@ -211,7 +211,9 @@ def _example(like: Path) -> Mapping[str, Any]:
         raise RecordingError(f"{file}: cannot be taken as an example: {error}.") from error
 
 
-def declaration(found: Found, known: Mapping[str, float], example: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+def declaration(
+    found: FolderContent, known: Mapping[str, float], example: Mapping[str, Any]
+) -> tuple[str, tuple[str, ...]]:
     """Text of the recording.toml, and the keys that nobody told."""
     missing: list[str] = []
 
@@ -255,7 +257,7 @@ def declaration(found: Found, known: Mapping[str, float], example: Mapping[str, 
     return "\n".join(lines) + "\n", tuple(missing)
 
 
-def _calibration_lines(found: Found, line: Any, example: Mapping[str, Any]) -> list[str]:
+def _calibration_lines(found: FolderContent, line: Any, example: Mapping[str, Any]) -> list[str]:
     if found.views is None and found.rig_file is not None:
         return ["[calibration]", _aligned(f"rig = {_toml(found.rig_file)}", "a rig that was calibrated before"), ""]
     left, right = (None, None) if found.views is None else (found.views.left.pattern, found.views.right.pattern)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calibration.arrays import Array, Mask
-from disctrack.repeats.runs import INDEX, NUTATION_PER_PRECESSION, Run
+from disctrack.repeats.runs import INDEX, NUTATION_PER_PRECESSION, AnalysedRun
 
 MATCHED = tuple(INDEX[name] for name in ("theta", "psidot", "energy"))
 MIN_OVERLAP = 0.5  # of the shorter run: less could be matched by chance
@@ -43,7 +43,7 @@ class Alignment:
 class Curves:
     """The quantities of one run as functions of its own time."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: AnalysedRun) -> None:
         good = run.known()
         self.start, self.end = float(run.time[good][0]), float(run.time[good][-1])
         self.interval = float(np.median(np.diff(run.time)))
@@ -69,7 +69,7 @@ class Curves:
         return out
 
 
-def align(runs: Sequence[Run], curves: Sequence[Curves]) -> Alignment:
+def align(runs: Sequence[AnalysedRun], curves: Sequence[Curves]) -> Alignment:
     """Put runs on one clock; time zero is the collapse if any run knows it, else the mean of the runs' own zeros."""
     n = len(runs)
     t_f = [run.fitted["t_f"] for run in runs]
@@ -108,7 +108,9 @@ def _mean(curves: Sequence[Curves], shift: Array, time: Array) -> tuple[Array, A
     return mean, np.where(count > 0, variance, np.nan)
 
 
-def _match(mine: Curves, others: Sequence[Curves], shift: Array, run: Run, near: float | None) -> tuple[float, float]:
+def _match(
+    mine: Curves, others: Sequence[Curves], shift: Array, run: AnalysedRun, near: float | None
+) -> tuple[float, float]:
     """Shift [s] of a run against the mean of others, and its sigma."""
     interval = min(c.interval for c in (mine, *others))
     begin = min(c.start - s for c, s in zip(others, shift, strict=True))
@@ -162,7 +164,7 @@ def _residual(mine: Curves, time: Array, mean: Array, variance: Array, shift: fl
     return residual, slope, 1.0 / (noise + apart)
 
 
-def _shift_sigma(score: Array, information: Array, run: Run, own_time: Array) -> float:
+def _shift_sigma(score: Array, information: Array, run: AnalysedRun, own_time: Array) -> float:
     """Sigma of the shift from the scatter of the score over stretches of at least a nutation period."""
     there = np.isfinite(score).all(axis=1)
     score, information = score[there].sum(axis=1), information[there].sum(axis=1)

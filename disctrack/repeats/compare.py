@@ -11,7 +11,7 @@ import numpy as np
 from disctrack.errors import DiscTrackError
 from disctrack.repeats.alignment import Alignment, Curves, align
 from disctrack.repeats.averages import Average, average
-from disctrack.repeats.runs import FITTED, INDEX, Run, read_run
+from disctrack.repeats.runs import FITTED, INDEX, AnalysedRun, read_run
 from disctrack.repeats.spread import Spread, spread
 
 SAME_SIZE = 1e-6  # relative: discs are declared, not measured
@@ -33,7 +33,7 @@ class RepeatGroup:
     """Runs of one disc on one surface, from one start, filmed by one rig."""
 
     name: str
-    runs: tuple[Run, ...]
+    runs: tuple[AnalysedRun, ...]
     alignment: Alignment
     spread: Spread | None  # None for a single run
     averages: dict[str, Average]  # of FITTED
@@ -45,7 +45,7 @@ class ExponentTable:
     """All runs of one disc on one surface, in the form of the paper's tables 2 and 3."""
 
     title: str
-    rows: tuple[tuple[str, int, Run], ...]  # group, trial in it, run
+    rows: tuple[tuple[str, int, AnalysedRun], ...]  # group, trial in it, run
     averages: dict[str, Average]
 
 
@@ -66,8 +66,8 @@ def compare(paths: Iterable[Path]) -> Comparison:
     return Comparison(tuple(groups), tuple(_tables(groups)), tuple(left_out))
 
 
-def _read(paths: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
-    runs: list[Run] = []
+def _read(paths: Sequence[Path]) -> tuple[list[AnalysedRun], list[LeftOut]]:
+    runs: list[AnalysedRun] = []
     left_out: list[LeftOut] = []
     for path in paths:
         try:
@@ -85,9 +85,9 @@ def _read(paths: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
     return runs, left_out
 
 
-def _alike(runs: Sequence[Run], same: Callable[[Run, Run], bool]) -> list[list[Run]]:
+def _alike(runs: Sequence[AnalysedRun], same: Callable[[AnalysedRun, AnalysedRun], bool]) -> list[list[AnalysedRun]]:
     """Runs that are linked by a chain of likeness, in the order given."""
-    groups: list[list[Run]] = []
+    groups: list[list[AnalysedRun]] = []
     for run in runs:
         linked = [group for group in groups if any(same(run, other) for other in group)]
         merged = [member for group in linked for member in group] + [run]
@@ -96,16 +96,16 @@ def _alike(runs: Sequence[Run], same: Callable[[Run, Run], bool]) -> list[list[R
     return sorted((sorted(group, key=lambda r: order[id(r)]) for group in groups), key=lambda g: order[id(g[0])])
 
 
-def _same_disc_and_surface(a: Run, b: Run) -> bool:
+def _same_disc_and_surface(a: AnalysedRun, b: AnalysedRun) -> bool:
     mine, other = ((run.disc.radius, run.disc.half_thickness, run.disc.mass) for run in (a, b))
     return a.surface == b.surface and bool(np.allclose(mine, other, rtol=SAME_SIZE, atol=0))
 
 
-def _same_experiment(a: Run, b: Run) -> bool:
+def _same_experiment(a: AnalysedRun, b: AnalysedRun) -> bool:
     return _same_disc_and_surface(a, b) and _same_rig(a, b) and _same_start(a, b)
 
 
-def _same_rig(a: Run, b: Run) -> bool:
+def _same_rig(a: AnalysedRun, b: AnalysedRun) -> bool:
     """Every camera stands where it stood, to what two calibrations tell."""
     for (R, t), (S, u) in zip(a.rig.camera_poses(), b.rig.camera_poses(), strict=True):
         turn = np.arccos(np.clip((np.trace(R @ S.T) - 1) / 2, -1, 1))
@@ -114,7 +114,7 @@ def _same_rig(a: Run, b: Run) -> bool:
     return True
 
 
-def _same_start(a: Run, b: Run) -> bool:
+def _same_start(a: AnalysedRun, b: AnalysedRun) -> bool:
     """By the declared case; without one, the same sense of precession and largely the same energies."""
     if a.case or b.case:
         return a.case == b.case
@@ -131,7 +131,7 @@ def _same_start(a: Run, b: Run) -> bool:
     return bool(senses[0] == senses[1] and high - low >= SAME_START * min(np.ptp(r) for r in ranges))
 
 
-def _group(name: str, runs: list[Run]) -> RepeatGroup:
+def _group(name: str, runs: list[AnalysedRun]) -> RepeatGroup:
     curves = [Curves(run) for run in runs]
     alignment = align(runs, curves)
     found = spread(curves, alignment) if len(runs) > 1 else None
@@ -153,7 +153,7 @@ def _named(group: RepeatGroup, groups: Sequence[RepeatGroup]) -> RepeatGroup:
     return RepeatGroup(name, group.runs, group.alignment, group.spread, group.averages, group.remarks)
 
 
-def _remarks(runs: Sequence[Run], found: Spread | None, averages: dict[str, Average]) -> list[str]:
+def _remarks(runs: Sequence[AnalysedRun], found: Spread | None, averages: dict[str, Average]) -> list[str]:
     remarks = []
     for i, run in enumerate(runs):
         reasons = [f"{item} = {run.fitted[item].value:.4g}" for item, a in averages.items() if i in a.outliers]

@@ -16,7 +16,7 @@ from disctrack.pages.figures import Drawn, dress
 from disctrack.pages.palette import AMBER, BLUE, INK, MUTED, SERIES
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import ExponentTable, RepeatGroup
-from disctrack.repeats.runs import INDEX, QUANTITIES, Run
+from disctrack.repeats.runs import INDEX, QUANTITIES, AnalysedRun
 from disctrack.repeats.spread import Spread
 
 MOST_NAMED = 8  # runs in a legend
@@ -45,7 +45,7 @@ def _colour(i: int) -> str:
     return SERIES[i % len(SERIES)]
 
 
-def _lines(axes: Axes, time: Array, values: Array, runs: Sequence[Run], width: float = 0.9) -> None:
+def _lines(axes: Axes, time: Array, values: Array, runs: Sequence[AnalysedRun], width: float = 0.9) -> None:
     for i, (value, run) in enumerate(zip(values, runs, strict=True)):
         axes.plot(time, value, color=_colour(i), linewidth=width, label=run.name if i < MOST_NAMED else None)
 

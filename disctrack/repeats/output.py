@@ -18,7 +18,7 @@ from disctrack.pages.html import bullets, page, paragraph, section, table, warni
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import Comparison, ExponentTable, RepeatGroup
 from disctrack.repeats.figures import FITTED_SCALES, fitted_figure, group_figures, slug, with_sigma
-from disctrack.repeats.runs import FITTED, INDEX, QUANTITIES, Measured, Run
+from disctrack.repeats.runs import FITTED, INDEX, QUANTITIES, AnalysedRun, FittedNumber
 from disctrack.repeats.spread import Spread
 
 MOST_ROWS = 2000  # of a table of spread: a person plots it, the figures have every frame
@@ -105,7 +105,7 @@ def _k_m_words(sources: Sequence[str]) -> str:
     )
 
 
-def _cell(name: str, item: Measured) -> str:
+def _cell(name: str, item: FittedNumber) -> str:
     return _two(name, item.value, item.sigma)
 
 
@@ -184,7 +184,7 @@ def as_json(comparison: Comparison) -> dict[str, Any]:
     )
 
 
-def _run_json(run: Run) -> dict[str, Any]:
+def _run_json(run: AnalysedRun) -> dict[str, Any]:
     fitted = {name: asdict(item) for name, item in run.fitted.items()}
     return {"path": str(run.path), "name": run.name, "case": run.case, "surface": run.surface, "fitted": fitted,
             "k_m_source": run.k_m_source}  # fmt: skip

@@ -22,7 +22,7 @@ MIN_FRAMES = 12
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ComparedCoordinate:
     """One coordinate that repeats are compared in."""
 
     name: str
@@ -35,21 +35,21 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity("x", "motion", "position_x", "x", "mm", 1e3, True),
-    Quantity("y", "motion", "position_y", "y", "mm", 1e3, True),
-    Quantity("z", "motion", "position_z", "z", "mm", 1e3, False),
-    Quantity("psi", "motion", "psi", "ψ", "deg", 180 / np.pi, True),
-    Quantity("theta", "motion", "theta", "θ", "deg", 180 / np.pi, False),
-    Quantity("phi", "motion", "phi", "φ", "deg", 180 / np.pi, True),
-    Quantity("psidot", "motion", "psidot", "dψ/dt", "rad/s", 1.0, False),
-    Quantity("energy", "energy", "total", "E", "mJ", 1e3, False),
+    ComparedCoordinate("x", "motion", "position_x", "x", "mm", 1e3, True),
+    ComparedCoordinate("y", "motion", "position_y", "y", "mm", 1e3, True),
+    ComparedCoordinate("z", "motion", "position_z", "z", "mm", 1e3, False),
+    ComparedCoordinate("psi", "motion", "psi", "ψ", "deg", 180 / np.pi, True),
+    ComparedCoordinate("theta", "motion", "theta", "θ", "deg", 180 / np.pi, False),
+    ComparedCoordinate("phi", "motion", "phi", "φ", "deg", 180 / np.pi, True),
+    ComparedCoordinate("psidot", "motion", "psidot", "dψ/dt", "rad/s", 1.0, False),
+    ComparedCoordinate("energy", "energy", "total", "E", "mJ", 1e3, False),
 )
 INDEX = {quantity.name: i for i, quantity in enumerate(QUANTITIES)}
 FITTED = ("n_energy", "n_theta", "n_psidot", "t_f", "k_m")
 
 
 @dataclass(frozen=True)
-class Measured:
+class FittedNumber:
     """A fitted number of one run; NaN where the run does not determine it."""
 
     value: float
@@ -62,11 +62,11 @@ class Measured:
         return bool(np.isfinite(self.value) and np.isfinite(self.sigma) and self.sigma > 0)
 
 
-UNKNOWN = Measured(float("nan"), float("nan"))
+UNKNOWN = FittedNumber(float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
-class Run:
+class AnalysedRun:
     """One analysed recording, as far as it rolls (the brake at the very end is left out)."""
 
     path: Path
@@ -78,7 +78,7 @@ class Run:
     time: Array  # (n,) [s]
     value: Array  # (n, 8) in the order of QUANTITIES, SI; NaN where unknown
     sigma: Array  # (n, 8) noise alone
-    fitted: dict[str, Measured]  # FITTED -> value
+    fitted: dict[str, FittedNumber]  # FITTED -> value
     k_m_source: str  # "diagnosis" or "energy"
     fingerprint: str  # of what the trajectory was made from
     notes: tuple[str, ...]  # why a fitted number is missing
@@ -88,7 +88,7 @@ class Run:
         return np.asarray(np.isfinite(self.value).all(axis=1))
 
 
-def read_run(path: Path, k_m_from_energy: bool = False) -> Run:
+def read_run(path: Path, k_m_from_energy: bool = False) -> AnalysedRun:
     """An analysed trajectory file as a Run.
 
     k_m_from_energy : do not take k_m from the diagnosis even where there is one
@@ -121,7 +121,7 @@ def read_run(path: Path, k_m_from_energy: bool = False) -> Run:
     if not k_m_from_energy and (diagnosed := _diagnosed_k_m(path)) is not None:
         k_m, source = diagnosed, "diagnosis"
     declared = provenance.settings.get("recording", {})
-    return Run(
+    return AnalysedRun(
         path=path,
         name=provenance.recording,
         case=str(declared.get("case", "")),
@@ -151,20 +151,20 @@ def _number(attributes: dict[str, Any], name: str) -> float:
     return float(attributes.get(name, np.nan))
 
 
-def _power_laws(scaling: dict[str, Any]) -> tuple[dict[str, Measured], tuple[str, ...], float]:
+def _power_laws(scaling: dict[str, Any]) -> tuple[dict[str, FittedNumber], tuple[str, ...], float]:
     """Exponents and t_f, why they are missing, and the instant [s] up to which the law was seen to hold."""
     reason = str(scaling.get("reason_undetermined", "the file does not say why"))
     exponents = {
-        name: Measured(_number(scaling, name), _number(scaling, f"{name}_sigma"))
+        name: FittedNumber(_number(scaling, name), _number(scaling, f"{name}_sigma"))
         for name in ("n_energy", "n_theta", "n_psidot")
     }
-    t_f = Measured(_number(scaling, "t_f_s"), _number(scaling, "t_f_sigma_s"))
+    t_f = FittedNumber(_number(scaling, "t_f_s"), _number(scaling, "t_f_sigma_s"))
     if reason or not t_f.known:
         return dict.fromkeys((*exponents, "t_f"), UNKNOWN), (f"exponents and t_f: {reason}",), np.inf
     return {**exponents, "t_f": t_f}, (), t_f.value - float(np.asarray(scaling["window_s"])[1]) + 1e-9
 
 
-def _diagnosed_k_m(path: Path) -> Measured | None:
+def _diagnosed_k_m(path: Path) -> FittedNumber | None:
     """k_m of the model that `disctrack diagnose` ended with, where that was run."""
     from disctrack.errors import TrajectoryFileError
 
@@ -175,13 +175,13 @@ def _diagnosed_k_m(path: Path) -> Measured | None:
         return None
     for name, item in parameters.items():
         if name.rpartition(".")[2] == "k_m" and item["value"] is not None and item["sigma"] is not None:
-            return Measured(float(item["value"]), float(item["sigma"]))
+            return FittedNumber(float(item["value"]), float(item["sigma"]))
     return None
 
 
 def k_m_of_energy(
     time: Array, value: Array, phidot: Array, force_z: Array, relative_calibration: float = 0.0
-) -> Measured:
+) -> FittedNumber:
     """Coefficient of M_m = -k_m F_z psidot |psidot| [m s^2], eq. (5.4), that accounts for the whole loss of energy.
 
     The moment's power is -M_m phidot sin theta (along m0 the disc turns at -phidot sin theta), so that E falls along
@@ -201,7 +201,7 @@ def k_m_of_energy(
     if len(np.unique(period)) < MIN_PERIODS:
         return UNKNOWN
     slope, sigma = slope_by_jackknife(work, energy[good], period)
-    return Measured(slope, sigma, abs(slope) * relative_calibration)
+    return FittedNumber(slope, sigma, abs(slope) * relative_calibration)
 
 
 def slope_by_jackknife(x: Array, y: Array, cluster: NDArray[np.int64]) -> tuple[float, float]:

@@ -7,7 +7,7 @@ elsewhere, `run` writes a scene's motion to a file.
 
 from disctrack.regular_precession import nutation_frequency, precession_rate
 from disctrack.rolling import effects
-from disctrack.rolling.effects import CATALOGUE, Effect, ModelError, Parameter
+from disctrack.rolling.effects import CATALOGUE, Effect, EffectParameter, ModelError
 from disctrack.rolling.impact import struck_disc
 from disctrack.rolling.model import DEFAULT_THETA_END, Model, effects_from_tables
 from disctrack.rolling.motion import EndReason, Motion, Regime, Switch
@@ -20,11 +20,11 @@ __all__ = [
     "CATALOGUE",
     "DEFAULT_THETA_END",
     "Effect",
+    "EffectParameter",
     "EndReason",
     "Model",
     "ModelError",
     "Motion",
-    "Parameter",
     "Regime",
     "Sensitivities",
     "State",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from disctrack.rolling import equations
 from disctrack.rolling._compiled import compile_law, compile_system
 from disctrack.rolling.effects.base import HELPERS
-from disctrack.rolling.integrate import System
+from disctrack.rolling.integrate import CompiledSystem
 from disctrack.rolling.model import Model, body_constants, effect_values
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
 
@@ -49,10 +49,12 @@ class Assembly:
         header = [regime, len(calls), self.kinematics.ctypes.data, self.wrench.ctypes.data]
         return np.array(header + [address for call in calls for address in call], np.int64)
 
-    def system(self, regime: int) -> System:
+    def system(self, regime: int) -> CompiledSystem:
         """Rates and margins in this regime."""
         pointers = [a.ctypes.data for a in (self._tables[regime], self.body, self.kinematics, self.wrench)]
-        return System(self._rates.address, self._margins.address, equations.N_EVENTS, np.array(pointers, np.int64))
+        return CompiledSystem(
+            self._rates.address, self._margins.address, equations.N_EVENTS, np.array(pointers, np.int64)
+        )
 
     def constant(self, name: str) -> Any:
         """One of records.BODY."""

@@ -31,7 +31,7 @@ _TABLEAU = tuple(np.ascontiguousarray(a) for a in (_A_ALL, DOP853.B, _C_ALL, DOP
 
 
 @dataclass(frozen=True)
-class System:
+class CompiledSystem:
     """Addresses of the rates and of the event margins, and the four addresses that both are called with."""
 
     rates: int
@@ -41,7 +41,7 @@ class System:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SolvedStretch:
     """Solution up to the end of the grid or to the first event; real or complex like its start."""
 
     status: int
@@ -54,14 +54,14 @@ class Stretch:
 
 
 def integrate(
-    system: System,
+    system: CompiledSystem,
     t0: Any,
     y0: NDArray[Any],
     grid: Array,
     rtol: float,
     atol: Array,
     max_steps: int = 200_000,
-) -> Stretch:
+) -> SolvedStretch:
     """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.
 
     grid : (n_grid,) increasing, none before t0.   atol : (n,)
@@ -86,7 +86,7 @@ def integrate(
         t_last,
         y_last,
     )
-    return Stretch(status, n_filled, solution, t_last[0], y_last, event, n_steps)
+    return SolvedStretch(status, n_filled, solution, t_last[0], y_last, event, n_steps)
 
 
 @njit(error_model="numpy")

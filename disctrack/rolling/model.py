@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from disctrack.disc import Disc
-from disctrack.rolling.effects import Effect, ModelError, Parameter, effect_class, effect_from_formulas
+from disctrack.rolling.effects import Effect, EffectParameter, ModelError, effect_class, effect_from_formulas
 from disctrack.rolling.records import BODY
 
 DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper
@@ -41,7 +41,7 @@ class Model:
         return {f"{e.name}.{k}": v for e in self.effects for k, v in e.values.items()}
 
     @property
-    def parameters(self) -> dict[str, Parameter]:
+    def parameters(self) -> dict[str, EffectParameter]:
         """Parameters by "effect.parameter"."""
         return {f"{e.name}.{p.name}": p for e in self.effects for p in e.parameters}
 

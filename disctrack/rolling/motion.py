@@ -96,7 +96,7 @@ def coordinates(kinematics: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 @dataclass(frozen=True)
-class Samples:
+class MotionSamples:
     """Raw answers of the compiled equations at n times."""
 
     time: Array  # (n,)
@@ -109,7 +109,7 @@ class Samples:
 def motion_from_samples(
     model: Model,
     body: NDArray[Any],
-    samples: Samples,
+    samples: MotionSamples,
     switches: list[Switch],
     end: EndReason,
     end_time: float,

@@ -14,7 +14,7 @@ from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import ModelError
 from disctrack.rolling.equations import EVENTS, FLYING, ROLLING, SLIPPING, STICK_SPEED
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
-from disctrack.rolling.motion import EndReason, Motion, Regime, Samples, Switch, coordinates, motion_from_samples
+from disctrack.rolling.motion import EndReason, Motion, MotionSamples, Regime, Switch, coordinates, motion_from_samples
 from disctrack.rolling.state import State
 
 RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over 1.5 s
@@ -86,7 +86,7 @@ def _start(state: State, theta_end: float) -> Array:
 class Path:
     """Solution over all regimes."""
 
-    samples: Samples
+    samples: MotionSamples
     switches: list[Switch]
     end: EndReason
     end_time: Any
@@ -98,7 +98,7 @@ def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_sw
     y = np.array(y, assembly.scalar)
     t: Any = grid[0] * y.dtype.type(1.0)
     regime = {n: r for r, n in _N_STATE.items()}[len(y)]
-    pieces: list[Samples] = []
+    pieces: list[MotionSamples] = []
     switches: list[Switch] = []
     end: EndReason | None = None
     i = 0
@@ -129,17 +129,19 @@ def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_sw
     return Path(_join(pieces), switches, end, t, y)
 
 
-def _join(pieces: list[Samples]) -> Samples:
-    return Samples(*(np.concatenate([getattr(p, name) for p in pieces]) for name in Samples.__dataclass_fields__))
+def _join(pieces: list[MotionSamples]) -> MotionSamples:
+    return MotionSamples(
+        *(np.concatenate([getattr(p, name) for p in pieces]) for name in MotionSamples.__dataclass_fields__)
+    )
 
 
-def _sample(assembly: Assembly, regime: int, time: Array, Y: NDArray[Any]) -> Samples:
+def _sample(assembly: Assembly, regime: int, time: Array, Y: NDArray[Any]) -> MotionSamples:
     system = assembly.system(regime)
     n = Y.shape[1]
     rates, kinematics, wrench = integrate.evaluate(
         system.rates, system.arguments, time, Y, n, (assembly.kinematics, assembly.wrench)
     )
-    return Samples(time, kinematics, wrench, rates[:, :8], np.full(len(time), regime, np.uint8))
+    return MotionSamples(time, kinematics, wrench, rates[:, :8], np.full(len(time), regime, np.uint8))
 
 
 def _rates(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

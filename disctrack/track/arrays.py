@@ -16,7 +16,7 @@ from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.track.stage import Measurement, Progress, findings_of
-from disctrack.track.tracking import PairBlock, TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.tracking import BlockOfPairs, TrackingSettings, prepare, stretch_edges, track
 
 Images = NDArray[Any]  # uint8 or uint16
 
@@ -59,7 +59,7 @@ def measure_pairs(
     edges = stretch_edges(range(n), disc)
     prepare(left.dtype)
 
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+    def read_blocks(start: int, stop: int) -> Iterator[BlockOfPairs]:
         cuts = sorted({start, stop, *(edge for edge in edges if start < edge < stop)})
         for a, b in pairwise(cuts):
             for first in range(a, b, BLOCK):

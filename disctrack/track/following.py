@@ -120,7 +120,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Setup:
+class TrackingSetup:
     """What does not change while a recording is followed."""
 
     rig: StereoRig
@@ -164,7 +164,7 @@ class Rows:
 class Follower:
     """One stretch of the recording: what is known of the disc between its blocks."""
 
-    setup: Setup
+    setup: TrackingSetup
     law: Law = field(default_factory=Law)
     heading: Heading | None = None
     lost: int | None = 0  # frames since the last pose; None while the disc is followed
@@ -188,7 +188,9 @@ class Follower:
             self.told.set_result(None)
 
 
-def run(setup: Setup, law: Law, heading: Heading, images: Image, readable: Mask, rows: Rows) -> tuple[int, Heading]:
+def run(
+    setup: TrackingSetup, law: Law, heading: Heading, images: Image, readable: Mask, rows: Rows
+) -> tuple[int, Heading]:
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
     poses = setup.rig.camera_poses()
     # the loop moves them on

@@ -18,7 +18,7 @@ from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.track import tracking as tracker
 from disctrack.track.dots import dot_centres, normalised_maps
-from disctrack.track.following import Follower, Heading, Pose, Rows, Setup, empty_rows, recover, run
+from disctrack.track.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
@@ -68,7 +68,7 @@ class Tracker:
         maps_x, maps_y = (
             np.stack(part) for part in zip(*(normalised_maps(camera) for camera in rig.cameras), strict=True)
         )
-        self._follower = Follower(Setup(rig, disc, self._settings.limits, maps_x, maps_y))
+        self._follower = Follower(TrackingSetup(rig, disc, self._settings.limits, maps_x, maps_y))
         self._readable = np.ones((1, 2), bool)
         self._angles: Array | None = None  # of the last pose
         self._found: Pose | None = None  # in the pair before, by a search

@@ -31,8 +31,8 @@ from disctrack.track.following import (
     Image,
     Law,
     Search,
-    Setup,
     Tables,
+    TrackingSetup,
     clear,
     empty_tables,
     follow_block,
@@ -59,7 +59,7 @@ FITTED_AT_ONCE = 4096  # frames
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
 
-class PairBlock(Protocol):
+class BlockOfPairs(Protocol):
     """Consecutive pairs as `readers.blocks.iter_pair_blocks` gives them; the images are not kept."""
 
     @property
@@ -110,7 +110,7 @@ class Tracking:
 
 
 def track(
-    read_blocks: Callable[[int, int], Iterable[PairBlock]],
+    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]],
     pairs: range,
     rig: StereoRig,
     disc: Disc,
@@ -145,7 +145,7 @@ def track(
         maps = list(pool.map(normalised_maps, rig.cameras))
     maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
     edges = stretch_edges(pairs, disc)
-    setup = Setup(rig, disc, settings.limits, maps_x, maps_y)
+    setup = TrackingSetup(rig, disc, settings.limits, maps_x, maps_y)
     followers = [Follower(setup, search=Search(always=settings.search_always)) for _ in edges[1:]]
     for number, follower in enumerate(followers):
         follower.given = partial(_first_law, followers[:number])
@@ -216,7 +216,7 @@ def track(
 
 
 def _arrangement(
-    read_blocks: Callable[[int, int], Iterable[PairBlock]], rig: StereoRig, disc: Disc, pairs: range
+    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], rig: StereoRig, disc: Disc, pairs: range
 ) -> str:
     """Whether the images are mirrored or exchanged, in words: by the first of the pairs, and by one in their middle."""
     for pair in dict.fromkeys([pairs[0], pairs[len(pairs) // 2]]):
@@ -238,7 +238,7 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     return [pairs.start + k * n // count for k in range(count + 1)]
 
 
-def _cut(block: PairBlock, edges: Sequence[int]) -> list[range]:
+def _cut(block: BlockOfPairs, edges: Sequence[int]) -> list[range]:
     """The block's frames without any edge inside."""
     first, stop = int(block.frames[0]), int(block.frames[-1]) + 1
     inside = [first, *(edge for edge in edges if first < edge < stop), stop]
@@ -362,7 +362,7 @@ def _assemble(
     )
 
 
-def _outlying(tables: Tables, setup: Setup) -> Mask:
+def _outlying(tables: Tables, setup: TrackingSetup) -> Mask:
     """(n,) True where the dots miss the pose that was tracked by far more than in the other frames."""
     n = len(tables.t)
     residuals = np.full(tables.pixels.shape, np.nan)

@@ -5,13 +5,13 @@ bound, efficiency (how well any method could do), stress (how much it bears), co
 tables, plots -> run. Only the truth and the reported numbers enter a judgement, never how the measurement is done.
 """
 
-from disctrack.validate.run import QUICK, Plan, run_validate, scene_of, validate, write_validation
+from disctrack.validate.run import QUICK, ValidationPlan, run_validate, scene_of, validate, write_validation
 from disctrack.validate.summary import Summary, complaints, summarise, verdict
 
 __all__ = [
     "QUICK",
-    "Plan",
     "Summary",
+    "ValidationPlan",
     "complaints",
     "run_validate",
     "scene_of",

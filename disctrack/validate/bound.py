@@ -29,7 +29,7 @@ DOT_BAND_PX = 4.0  # pixels farther outside a dot's edge hold less than 1e-5 of 
 
 
 @dataclass(frozen=True)
-class Bound:
+class PoseBound:
     """Fisher information on POSE_COMPONENTS (SI, radians) of one pair of images."""
 
     dots: Array  # (6, 6) from the pixels of the upper face's dots: what a method that uses the dots can know
@@ -75,7 +75,7 @@ def pixel_variance(grey: Array, sensor: SensorSettings, bit_depth: int) -> Array
     return np.asarray(shot + sensor.read_noise_dn**2 + rounding)
 
 
-def pose_bound(q: Array, rig: StereoRig, disc: Disc, scene: Scene, maps: Maps) -> Bound:
+def pose_bound(q: Array, rig: StereoRig, disc: Disc, scene: Scene, maps: Maps) -> PoseBound:
     """Bound for the disc at rest at q (6,) before the true cameras `rig`."""
     images = expected_disc(neighbours(q), rig, disc, scene)
     derivative = (images[1::2].astype(float) - images[2::2]) / (2 * STEP[:, None, None, None])
@@ -87,7 +87,7 @@ def pose_bound(q: Array, rig: StereoRig, disc: Disc, scene: Scene, maps: Maps) -
             for camera, (R_cw, t_cw), rays in zip(rig.cameras, rig.camera_poses(), maps, strict=True)
         ]
     )
-    return Bound(
+    return PoseBound(
         dots=_information(derivative, weight * mask), image=_information(derivative, weight), expected=images[0]
     )
 

@@ -18,7 +18,7 @@ QUANTITIES = ("x", "y", "z", "psi", "theta", "phi", "rotation")
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PoseErrors:
     """Differences measured - true of n poses; NaN where there is no answer."""
 
     q: Array  # (n, 6) true
@@ -51,14 +51,14 @@ class Comparison:
             return self.error[ok, 3:].ravel()
         return self.error[ok, i] if i < 3 else self.angles[ok, i - 3]
 
-    def part(self, rows: Mask) -> Comparison:
+    def part(self, rows: Mask) -> PoseErrors:
         """The poses where `rows` (n,) is True."""
-        return Comparison(
+        return PoseErrors(
             self.q[rows], self.error[rows], self.angles[rows], self.covariance[rows], self.calibration_covariance[rows]
         )
 
 
-def compare(trajectory: Trajectory, q_true: Array) -> Comparison:
+def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
     """Comparison of a trajectory with the true poses (n, 6) of its frames."""
     turn = rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(
         rotation_from_euler(q_true[:, 3], q_true[:, 4], q_true[:, 5]), 1, 2
@@ -67,17 +67,17 @@ def compare(trajectory: Trajectory, q_true: Array) -> Comparison:
     angles = np.angle(np.exp(1j * (trajectory.q[:, 3:] - q_true[:, 3:])))
     lost = ~trajectory.measured
     error[lost], angles[lost] = np.nan, np.nan
-    return Comparison(q_true, error, angles, trajectory.pose_covariance, trajectory.calibration_covariance)
+    return PoseErrors(q_true, error, angles, trajectory.pose_covariance, trajectory.calibration_covariance)
 
 
-def joined(parts: Sequence[Comparison]) -> Comparison:
+def joined(parts: Sequence[PoseErrors]) -> PoseErrors:
     """All poses of several comparisons."""
-    names = Comparison.__dataclass_fields__
-    return Comparison(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    names = PoseErrors.__dataclass_fields__
+    return PoseErrors(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True)
-class Spread:
+class ErrorStatistics:
     """Statistics of one quantity's errors [m or rad]."""
 
     n: int
@@ -88,13 +88,13 @@ class Spread:
     largest: float
 
 
-def spread(errors: Array) -> Spread:
+def spread(errors: Array) -> ErrorStatistics:
     """Statistics of errors (n,); NaN where there is none."""
     errors = np.asarray(errors, float)
     if errors.size == 0:
-        return Spread(0, *5 * (float("nan"),))
+        return ErrorStatistics(0, *5 * (float("nan"),))
     size = np.abs(errors)
-    return Spread(
+    return ErrorStatistics(
         int(errors.size),
         float(errors.mean()),
         float(errors.std()),
@@ -113,7 +113,7 @@ class Consistency:
     n: int  # poses, or rigs, that are independent
 
 
-def noise_consistency(comparison: Comparison) -> Consistency:
+def noise_consistency(comparison: PoseErrors) -> Consistency:
     """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
     ok = comparison.usable
     e, C = comparison.error[ok], comparison.covariance[ok]
@@ -124,7 +124,7 @@ def noise_consistency(comparison: Comparison) -> Consistency:
     return Consistency(float(value), float(np.sqrt(2 / (6 * n))), n)
 
 
-def calibration_consistency(own: Sequence[Comparison], true: Sequence[Comparison]) -> Consistency:
+def calibration_consistency(own: Sequence[PoseErrors], true: Sequence[PoseErrors]) -> Consistency:
     """Squared calibration error over its reported variance, from the same images measured through two rigs.
 
     own[k], true[k] : poses of recording k through its own calibration and through the true cameras. The image noise is

@@ -18,7 +18,7 @@ from disctrack.errors import TrackingError
 from disctrack.render import render_disc, rig_after_faults
 from disctrack.scene.description import CameraFault, Faults, Scene
 from disctrack.track.tracking import Tracking
-from disctrack.validate.comparison import Comparison, compare
+from disctrack.validate.comparison import PoseErrors, compare
 from disctrack.validate.poses import centre_height
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, LOST_ALLOWED, stress_poses
 from disctrack.validate.trial import every, locate
@@ -119,7 +119,7 @@ def _judge(case: _Case, images: NDArray, q: Array, scene: Scene, baseline: Contr
 _PARTS = (slice(0, 3), slice(3, 6))
 
 
-def _alarms(tracking: Tracking, comparison: Comparison, q: Array, disc: Disc) -> tuple[str, ...]:
+def _alarms(tracking: Tracking, comparison: PoseErrors, q: Array, disc: Disc) -> tuple[str, ...]:
     """What a user would see without knowing the truth."""
     alarms = [warning.split(":")[0] for warning in tracking.warnings]
     lost = float(1 - comparison.found.mean())

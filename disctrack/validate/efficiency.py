@@ -14,7 +14,7 @@ from disctrack.render.sensor import digitise
 from disctrack.scene.description import Scene
 from disctrack.trajectory import MarkerStatus
 from disctrack.validate.bound import camera_maps, inverse_information, pose_bound
-from disctrack.validate.comparison import QUANTITIES, Comparison, compare
+from disctrack.validate.comparison import QUANTITIES, PoseErrors, compare
 from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, static_poses
 from disctrack.validate.trial import Image, every, locate
 
@@ -104,25 +104,25 @@ def coordinate_sigma(covariance: Array, q: Array) -> Array:
         return np.asarray(np.sqrt(np.concatenate([np.diag(covariance)[:3], angles, [rotation]])))
 
 
-def _scatter(part: Comparison) -> Array:
+def _scatter(part: PoseErrors) -> Array:
     ok = part.usable
     e = np.concatenate([part.error[ok, :3], part.angles[ok]], axis=1)
     rotation = np.sqrt(np.mean(part.error[ok, 3:].var(axis=0, ddof=1)))
     return np.append(e.std(axis=0, ddof=1), rotation)
 
 
-def _bias(part: Comparison) -> Array:
+def _bias(part: PoseErrors) -> Array:
     ok = part.usable
     e = np.concatenate([part.error[ok, :3], part.angles[ok]], axis=1).mean(axis=0)
     return np.append(e, np.sqrt(np.mean(part.error[ok, 3:].mean(axis=0) ** 2)))
 
 
-def _reported(part: Comparison) -> Array:
+def _reported(part: PoseErrors) -> Array:
     sigma = [coordinate_sigma(C, q) for C, q in zip(part.covariance[part.usable], part.q[part.usable], strict=True)]
     return np.asarray(np.sqrt(np.mean(np.square(sigma), axis=0)))
 
 
-def _excess(part: Comparison, information: Array) -> float:
+def _excess(part: PoseErrors, information: Array) -> float:
     e = part.error[part.usable]
     e = e - e.mean(axis=0)
     return float(np.einsum("ni,ij,nj->", e, information, e) / (6 * (len(e) - 1)))

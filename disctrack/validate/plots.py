@@ -11,16 +11,16 @@ from matplotlib.ticker import NullFormatter
 
 from calibration.arrays import Array
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED
-from disctrack.validate.comparison import Comparison, joined
+from disctrack.validate.comparison import PoseErrors, joined
 from disctrack.validate.efficiency import Efficiency
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, Stress
-from disctrack.validate.trial import Trial
+from disctrack.validate.trial import TrialRecording
 
 _UM, _DEG = 1e6, 180 / np.pi
 AXES = (BLUE, AMBER, RED)
 
 
-def error_figure(trials: Sequence[Trial], law: float) -> Figure:
+def error_figure(trials: Sequence[TrialRecording], law: float) -> Figure:
     """|error| of every pose seen by both cameras against nutation, with the claim and the law of psi and phi."""
     parts = [(trial.static.own.part(trial.static.cameras == 2), "o") for trial in trials]
     parts += [(m.own.part(m.cameras == 2), ".") for trial in trials for m in trial.rolling.values()]
@@ -52,8 +52,8 @@ def error_figure(trials: Sequence[Trial], law: float) -> Figure:
 
 def _points(
     axes: Axes,
-    parts: Sequence[tuple[Comparison, str]],
-    values: Callable[[Comparison], Array],
+    parts: Sequence[tuple[PoseErrors, str]],
+    values: Callable[[PoseErrors], Array],
     colours: Sequence[str],
     names: Sequence[str],
 ) -> None:

@@ -18,13 +18,13 @@ from disctrack.validate.efficiency import measure_efficiency
 from disctrack.validate.stress import DISTURBANCES, apply_stress, stress_poses
 from disctrack.validate.summary import Summary, summarise
 from disctrack.validate.tables import as_json, markdown
-from disctrack.validate.trial import Trial, run_trial
+from disctrack.validate.trial import TrialRecording, run_trial
 
 FIRST_SEED = 2014
 
 
 @dataclass(frozen=True)
-class Plan:
+class ValidationPlan:
     """How much is rendered and measured. Poses and frames are shared out among the recordings."""
 
     recordings: int = 3
@@ -44,7 +44,7 @@ class Plan:
         return max(self.fewest, -(-total // self.recordings)) if total else 0
 
 
-QUICK = Plan(
+QUICK = ValidationPlan(
     recordings=1, static_poses=40, rolling_frames=24, final_frames=24, bound_poses=8, copies=8, stress_poses=4,
     bisections=1, disturbances=("noise of a pixel", "dots that have come off"),
 )  # fmt: skip
@@ -64,10 +64,14 @@ def scene_of(seed: int, quick: bool = False) -> Scene:
 
 
 def validate(
-    plan: Plan, *, quick: bool = False, seed: int = FIRST_SEED, say: Callable[[str], object] = lambda text: None
-) -> tuple[Summary, list[Trial]]:
+    plan: ValidationPlan,
+    *,
+    quick: bool = False,
+    seed: int = FIRST_SEED,
+    say: Callable[[str], object] = lambda text: None,
+) -> tuple[Summary, list[TrialRecording]]:
     """Run a plan: recording k has the seed `seed` + k. Nothing is left on the disk; `say` tells of every step."""
-    trials: list[Trial] = []
+    trials: list[TrialRecording] = []
     for k in range(plan.recordings):
         with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
             trials.append(
@@ -98,7 +102,7 @@ def validate(
     return summarise(trials, efficiency, stresses, controls), trials
 
 
-def write_validation(folder: Path, summary: Summary, trials: list[Trial], seconds: float) -> list[Path]:
+def write_validation(folder: Path, summary: Summary, trials: list[TrialRecording], seconds: float) -> list[Path]:
     """Write validation.json, validation.md and the pictures; returns the files. Raises OutputError."""
     from disctrack.pages.figures import save_figure
     from disctrack.validate.plots import bound_figure, error_figure, stress_figure
@@ -125,14 +129,14 @@ def run_validate(
     recordings: int | None = None,
     quick: bool = False,
     seed: int = FIRST_SEED,
-    plan: Plan | None = None,
+    plan: ValidationPlan | None = None,
     say: Callable[[str], object] = lambda text: None,
 ) -> tuple[Summary, list[Path]]:
     """Validate and write the results into `folder`; returns the summary and the files.
 
     recordings : None leaves it to the plan   quick : small images and few of everything   plan : in place of both
     """
-    plan = plan or (QUICK if quick else Plan())
+    plan = plan or (QUICK if quick else ValidationPlan())
     if recordings is not None:
         plan = replace(plan, recordings=recordings)
     make_folder(folder)  # a place that cannot be written to should be known before the work

@@ -10,9 +10,9 @@ import numpy as np
 from calibration.arrays import Array, Mask
 from disctrack.validate.comparison import (
     QUANTITIES,
-    Comparison,
     Consistency,
-    Spread,
+    ErrorStatistics,
+    PoseErrors,
     calibration_consistency,
     joined,
     noise_consistency,
@@ -22,7 +22,7 @@ from disctrack.validate.controls import Control
 from disctrack.validate.efficiency import Efficiency, law_constant
 from disctrack.validate.poses import STRATA_DEG
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, Stress
-from disctrack.validate.trial import FINAL, ROLLING, Measured, Trial
+from disctrack.validate.trial import FINAL, ROLLING, MeasuredTwice, TrialRecording
 
 CLAIM = dict(zip(QUANTITIES, 3 * [CLAIM_POSITION] + 4 * [CLAIM_ROTATION], strict=True))
 REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta) is all there is to see
@@ -35,9 +35,9 @@ class Row:
     """Errors of one quantity: everything, and its two shares measured on the same images."""
 
     quantity: str
-    total: Spread  # through the recordings' own calibrations
-    noise: Spread  # through the true cameras
-    calibration: Spread  # the difference of the two
+    total: ErrorStatistics  # through the recordings' own calibrations
+    noise: ErrorStatistics  # through the true cameras
+    calibration: ErrorStatistics  # the difference of the two
     bound: float  # Cramer-Rao sigma from the dots, rms over the poses of the efficiency run; NaN where not computed
     claim: float
 
@@ -48,7 +48,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Sight:
+class SightCount:
     """Static poses by the number of cameras that can see the upper face."""
 
     cameras: int
@@ -75,7 +75,7 @@ class Summary:
 
     recordings: int
     rows: dict[str, tuple[Row, ...]]  # by kind of motion
-    sights: tuple[Sight, ...]
+    sights: tuple[SightCount, ...]
     strata: tuple[Stratum, ...]
     noise_consistency: dict[str, Consistency]
     calibration_consistency: Consistency
@@ -92,7 +92,7 @@ class Summary:
 
 
 def summarise(
-    trials: Sequence[Trial],
+    trials: Sequence[TrialRecording],
     efficiency: Efficiency | None = None,
     stresses: Sequence[Stress] = (),
     controls: Sequence[Control] = (),
@@ -125,10 +125,10 @@ def summarise(
     )  # fmt: skip
 
 
-Pair = tuple[Comparison, Comparison]  # through the own calibration, through the true cameras
+Pair = tuple[PoseErrors, PoseErrors]  # through the own calibration, through the true cameras
 
 
-def _both(measured: Measured, rows: Mask) -> Pair:
+def _both(measured: MeasuredTwice, rows: Mask) -> Pair:
     return measured.own.part(rows), measured.true.part(rows)
 
 
@@ -161,10 +161,10 @@ def _rows(parts: Sequence[Pair], efficiency: Efficiency | None) -> tuple[Row, ..
     return tuple(rows)
 
 
-def _sight(measured: Sequence[Measured], cameras: int) -> Sight:
+def _sight(measured: Sequence[MeasuredTwice], cameras: int) -> SightCount:
     own = joined([m.own.part(m.cameras == cameras) for m in measured])
     ok = own.usable
-    return Sight(
+    return SightCount(
         cameras, len(own.q), int(own.found.sum()), int(own.gross.sum()),
         _rms(own.error[ok, :3]), _rms(own.error[ok, 3:]),
     )  # fmt: skip

@@ -29,7 +29,7 @@ from disctrack.scene.description import MotionSettings, RollingMotion, Scene
 from disctrack.scene.motion import SceneMotion, motion_of
 from disctrack.track.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import Trajectory
-from disctrack.validate.comparison import Comparison, compare
+from disctrack.validate.comparison import PoseErrors, compare
 from disctrack.validate.poses import cameras_in_sight, static_poses
 
 ROLLING = "rolling at 8 to 12 deg"
@@ -40,25 +40,25 @@ TO_REST = (7.93, 1.5)  # (5.11): theta [deg] this time [s] before the end, and t
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredTwice:
     """The same images measured twice: through the recording's own calibration, and through the true cameras."""
 
-    own: Comparison
-    true: Comparison
+    own: PoseErrors
+    true: PoseErrors
     cameras: NDArray[np.int64]  # (n,) that see the upper face
     variance_factor: float  # of the run through the own calibration
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialRecording:
     """What one recording showed."""
 
     scene: Scene
     truth: Truth
     calibration: StereoCalibration
-    static: Measured
-    rolling: dict[str, Measured]  # by the name of the stretch
+    static: MeasuredTwice
+    rolling: dict[str, MeasuredTwice]  # by the name of the stretch
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def run_trial(
     n_rolling: int,
     n_final: int,
     say: Callable[[str], object] = lambda text: None,
-) -> Trial:
+) -> TrialRecording:
     """Render the recording of `scene` into `folder`, measure it and compare.
 
     n_static, n_rolling, n_final : static poses, frames of the two stretches of rolling motion (0: none)
@@ -160,7 +160,7 @@ def run_trial(
         )
         for k, (a, b) in enumerate(itertools.pairwise(edges))
     ]
-    return Trial(scene, truth, calibration, measured[0], dict(zip(stretches, measured[1:], strict=True)))
+    return TrialRecording(scene, truth, calibration, measured[0], dict(zip(stretches, measured[1:], strict=True)))
 
 
 def read_images(recording: Recording, start: int, stop: int) -> Image:
@@ -181,13 +181,13 @@ def measure_twice(
     scene: Scene,
     *,
     apart: bool,
-) -> Measured:
+) -> MeasuredTwice:
     """Comparison of images (n, 2, height, width) measured through both rigs; `apart` as in `locate`."""
     rate = scene.cameras.frame_rate_hz
     through_own = locate(images, own, disc, rate, apart=apart)
     through_true = locate(images, true, disc, rate, apart=apart)
     step = 2 if apart else 1
-    return Measured(
+    return MeasuredTwice(
         own=compare(every(through_own.trajectory, step), q_true),
         true=compare(every(through_true.trajectory, step), q_true),
         cameras=cameras_in_sight(q_true, true, disc),

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise, Stretch, estimate
+from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, SmoothNoise, estimate
 from disctrack.examples.ball_drop import analyse_drops, main, settings_for
 from disctrack.examples.ball_system import GRAVITY, STEP, Ball, BallDrops, Drop, fall, read_drops
 
@@ -59,7 +59,7 @@ def test_noise_with_a_memory_is_measured(rng):
     root = np.linalg.cholesky(truth.covariance(TIME))
     basis = TIME[:, None] ** np.arange(3)
     found = estimate(
-        [Stretch(TIME, root @ rng.standard_normal((45, 1)), basis) for _ in range(30)], SmoothNoise(0.1, 0.1, 0.3)
+        [SampleStretch(TIME, root @ rng.standard_normal((45, 1)), basis) for _ in range(30)], SmoothNoise(0.1, 0.1, 0.3)
     )
     # 30 stretches of 45 samples, each six memories long: 3 % of the white part, about 10 % of the others; three sigmas
     assert found.white == pytest.approx(truth.white, rel=0.1)

@@ -157,6 +157,17 @@ def test_no_file_asks_for_one_that_asks_for_it():
         asked = {name: others for name, others in asked.items() if name not in free}
 
 
+def test_a_public_class_has_a_name_of_its_own():
+    """Plan, Motion or Found say nothing where two things bear the name; each example speaks its own language."""
+    places: dict[str, list[str]] = {}
+    for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
+        if "examples" not in file.parts:
+            classes = [node for node in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(node, ast.ClassDef)]
+            for node in classes:
+                places.setdefault(node.name, []).append(file.name)
+    assert {name: files for name, files in places.items() if len(files) > 1 and name[0] != "_"} == {}
+
+
 @pytest.mark.parametrize("room", ROOMS_OF_DIAGNOSIS)
 def test_the_engine_of_a_diagnosis_knows_no_disc_and_no_page(room):
     for file in (ROOT / "disctrack" / "diagnosis" / room).rglob("*.py"):

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.analyse.contact import analyse_contact, contact_quantities
 from disctrack.analyse.derivatives import differentiate
-from disctrack.analyse.propagation import State
+from disctrack.analyse.propagation import MotionState
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import CATALOGUE, Model, simulate
@@ -18,7 +18,7 @@ COLUMN = {"slip": slice(3, 6), "locus": slice(6, 8), "force": slice(8, 11), "nee
 
 
 def exact(truth):
-    return State(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha)
+    return MotionState(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha)
 
 
 def sliding(truth, onset, speed, heading=0.7):

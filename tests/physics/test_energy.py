@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.energy import analyse_energy, energy_quantities
-from disctrack.analyse.propagation import State
+from disctrack.analyse.propagation import MotionState
 from disctrack.disc import MA_2014
 from disctrack.regular_precession import precession_rate
 
@@ -15,7 +15,9 @@ TOTAL, POWER, ADIABATIC, LEVEL = 5, 6, 7, 8
 
 def exact(truth):
     return energy_quantities(
-        State(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha), MA_2014, 9.81
+        MotionState(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha),
+        MA_2014,
+        9.81,
     )
 
 

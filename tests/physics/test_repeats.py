@@ -18,7 +18,7 @@ from disctrack.files.trajectory_file import Provenance, write_trajectory
 from disctrack.repeats import compare, write
 from disctrack.repeats.alignment import Curves, align
 from disctrack.repeats.averages import average
-from disctrack.repeats.runs import INDEX, QUANTITIES, UNKNOWN, Measured, Run, k_m_of_energy
+from disctrack.repeats.runs import INDEX, QUANTITIES, UNKNOWN, AnalysedRun, FittedNumber, k_m_of_energy
 from disctrack.repeats.spread import independent_samples, spread
 
 # of one smoothed frame, in the order of QUANTITIES: what the analysis of a recorded motion states at 5 degrees
@@ -39,11 +39,11 @@ def quantities(truth) -> np.ndarray:
 def run_of(as_tracked):
     rig = None
 
-    def make(truth, rng, name="run", t_f=UNKNOWN, offset=0.0) -> Run:
+    def make(truth, rng, name="run", t_f=UNKNOWN, offset=0.0) -> AnalysedRun:
         nonlocal rig
         rig = rig or as_tracked(truth[:20], rng).rig
         value = quantities(truth)
-        return Run(
+        return AnalysedRun(
             path=Path(f"{name}.h5"),
             name=name,
             case="",
@@ -90,7 +90,7 @@ def test_the_sigma_of_a_shift_tells_its_scatter(true_motion, run_of):
 
 def test_collapse_is_the_common_clock_where_it_was_fitted(true_motion, run_of, rng):
     truth = true_motion(theta_deg=9, duration=3.0)
-    t_f = [Measured(3.1, 2e-4), Measured(1.1, 3e-4), UNKNOWN]
+    t_f = [FittedNumber(3.1, 2e-4), FittedNumber(1.1, 3e-4), UNKNOWN]
     offsets = np.array([0.0, -2.0, 0.7])
     runs = [
         run_of(truth[500 + 20 * i : 1500 + 20 * i], rng, f"{i}", t, o)
@@ -104,7 +104,7 @@ def test_collapse_is_the_common_clock_where_it_was_fitted(true_motion, run_of, r
 
 def test_equal_runs_spread_by_the_measurement_and_a_planted_spread_is_found(true_motion, run_of, rng):
     truth = true_motion(theta_deg=9, duration=3.0)[400:1000]
-    exact = Measured(3.0, 1e-9)
+    exact = FittedNumber(3.0, 1e-9)
     same = [run_of(truth, rng, f"{i}", exact) for i in range(6)]
     found = spread([Curves(r) for r in same], align(same, [Curves(r) for r in same]))
     for part in found.parts:
@@ -131,7 +131,7 @@ def test_equal_runs_spread_by_the_measurement_and_a_planted_spread_is_found(true
 
 def test_runs_that_started_turned_about_the_vertical_have_the_same_path(true_motion, run_of, rng):
     truth = true_motion(theta_deg=9, duration=3.0)[400:1000]
-    exact, runs = Measured(3.0, 1e-9), []
+    exact, runs = FittedNumber(3.0, 1e-9), []
     for i, angle in enumerate((0.0, 1.0, -0.8)):
         run = run_of(truth, rng, f"{i}", exact)
         c, s = np.cos(angle), np.sin(angle)
@@ -292,7 +292,7 @@ def test_page_tables_and_figures_say_the_same_as_the_comparison(compared, tmp_pa
 
 
 def test_a_run_that_does_not_belong_is_pointed_at(true_motion, run_of, rng):
-    exact, runs = Measured(3.0, 1e-4), []
+    exact, runs = FittedNumber(3.0, 1e-4), []
     truth = true_motion(theta_deg=9, duration=3.0)[400:1000]
     for i, factor in enumerate((1.0, 1.004, 0.997, 1.1, 0.999)):  # of theta: the fourth is another experiment
         run = run_of(truth, rng, f"run {i}", exact)

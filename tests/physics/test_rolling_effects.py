@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.rolling import CATALOGUE, Effect, Model, ModelError, Parameter, State, steady_precession
+from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, ModelError, State, steady_precession
 from disctrack.rolling.effects import catalogue_table, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
@@ -118,7 +118,7 @@ def test_a_new_effect_is_one_small_class():
         name = "test_magnet"
         title = "magnetic brake"
         source = "this test"
-        parameters = (Parameter("b", "N m s", 1e-6, "moment per rate", lower=0.0),)
+        parameters = (EffectParameter("b", "N m s", 1e-6, "moment per rate", lower=0.0),)
 
         @staticmethod
         def law(p, s, w):

@@ -16,7 +16,7 @@ from disctrack.analyse.power_laws import (
     nutation_ratio,
     power_law_end,
 )
-from disctrack.analyse.propagation import State, propagate, rates
+from disctrack.analyse.propagation import MotionState, propagate, rates
 from disctrack.disc import MA_2014
 
 
@@ -41,7 +41,7 @@ def known_law(n, rng, nutation=0.1, duration=0.6, unseen=0.03):
 
 
 def of_motion(truth):
-    state = State(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha)
+    state = MotionState(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha)
     E = energy_quantities(state, MA_2014, 9.81)[:, 5]
     return truth.time, truth.euler[:, 0], truth.euler[:, 1], truth.rates[:, 0], E
 

@@ -13,7 +13,7 @@ from disctrack.validate import QUICK, complaints, scene_of, summarise, validate,
 from disctrack.validate.bound import camera_maps, dot_pixels, pose_bound
 from disctrack.validate.comparison import compare, joined, noise_consistency
 from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, centre_height, static_poses
-from disctrack.validate.run import Plan
+from disctrack.validate.run import ValidationPlan
 from disctrack.validate.stress import (
     CLAIM_POSITION,
     CLAIM_ROTATION,
@@ -216,7 +216,7 @@ def test_pairs_apart_are_each_found_without_the_one_before(rng):
 @pytest.mark.slow
 def test_full_validation_over_many_rigs(tmp_path):
     """Covariances honest within the band of 0.8 to 1.25, noise and calibration, in the paper's format."""
-    plan = Plan(recordings=6, bound_poses=12, stress_poses=0)
+    plan = ValidationPlan(recordings=6, bound_poses=12, stress_poses=0)
     summary, _ = validate(plan)
     assert complaints(summary) == ()
     consistency = [*summary.noise_consistency.values(), summary.calibration_consistency]

@@ -1,7 +1,7 @@
 """What may be wrong about a measurement: clocks, cameras, dots, table. One class for each kind of fault.
 
-To add one, write a subclass of Fault here: its quantities, what it alters (`Setup`) or shifts in the images, and its
-place in a scene (scene.description.Faults), so that it can be rendered, saved and given to the next diagnosis.
+To add one, write a subclass of Fault here: its quantities, what it alters (`MeasurementSetup`) or shifts in the images,
+and its place in a scene (scene.description.Faults), so that it can be rendered, saved and given to the next diagnosis.
 Candidates, prediction, derivatives, saved models and trials take it from `faults_of`.
 
 Quantities are addressed by name, as parameters of the effects of the motion are: "right_turned.rotation_x". Null is
@@ -51,7 +51,7 @@ class CameraChange:
 
 
 @dataclass
-class Setup:
+class MeasurementSetup:
     """How clocks, cameras, dots and table differ from what was declared and calibrated. Faults alter it."""
 
     misprint: Array  # (m, 2) [m] of single dots, body axes
@@ -151,7 +151,7 @@ class Fault:
         """Its numbers among the values; zero where they are not."""
         return np.array([float(values.get(name, 0.0)) for name in self.names()])
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         """Write its numbers v into the setup."""
 
     def column(self, part: str, sight: Sight) -> Array:
@@ -182,7 +182,7 @@ class TimeOffset(Fault):
     source, meaning = "synchronisation of the cameras", "right minus left"
     bounds = (-0.05, 0.05)
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.delay = float(v[0])
 
     def column(self, part: str, sight: Sight) -> Array:
@@ -206,7 +206,7 @@ class FrameRate(Fault):
     bounds = (-0.6, 1.2)
     of_poses_alone = False
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.rate = 1.0 + float(v[0])
 
     def column(self, part: str, sight: Sight) -> Array:
@@ -261,7 +261,7 @@ class _OfCamera(_Keyed):
     def said(self) -> str:
         return self.title.format(self.camera)
 
-    def change(self, setup: Setup) -> CameraChange:
+    def change(self, setup: MeasurementSetup) -> CameraChange:
         """Of this camera."""
         return setup.cameras[CAMERAS.index(self.camera)]
 
@@ -282,7 +282,7 @@ class CameraTurned(_OfCamera):
     bounds = (-0.06, 0.06)
     key, factor = "rotation_deg", 180 / np.pi
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         self.change(setup).rotation = v
 
 
@@ -296,7 +296,7 @@ class CameraShifted(_OfCamera):
     bounds = (-0.01, 0.01)
     key, factor = "translation_mm", 1e3
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         self.change(setup).translation = v
 
 
@@ -309,7 +309,7 @@ class FocalLength(_OfCamera):
     bounds = (-0.05, 0.05)
     key, null = "focal_scale", 1.0
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         self.change(setup).focal = float(v[0])
 
 
@@ -322,7 +322,7 @@ class PrincipalPoint(_OfCamera):
     bounds = (-5.0, 5.0)
     key = "principal_point_change_px"
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         self.change(setup).centre = v
 
 
@@ -335,7 +335,7 @@ class Distortion(_OfCamera):
     bounds = (-1.0, 1.0)
     key = "k1_change"
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         self.change(setup).k1 = float(v[0])
 
 
@@ -361,7 +361,7 @@ class Misprint(Fault):
     def said(self) -> str:
         return self.title.format(self.dot)
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.misprint[self.dot] = v
 
     def column(self, part: str, sight: Sight) -> Array:
@@ -388,7 +388,7 @@ class PatternOffset(_Keyed):
     source, meaning = "gluing of the paper", "body axes"
     key, factor = "pattern_offset_mm", 1e3
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.pattern_offset[:2] = v
 
 
@@ -401,7 +401,7 @@ class PatternRotation(_Keyed):
     source, meaning = "gluing; the same as another spin angle", "about e3"
     key, factor = "pattern_turn_deg", 180 / np.pi
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.pattern_turn = float(v[0])
 
 
@@ -414,7 +414,7 @@ class PatternScale(_Keyed):
     source, meaning = "printer", "relative"
     key, null = "pattern_scale", 1.0
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.pattern_scale = 1.0 + float(v[0])
 
 
@@ -427,7 +427,7 @@ class PatternHeight(_Keyed):
     source, meaning = "paper, glue, thickness", "along e3"
     key, factor = "pattern_height_mm", 1e3
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.pattern_offset[2] = v[0]
 
 
@@ -439,7 +439,7 @@ class TablePlane(_Keyed):
     source, meaning = "board on a burr", "turn of the true table, calibrated axes"
     key, factor = "table_turn_deg", 180 / np.pi
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.table_turn[:2] = v
 
 
@@ -451,7 +451,7 @@ class TableHeight(_Keyed):
     source, meaning = "thickness of the board", "true height of the table in the calibrated axes"
     key, factor = "table_height_mm", 1e3
 
-    def alter(self, setup: Setup, v: Array) -> None:
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
         setup.table_height = float(v[0])
 
 
@@ -507,9 +507,9 @@ def measurement_candidates(disc: Disc) -> tuple[Candidate, ...]:
     return tuple(fault.candidate() for fault in faults_of(disc))
 
 
-def setup_of(disc: Disc, values: Mapping[str, float]) -> Setup:
+def setup_of(disc: Disc, values: Mapping[str, float]) -> MeasurementSetup:
     """How the measurement differs from what was declared where faults have these values; those absent are null."""
-    setup = Setup(np.zeros((disc.n_markers, 2)))
+    setup = MeasurementSetup(np.zeros((disc.n_markers, 2)))
     for fault in faults_of(disc):
         v = fault.numbers(values)
         if v.any():

@@ -9,9 +9,9 @@ import numpy as np
 
 from calibration.arrays import Array
 from disctrack.analyse.contact import K
-from disctrack.analyse.derivatives import Motion, differentiate
+from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.energy import analyse_energy
-from disctrack.analyse.propagation import RATES, State, propagate, rates
+from disctrack.analyse.propagation import RATES, MotionState, propagate, rates
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HALF_WINDOW, HORIZONS, Ahead, energy_balance, free_run, simulated
 from disctrack.diagnosis.disc.learned_law import MissingMoment, missing_moment, probe
@@ -25,7 +25,7 @@ SHORTEST = 0.05  # [s] of frames from which a longer free run may start
 
 
 @dataclass(frozen=True)
-class Measured:
+class ModelFreeForces:
     """What the poses say without any model of the motion; n frames of the system, NaN where they say nothing."""
 
     psidot: Array  # (n,) [rad/s]
@@ -37,17 +37,17 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ModelFreeEvidence:
     """Beside the answer; None where it cannot be had."""
 
-    measured: Measured | None
+    measured: ModelFreeForces | None
     moment: MissingMoment | None  # that the model before fails to supply
     moment_of_law: MissingMoment | None  # that the effects found add, read in the same way
     energy_before: dict[str, float] = field(default_factory=dict)  # [J]
     ahead: tuple[tuple[Ahead, Ahead], ...] = ()  # before, after; of free runs after shorter fits
 
 
-def evidence(result: DiscDiagnosis) -> Evidence:
+def evidence(result: DiscDiagnosis) -> ModelFreeEvidence:
     """All that a report shows beside a diagnosis whose base fit converged."""
     system, before = result.system, result.diagnosis.before
     moment, of_law = result.moment, None
@@ -57,10 +57,10 @@ def evidence(result: DiscDiagnosis) -> Evidence:
         if result.after_fit is not before:
             of_law = missing_moment(probe(system, before, result.after_fit.values), moment.scale)
     energy = energy_balance(system, before.values) if before.converged else {}
-    return Evidence(_measured(system), moment, of_law, energy, _longer(result))
+    return ModelFreeEvidence(_measured(system), moment, of_law, energy, _longer(result))
 
 
-def _measured(system: DiscSystem) -> Measured | None:
+def _measured(system: DiscSystem) -> ModelFreeForces | None:
     disc, gravity = system.disc, system.model.gravity
     try:
         motion = differentiate(part(system.trajectory, system.rows))
@@ -68,14 +68,14 @@ def _measured(system: DiscSystem) -> Measured | None:
     except AnalysisError:
         return None
 
-    def force(state: State) -> Array:
+    def force(state: MotionState) -> Array:
         n0, _, _ = state.axes()
         total = disc.mass * (state.acceleration + gravity * K)
         return np.stack(
             [np.sum(total * axis, axis=1) for axis in (n0, np.cross(K, n0), np.broadcast_to(K, n0.shape))], 1
         )
 
-    return Measured(
+    return ModelFreeForces(
         *_column(motion, [name for name, _, _ in RATES].index("psidot")),
         *_values(motion, force),
         energy.loss,
@@ -83,12 +83,12 @@ def _measured(system: DiscSystem) -> Measured | None:
     )
 
 
-def _values(motion: Motion, function: Callable[[State], Array]) -> tuple[Array, Array]:
+def _values(motion: MeasuredMotion, function: Callable[[MotionState], Array]) -> tuple[Array, Array]:
     found = propagate(motion, function)
     return found.value, np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
 
 
-def _column(motion: Motion, i: int) -> tuple[Array, Array]:
+def _column(motion: MeasuredMotion, i: int) -> tuple[Array, Array]:
     value, sigma = _values(motion, rates)
     return value[:, i], sigma[:, i]
 

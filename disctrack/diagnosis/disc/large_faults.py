@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from calibration.arrays import Array
 from calibration.camera import StereoRig
-from disctrack.diagnosis.disc.faults import Setup, faults_of, setup_of
+from disctrack.diagnosis.disc.faults import MeasurementSetup, faults_of, setup_of
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, with_noise_of_frames
@@ -55,7 +55,7 @@ class Assumed:
         return self.base.cost + free * float(np.log(max(self.base.n_data, 2)))
 
 
-def rig_as_it_is(rig: StereoRig, setup: Setup) -> StereoRig:
+def rig_as_it_is(rig: StereoRig, setup: MeasurementSetup) -> StereoRig:
     """The rig with what became of its cameras after the calibration."""
     poses = []
     for (R, t), change in zip(rig.camera_poses(), setup.cameras, strict=True):

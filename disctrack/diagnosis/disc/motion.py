@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
-from disctrack.rolling import CATALOGUE, Effect, Model, Parameter, State
+from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, State
 
 # Parameters of one effect that act so differently that each part is a question of its own.
 _PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
@@ -42,7 +42,7 @@ def slipping_start_quantities(model: Model) -> tuple[Quantity, ...]:
     return velocity if model.effect("slip") else (*velocity, *slip_candidate(CATALOGUE["slip"]).quantities)
 
 
-def effect_quantity(effect: type[Effect], parameter: Parameter) -> Quantity:
+def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantity:
     """A parameter of an effect as the engine wants it."""
     null = parameter.nominal if parameter.is_shape else parameter.null
     return Quantity(

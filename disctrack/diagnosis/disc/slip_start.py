@@ -43,7 +43,7 @@ class SlipStart:
 
 
 @dataclass(frozen=True)
-class Answer:
+class SlipDiagnosis:
     """Diagnosis of a motion that may begin in slip."""
 
     system: DiscSystem
@@ -54,7 +54,7 @@ class Answer:
 
 def diagnose_motion(
     trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings | None = None
-) -> Answer:
+) -> SlipDiagnosis:
     """Diagnose the motion, rolling or slipping at its start. Raises AnalysisError."""
     settings = settings or Settings()
     as_tracked = trajectory
@@ -81,12 +81,12 @@ def diagnose_motion(
         alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
             return _slipping(trajectory, model, faults, settings, rolling, base, onset)
-    return Answer(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
+    return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
 
 
-def _with_large(assumed: Assumed, settings: Settings) -> Answer:
+def _with_large(assumed: Assumed, settings: Settings) -> SlipDiagnosis:
     diagnosis = with_large(diagnose(assumed.system, assumed.base.values, settings), assumed)
-    return Answer(assumed.system, diagnosis, notes=(*assumed.system.stretch.notes, in_words(assumed)))
+    return SlipDiagnosis(assumed.system, diagnosis, notes=(*assumed.system.stretch.notes, in_words(assumed)))
 
 
 def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:
@@ -109,7 +109,7 @@ def _slipping(
     rolling: DiscSystem,
     base: Fit,
     onset: RollingOnset,
-) -> Answer:
+) -> SlipDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     systematic = rolling.systematic
     system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
@@ -119,11 +119,11 @@ def _slipping(
         if later is not None:
             return later
     if diagnosis.held_out_after is None or not _declares(system):
-        return Answer(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis)))
+        return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis)))
     rows = training_rows(system, settings.train_fraction)
     judged = diagnosis.judged or system
     slip = SlipStart(base, held_out(judged, base.quantities, base.values, rows), _candidate(system))
-    return Answer(system, diagnosis, slip, (*system.stretch.notes, *_in_words(system, diagnosis)))
+    return SlipDiagnosis(system, diagnosis, slip, (*system.stretch.notes, *_in_words(system, diagnosis)))
 
 
 def _declares(system: DiscSystem) -> bool:
@@ -137,7 +137,7 @@ def _after_slip(
     settings: Settings,
     onset: RollingOnset,
     slipping: Diagnosis,
-) -> Answer | None:
+) -> SlipDiagnosis | None:
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
         stretch = free_stretch(rolling.trajectory, onset.high)
@@ -152,7 +152,7 @@ def _after_slip(
         f"the disc slips until {onset.time:.4f} s (95 %: {onset.low:.4f} to {onset.high:.4f} s), and no coefficient of "
         f"friction describes that ({left}): this is the diagnosis of what comes after it"
     )
-    return Answer(system, diagnosis, notes=(*system.stretch.notes, note))
+    return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, note))
 
 
 def _candidate(system: DiscSystem) -> Candidate:

@@ -40,7 +40,7 @@ class SmoothNoise:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SampleStretch:
     """Samples that share errors, and what a model may absorb of them."""
 
     time: Array  # (n,)
@@ -49,7 +49,7 @@ class Stretch:
     part: NDArray[np.int64] | None = None  # (n,) samples of different parts have independent errors
 
 
-def estimate(stretches: Sequence[Stretch], start: SmoothNoise) -> SmoothNoise:
+def estimate(stretches: Sequence[SampleStretch], start: SmoothNoise) -> SmoothNoise:
     """Restricted maximum likelihood: what is left in all stretches after their bases are cleared out.
 
     A memory beyond a fifth of the longest stretch is not sought: such an error looks like the motion itself.
@@ -70,7 +70,7 @@ def estimate(stretches: Sequence[Stretch], start: SmoothNoise) -> SmoothNoise:
     return SmoothNoise(*np.exp(found.x).tolist())
 
 
-def _minus_log_likelihood(s: Stretch, noise: SmoothNoise) -> float:
+def _minus_log_likelihood(s: SampleStretch, noise: SmoothNoise) -> float:
     K = noise.covariance(s.time)
     if s.part is not None:
         K = np.where(s.part[:, None] == s.part[None, :], K, 0.0)

@@ -13,7 +13,7 @@ from scipy.signal import periodogram
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import frequencies, simulated
-from disctrack.diagnosis.disc.free_runs import Evidence, Measured, force_of
+from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
@@ -23,7 +23,7 @@ from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 N_TRIED = 14
 
 
-def all_figures(result: DiscDiagnosis, beside: Evidence | None) -> tuple[Drawn, ...]:
+def all_figures(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> tuple[Drawn, ...]:
     """Every figure of a diagnosis whose base fit converged; of another what was tried."""
     held = result.diagnosis.held_out_before, result.after_held_out
     if beside is None or held[0] is None or held[1] is None:
@@ -37,7 +37,7 @@ def all_figures(result: DiscDiagnosis, beside: Evidence | None) -> tuple[Drawn, 
     return tuple(replace(d, name=f"{i:02d}_{d.name}") for i, d in enumerate(found, start=1))
 
 
-def superposed(result: DiscDiagnosis, beside: Evidence) -> Drawn:
+def superposed(result: DiscDiagnosis, beside: ModelFreeEvidence) -> Drawn:
     """Nutation, precession rate and path: measurement, model before, model after (figures 17 and 18 of the paper)."""
     system, diagnosis = result.system, result.diagnosis
     figure = Figure(figsize=(9.5, 6.4), layout="constrained")
@@ -196,7 +196,7 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
     return Drawn("missing_moment", "The missing moment", caption, figure)
 
 
-def force(result: DiscDiagnosis, measured: Measured) -> Drawn:
+def force(result: DiscDiagnosis, measured: ModelFreeForces) -> Drawn:
     """Force on the disc that the model fails to supply, from the accelerations alone, and what was found adds to it."""
     system = result.system
     before, after = force_of(system, result.diagnosis.before), force_of(system, result.after_fit)

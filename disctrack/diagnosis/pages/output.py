@@ -22,7 +22,7 @@ from disctrack.frames import COORDINATES, POSE_COMPONENTS
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
-    from disctrack.diagnosis.disc.free_runs import Evidence
+    from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
 
 GROUP = "diagnosis"
 
@@ -152,7 +152,7 @@ def _learned(learned: Learned) -> dict[str, Any]:
     }
 
 
-def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, Any]:
+def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     diagnosis = result.diagnosis
     apart = result.separated_by
@@ -180,7 +180,9 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
     return dict(plain(document))
 
 
-def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, document: dict[str, Any]) -> None:
+def write_diagnosis(
+    path: Path, result: DiscDiagnosis, beside: ModelFreeEvidence | None, document: dict[str, Any]
+) -> None:
     """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
     system = result.system
     n = len(system.trajectory)
@@ -220,7 +222,7 @@ def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, 
     write_group(path, GROUP, variables, axes=axes, attributes=attributes)
 
 
-def lines(result: DiscDiagnosis, beside: Evidence | None = None) -> list[str]:
+def lines(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> list[str]:
     """Some lines for the terminal."""
     before, after = result.before, result.after
     found = [f"{'verdict':<13} {result.diagnosis.verdict}", f"{'':<13} {result.sentence}"]

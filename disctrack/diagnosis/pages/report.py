@@ -8,7 +8,7 @@ import numpy as np
 
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
-from disctrack.diagnosis.disc.free_runs import Evidence
+from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
 from disctrack.diagnosis.engine.search import Found
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
@@ -19,7 +19,9 @@ from disctrack.pages.figures import draw, gallery
 from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, text
 
 
-def write_report(folder: Path, result: DiscDiagnosis, beside: Evidence | None, recording: str) -> tuple[Path, ...]:
+def write_report(
+    folder: Path, result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: str
+) -> tuple[Path, ...]:
     """Write diagnosis.html and figures/*.png; returns the files. Raises OutputError."""
     figures = all_figures(result, beside)
     files, pictures = draw(folder, figures, ["png"])
@@ -28,7 +30,7 @@ def write_report(folder: Path, result: DiscDiagnosis, beside: Evidence | None, r
     return (written, *files)
 
 
-def _page(result: DiscDiagnosis, beside: Evidence | None, recording: str, figures: str) -> str:
+def _page(result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: str, figures: str) -> str:
     verdict = f"Verdict: <b>{text(result.diagnosis.verdict)}</b>. Model: {text(result.model)}. "
     parts = [
         paragraph(result.sentence, "lead"),
@@ -81,7 +83,7 @@ def _class_text(found: Found, result: DiscDiagnosis) -> str:
     return " ".join(texts)
 
 
-def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[str]:
+def _before_after(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> list[str]:
     before, after = result.before, result.after
     if before is None or after is None or beside is None:
         return []
@@ -136,7 +138,7 @@ def _laws(result: DiscDiagnosis) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _energy(result: DiscDiagnosis, beside: Evidence) -> list[tuple[str, str, str]]:
+def _energy(result: DiscDiagnosis, beside: ModelFreeEvidence) -> list[tuple[str, str, str]]:
     """Energy balance of both models, and the loss that the poses alone show."""
     rows = []
     for name in {**beside.energy_before, **result.energy}:

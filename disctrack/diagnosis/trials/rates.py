@@ -44,7 +44,7 @@ AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
 
 
 @dataclass(frozen=True)
-class Recording:
+class Filmed:
     """What is filmed, before anything is planted."""
 
     seed: int
@@ -62,7 +62,7 @@ class Verdict:
 
     hidden: tuple[str, ...]
     size: tuple[float, ...]
-    recording: Recording
+    recording: Filmed
     verdict: str
     sentence: str
     found: tuple[str, ...]  # every effect claimed, its class after it in brackets
@@ -88,13 +88,13 @@ class Verdict:
         return self.named and abs(self.pull) <= ENOUGH
 
 
-def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Recording:
+def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Filmed:
     """A motion that lasts as long as it is filmed, whatever is planted in it."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
     for _ in range(DRAWS):
         theta = float(rng.uniform(*THETA_DEG))
-        recording = Recording(
+        recording = Filmed(
             seed,
             int(rate * rng.uniform(*DURATION)),
             theta,
@@ -133,7 +133,7 @@ def _changed(a: Faults | Unseen, null: Faults | Unseen) -> dict[str, Any]:
     return {f.name: getattr(a, f.name) for f in fields(a) if getattr(a, f.name) != getattr(null, f.name)}
 
 
-def trajectory_of(recording: Recording, planted: Planted, n: int | None = None) -> Trajectory:
+def trajectory_of(recording: Filmed, planted: Planted, n: int | None = None) -> Trajectory:
     """The measured trajectory, of its first `n` frames if given."""
     return measured(
         planted.effects,

@@ -6,8 +6,8 @@ from pkgutil import iter_modules
 from disctrack.rolling.effects.base import (
     CATALOGUE,
     Effect,
+    EffectParameter,
     ModelError,
-    Parameter,
     catalogue,
     catalogue_table,
     effect_class,
@@ -21,8 +21,8 @@ from disctrack.rolling.effects.learned import effect_from_formulas  # noqa: E402
 __all__ = [
     "CATALOGUE",
     "Effect",
+    "EffectParameter",
     "ModelError",
-    "Parameter",
     "catalogue",
     "catalogue_table",
     "effect_class",

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, Parameter, magnitude
+from disctrack.rolling.effects.base import Effect, EffectParameter, magnitude
 
 AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
 AIR_VISCOSITY = 1.81e-5  # [Pa s]
@@ -18,7 +18,7 @@ class MoffattAirLayer(Effect):
     source = "Moffatt 2000, Nature 404:833; mu = 1.81e-5 Pa s"
     belongs_to = ("air",)
     density_power = 0.0
-    parameters = (Parameter("f", "1", 1.0, "factor on the lubrication layer", lower=0.0),)
+    parameters = (EffectParameter("f", "1", 1.0, "factor on the lubrication layer", lower=0.0),)
     counter_rotating = True  # reads psidot, works on phidot
 
     @staticmethod
@@ -35,7 +35,7 @@ class BildstenAirLayer(Effect):
     source = "Bildsten 2002, Phys. Rev. E 66:056309; rho = 1.2 kg/m^3"
     belongs_to = ("air",)
     density_power = 0.5
-    parameters = (Parameter("beta", "1", 1.0, "factor of order one", lower=0.0),)
+    parameters = (EffectParameter("beta", "1", 1.0, "factor of order one", lower=0.0),)
     counter_rotating = True
 
     @staticmethod
@@ -53,7 +53,7 @@ class QuadraticAirDrag(Effect):
     source = "dimensional analysis; a about 0.1, rho = 1.2 kg/m^3"
     belongs_to = ("air",)
     density_power = 1.0
-    parameters = (Parameter("a", "1", 0.1, "drag coefficient", lower=0.0),)
+    parameters = (EffectParameter("a", "1", 0.1, "drag coefficient", lower=0.0),)
     airborne = True
 
     @staticmethod
@@ -75,7 +75,7 @@ class SpinAirDrag(Effect):
     source = "Jalali, Sarebangholi and Alam 2015, Phys. Rev. E 92:032913"
     belongs_to = ("air", "disc")
     density_power = 0.0
-    parameters = (Parameter("a", "N m s", 1e-7, "moment per spin rate", lower=0.0),)
+    parameters = (EffectParameter("a", "N m s", 1e-7, "moment per spin rate", lower=0.0),)
     airborne = True
 
     @staticmethod
@@ -92,7 +92,7 @@ class RotationDrag(Effect):
     source = "viscous drag of a fluid at rest, Stokes' law for rotation"
     belongs_to = ("air", "disc")
     density_power = 0.0
-    parameters = (Parameter("c", "N m s", 1e-6, "moment per angular velocity", lower=0.0),)
+    parameters = (EffectParameter("c", "N m s", 1e-6, "moment per angular velocity", lower=0.0),)
     airborne = True
 
     @staticmethod
@@ -110,7 +110,7 @@ class LinearDrag(Effect):
     source = "Stokes' law; an eddy-current brake or a draught at rest has the same form"
     belongs_to = ("air", "disc")
     density_power = 0.0
-    parameters = (Parameter("c", "N s/m", 1e-4, "force per velocity of the centre", lower=0.0),)
+    parameters = (EffectParameter("c", "N s/m", 1e-4, "force per velocity of the centre", lower=0.0),)
     airborne = True
 
     @staticmethod

@@ -29,7 +29,7 @@ CATALOGUE: dict[str, type[Effect]] = {}
 
 
 @dataclass(frozen=True)
-class Parameter:
+class EffectParameter:
     """One number of an effect."""
 
     name: str
@@ -61,7 +61,7 @@ class Effect:
     name: ClassVar[str]
     title: ClassVar[str]
     source: ClassVar[str]
-    parameters: ClassVar[tuple[Parameter, ...]]
+    parameters: ClassVar[tuple[EffectParameter, ...]]
     passive: ClassVar[bool] = True  # its power is never positive ...
     counter_rotating: ClassVar[bool] = False  # ... provided that psidot phidot < 0, as in every rolling down
     airborne: ClassVar[bool] = False  # acts also without contact

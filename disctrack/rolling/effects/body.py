@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, Parameter
+from disctrack.rolling.effects.base import Effect, EffectParameter
 
 
 class TableTilt(Effect):
@@ -15,8 +15,8 @@ class TableTilt(Effect):
     source = "geometry; k stays the normal of the table"
     belongs_to = ("rig", "surface")
     parameters = (
-        Parameter("tilt_x", "rad", 1e-3, "direction cosine of gravity along i", lower=-0.5, upper=0.5),
-        Parameter("tilt_y", "rad", 1e-3, "direction cosine of gravity along j", lower=-0.5, upper=0.5),
+        EffectParameter("tilt_x", "rad", 1e-3, "direction cosine of gravity along i", lower=-0.5, upper=0.5),
+        EffectParameter("tilt_y", "rad", 1e-3, "direction cosine of gravity along j", lower=-0.5, upper=0.5),
     )
     passive = False
 
@@ -35,7 +35,7 @@ class Gravity(Effect):
     title = "gravity differs by g_error"
     source = "local value of g"
     belongs_to = ("rig",)
-    parameters = (Parameter("g_error", "m/s^2", 0.01, "gravity minus the declared one", lower=-5.0, upper=5.0),)
+    parameters = (EffectParameter("g_error", "m/s^2", 0.01, "gravity minus the declared one", lower=-5.0, upper=5.0),)
     passive = False
 
     @staticmethod
@@ -53,9 +53,9 @@ class CentreOfMass(Effect):
     source = "rigid-body mechanics; c_3 along e3"
     belongs_to = ("disc",)
     parameters = (
-        Parameter("c_1", "m", 1e-4, "along the first body axis"),
-        Parameter("c_2", "m", 1e-4, "along the second body axis"),
-        Parameter("c_3", "m", 1e-4, "along the axis of the disc, towards the upper face"),
+        EffectParameter("c_1", "m", 1e-4, "along the first body axis"),
+        EffectParameter("c_2", "m", 1e-4, "along the second body axis"),
+        EffectParameter("c_3", "m", 1e-4, "along the axis of the disc, towards the upper face"),
     )
     passive = False
 
@@ -73,7 +73,9 @@ class ContactRadius(Effect):
     title = "radius of the contact circle differs by r_error"
     source = "geometry (chamfer, burr, micrometer error)"
     belongs_to = ("disc",)
-    parameters = (Parameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),)
+    parameters = (
+        EffectParameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),
+    )
     passive = False
 
     @staticmethod
@@ -88,7 +90,9 @@ class ContactHeight(Effect):
     title = "half thickness at the contact differs by h_error"
     source = "geometry (paper, chamfer, micrometer error)"
     belongs_to = ("disc",)
-    parameters = (Parameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),)
+    parameters = (
+        EffectParameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),
+    )
     passive = False
 
     @staticmethod
@@ -103,7 +107,7 @@ class RoundedEdge(Effect):
     title = "edge rounded with radius rho"
     source = "geometry: r_OA = -(r - rho) e2 - (h - rho) e3 - rho k"
     belongs_to = ("disc",)
-    parameters = (Parameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),)
+    parameters = (EffectParameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),)
     passive = False
 
     @staticmethod
@@ -118,7 +122,7 @@ class DiametralInertia(Effect):
     title = "J1 and J2 multiplied by 1 + e"
     source = "holes, rims, inhomogeneous material"
     belongs_to = ("disc",)
-    parameters = (Parameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),)
+    parameters = (EffectParameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),)
     passive = False
 
     @staticmethod
@@ -134,7 +138,7 @@ class AxialInertia(Effect):
     title = "J3 multiplied by 1 + e"
     source = "holes, rims, inhomogeneous material"
     belongs_to = ("disc",)
-    parameters = (Parameter("e", "1", 0.01, "relative change of J3", lower=-0.5, upper=1.0),)
+    parameters = (EffectParameter("e", "1", 0.01, "relative change of J3", lower=-0.5, upper=1.0),)
     passive = False
 
     @staticmethod
@@ -150,8 +154,8 @@ class InertiaProduct(Effect):
     source = "wedge, dynamic imbalance"
     belongs_to = ("disc",)
     parameters = (
-        Parameter("J_13", "kg m^2", 1e-8, "moment of deviation between the first body axis and e3"),
-        Parameter("J_23", "kg m^2", 1e-8, "moment of deviation between the second body axis and e3"),
+        EffectParameter("J_13", "kg m^2", 1e-8, "moment of deviation between the first body axis and e3"),
+        EffectParameter("J_23", "kg m^2", 1e-8, "moment of deviation between the second body axis and e3"),
     )
     passive = False
 
@@ -168,7 +172,7 @@ class Slip(Effect):
     title = "Coulomb friction, |F_t| <= mu F_z, F_t = -mu F_z v_A / |v_A| in slip"
     source = "Coulomb's law at the contact"
     parameters = (
-        Parameter("mu", "1", 0.2, "coefficient of friction; infinite = never slips", null=np.inf, lower=1e-3),
+        EffectParameter("mu", "1", 0.2, "coefficient of friction; infinite = never slips", null=np.inf, lower=1e-3),
     )
     passive = False  # acts through the constraint force, not through the wrench of a law
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import CATALOGUE, Effect, ModelError, Parameter, magnitude, sign
+from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter, ModelError, magnitude, sign
 from disctrack.rolling.records import KINEMATICS, WRENCH
 
 _COMPONENTS = WRENCH[:9]
@@ -32,7 +32,7 @@ _ALLOWED = (
 def effect_from_formulas(
     name: str,
     formulas: Mapping[str, str],
-    parameters: tuple[Parameter, ...] = (),
+    parameters: tuple[EffectParameter, ...] = (),
     *,
     title: str = "",
     source: str = "learned from a residual",
@@ -50,7 +50,7 @@ def effect_from_formulas(
 def _effect(
     name: str,
     pairs: tuple[tuple[str, str], ...],
-    parameters: tuple[Parameter, ...],
+    parameters: tuple[EffectParameter, ...],
     title: str,
     source: str,
     passive: bool,
@@ -77,7 +77,7 @@ def _effect(
         "name": name,
         "title": title or "; ".join(f"{k} = {v}" for k, v in formulas.items()),
         "source": source,
-        "parameters": tuple(given.get(n, Parameter(n, "SI", 1.0, "number of the formula")) for n in free),
+        "parameters": tuple(given.get(n, EffectParameter(n, "SI", 1.0, "number of the formula")) for n in free),
         "passive": passive,
         "formulas": formulas,
         "law": staticmethod(namespace["law"]),

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, Parameter, sign
+from disctrack.rolling.effects.base import Effect, EffectParameter, sign
 
 SMOOTH_PIVOTING = 1e-2  # [rad/s] width of the sign at omega_z = 0, crossed within some ms
 
@@ -15,7 +15,7 @@ class PivotingFriction(Effect):
     name = "kz"
     title = "pivoting friction, M_z = -k_z F_z sgn omega_z"
     source = "Ma et al. 2014, (5.2); Coulomb-Contensou: k_z = 2/3 mu a of a contact of radius a"
-    parameters = (Parameter("k_z", "m", 1e-5, "lever arm", lower=0.0),)
+    parameters = (EffectParameter("k_z", "m", 1e-5, "lever arm", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -28,7 +28,7 @@ class ViscousPivotingFriction(Effect):
     name = "pivoting_viscous"
     title = "viscous pivoting friction, M_z = -k F_z omega_z"
     source = "Coulomb-Contensou friction linearised in the pivoting rate, Leine and Glocker 2003"
-    parameters = (Parameter("k", "m s", 1e-5, "lever arm per pivoting rate", lower=0.0),)
+    parameters = (EffectParameter("k", "m s", 1e-5, "lever arm per pivoting rate", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -42,9 +42,11 @@ class ContensouPivotingFriction(Effect):
     title = "Coulomb-Contensou pivoting friction, M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2)"
     source = "Leine and Glocker 2003, Eur. J. Mech. A 22:193 (smooth approximation of the Contensou coupling)"
     parameters = (
-        Parameter("k", "m", 1e-5, "lever arm of full pivoting", lower=0.0),
-        Parameter("omega_s", "rad/s", 1.0, "pivoting rate below which creep dominates", lower=1e-2, is_shape=True),
-        Parameter("a", "m", 75e-6, "radius of the contact", lower=1e-7, is_shape=True),
+        EffectParameter("k", "m", 1e-5, "lever arm of full pivoting", lower=0.0),
+        EffectParameter(
+            "omega_s", "rad/s", 1.0, "pivoting rate below which creep dominates", lower=1e-2, is_shape=True
+        ),
+        EffectParameter("a", "m", 75e-6, "radius of the contact", lower=1e-7, is_shape=True),
     )
 
     @staticmethod

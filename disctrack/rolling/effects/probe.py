@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, Parameter
+from disctrack.rolling.effects.base import Effect, EffectParameter
 
 
 class WrenchProbe(Effect):
@@ -14,10 +14,10 @@ class WrenchProbe(Effect):
     title = "moment (M_n, M_m, M_z) and force (X_n, X_m, X_z) times exp(-(t - t_0)^2 / (2 width^2))"
     source = "tool: a residual motion, resolved into probes at successive t_0, is the moment that a model lacks"
     parameters = (
-        *(Parameter(f"M_{a}", "N m", 1e-5, f"moment along {a}") for a in ("n", "m", "z")),
-        *(Parameter(f"X_{a}", "N", 1e-3, f"force on the centre along {a}") for a in ("n", "m", "z")),
-        Parameter("t_0", "s", 0.1, "middle of the probe", is_shape=True),
-        Parameter("width", "s", 0.01, "standard deviation of its course", lower=1e-3, is_shape=True),
+        *(EffectParameter(f"M_{a}", "N m", 1e-5, f"moment along {a}") for a in ("n", "m", "z")),
+        *(EffectParameter(f"X_{a}", "N", 1e-3, f"force on the centre along {a}") for a in ("n", "m", "z")),
+        EffectParameter("t_0", "s", 0.1, "middle of the probe", is_shape=True),
+        EffectParameter("width", "s", 0.01, "standard deviation of its course", lower=1e-3, is_shape=True),
     )
     passive = False
     candidate = False

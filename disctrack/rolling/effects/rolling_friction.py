@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, Parameter, magnitude, sign
+from disctrack.rolling.effects.base import Effect, EffectParameter, magnitude, sign
 
 SLOWEST_ROLLING = 1e-3  # [rad/s] rolling rate below which the classical law is smoothed; the disc's is above 1
 
@@ -15,7 +15,7 @@ class PrecessionFriction(Effect):
     name = "km"
     title = "rolling friction on the precession, M_m = -k_m F_z psidot |psidot|"
     source = "Ma et al. 2014, (5.4); 0.381e-7 on steel, 0.28e-7 on glass"
-    parameters = (Parameter("k_m", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),)
+    parameters = (EffectParameter("k_m", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),)
     counter_rotating = True  # reads psidot, works on phidot
 
     @staticmethod
@@ -29,7 +29,7 @@ class AxisFriction(Effect):
     name = "km_e2"
     title = "rolling friction along e2, M = -k F_z psidot |psidot| e2"
     source = "variant of Ma et al. 2014, (5.4): direction of the dissipative moment"
-    parameters = (Parameter("k", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),)
+    parameters = (EffectParameter("k", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -44,7 +44,7 @@ class NutationFriction(Effect):
     name = "kn"
     title = "rolling friction on the nutation, M_n = -k_n F_z thetadot |thetadot|"
     source = "Ma et al. 2014, (5.3)"
-    parameters = (Parameter("k_n", "m s^2", 0.381e-7, "lever arm per squared nutation rate", lower=0.0),)
+    parameters = (EffectParameter("k_n", "m s^2", 0.381e-7, "lever arm per squared nutation rate", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -58,8 +58,8 @@ class PowerFriction(Effect):
     title = "rolling friction with a free exponent, M_m = -k F_z |psidot / (100 rad/s)|^p sgn psidot"
     source = "generalises Ma et al. 2014, (5.4): p = 2, k = 1e4 k_m"
     parameters = (
-        Parameter("k", "m", 1e-4, "lever arm at 100 rad/s", lower=0.0),
-        Parameter("p", "1", 1.5, "exponent of the precession rate", lower=0.0, upper=4.0, is_shape=True),
+        EffectParameter("k", "m", 1e-4, "lever arm at 100 rad/s", lower=0.0),
+        EffectParameter("p", "1", 1.5, "exponent of the precession rate", lower=0.0, upper=4.0, is_shape=True),
     )
     counter_rotating = True
 
@@ -75,7 +75,7 @@ class DryContourFriction(Effect):
     name = "contour_dry"
     title = "dry contour friction, M_m = mu_c F_z r sgn(phidot) / sin theta"
     source = "Leine 2009, Arch. Appl. Mech. 79:1063; power as in Easwar et al. 2002"
-    parameters = (Parameter("mu_c", "1", 1.06e-3, "coefficient of contour friction", lower=0.0),)
+    parameters = (EffectParameter("mu_c", "1", 1.06e-3, "coefficient of contour friction", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -88,7 +88,7 @@ class ViscousContourFriction(Effect):
     name = "contour_viscous"
     title = "viscous contour friction, M_m = c r^2 phidot / sin theta"
     source = "Leine 2009, Arch. Appl. Mech. 79:1063; power as in McDonald and McDonald 2001"
-    parameters = (Parameter("c", "N s/m", 1e-5, "viscous coefficient along the contour", lower=0.0),)
+    parameters = (EffectParameter("c", "N s/m", 1e-5, "viscous coefficient along the contour", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -101,7 +101,7 @@ class ClassicalRollingFriction(Effect):
     name = "rolling_classical"
     title = "classical rolling friction, M = -delta F_z (thetadot n0 - phidot sin theta m0) / |...|"
     source = "Le Saux, Leine and Glocker 2005; Kessler and O'Reilly 2002"
-    parameters = (Parameter("delta", "m", 1e-5, "lever arm: half width of the contact", lower=0.0),)
+    parameters = (EffectParameter("delta", "m", 1e-5, "lever arm: half width of the contact", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
@@ -117,7 +117,7 @@ class ViscousRollingFriction(Effect):
     name = "rolling_viscous"
     title = "viscous rolling friction, M = -c F_z (thetadot n0 - phidot sin theta m0)"
     source = "Borisov, Kilin and Karavaev 2017, Phys.-Usp. 60:931"
-    parameters = (Parameter("c", "m s", 1e-6, "lever arm per rolling rate", lower=0.0),)
+    parameters = (EffectParameter("c", "m s", 1e-6, "lever arm per rolling rate", lower=0.0),)
 
     @staticmethod
     def law(p: Any, s: Any, w: Any) -> None:
