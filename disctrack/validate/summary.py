@@ -31,7 +31,7 @@ CONSISTENT = (0.8, 1.25)
 
 
 @dataclass(frozen=True)
-class Row:
+class SummaryRow:
     """Errors of one quantity: everything, and its two shares measured on the same images."""
 
     quantity: str
@@ -74,7 +74,7 @@ class Summary:
     """All that a validation found."""
 
     recordings: int
-    rows: dict[str, tuple[Row, ...]]  # by kind of motion
+    rows: dict[str, tuple[SummaryRow, ...]]  # by kind of motion
     sights: tuple[SightCount, ...]
     strata: tuple[Stratum, ...]
     noise_consistency: dict[str, Consistency]
@@ -139,7 +139,7 @@ def _law_from(static: Sequence[Pair]) -> float:
     return float(np.sqrt(np.mean(scaled**2)))
 
 
-def _rows(parts: Sequence[Pair], efficiency: Efficiency | None) -> tuple[Row, ...]:
+def _rows(parts: Sequence[Pair], efficiency: Efficiency | None) -> tuple[SummaryRow, ...]:
     own, true = joined([a for a, _ in parts]), joined([b for _, b in parts])
     both = own.usable & true.usable
     own, true = own.part(both), true.part(both)
@@ -157,7 +157,7 @@ def _rows(parts: Sequence[Pair], efficiency: Efficiency | None) -> tuple[Row, ..
             bound = float(np.sqrt(np.mean(efficiency.bound[seen, k] ** 2)))
         e, f = a.of(name), b.of(name)
         difference = np.angle(np.exp(1j * (e - f))) if k >= 3 else e - f
-        rows.append(Row(label, spread(e), spread(f), spread(difference), bound, CLAIM[name]))
+        rows.append(SummaryRow(label, spread(e), spread(f), spread(difference), bound, CLAIM[name]))
     return tuple(rows)
 
 

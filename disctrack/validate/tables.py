@@ -11,7 +11,7 @@ import numpy as np
 from disctrack.files.json_text import plain
 from disctrack.validate.comparison import QUANTITIES, Consistency
 from disctrack.validate.efficiency import Efficiency
-from disctrack.validate.summary import CONSISTENT, Row, Summary, complaints, verdict
+from disctrack.validate.summary import CONSISTENT, Summary, SummaryRow, complaints, verdict
 from disctrack.validate.trial import EXPOSURE
 
 _UM, _MDEG = 1e6, 180e3 / np.pi
@@ -65,7 +65,7 @@ def markdown(summary: Summary) -> str:
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
 
-def accuracy_table(rows: Sequence[Row]) -> str:
+def accuracy_table(rows: Sequence[SummaryRow]) -> str:
     """Bias, scatter, 95 %, maximum, both shares, bound and claim of each quantity."""
     head = ["quantity", "unit", "n", "bias", "scatter", "95 %", "max", "noise rms (true cameras)",
             "calibration rms", "bound", "claim", "claim / 95 %"]  # fmt: skip
