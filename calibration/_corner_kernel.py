@@ -80,8 +80,9 @@ def normal_equations(image, window, p, curvature, noise, weights, first_pass, H,
     weights : of the window's pixels; filled in the first pass from the noise at the model's grey values, then left, so
     that chi-square is one function of p and Gauss-Newton's step goes down on it
 
-    window (13,): x0, x1, y0, y1 [px, inclusive]; centre x, y; inverse of the local axes, row by row; half widths along
-    i and j [squares]; largest step [px].
+    window (14,): x0, x1, y0, y1 [px, inclusive]; centre x, y; inverse of the local axes, row by row; half widths along
+    i and j [squares]; largest step [px]; distance from both edges [squares] beyond which the light squares are
+    not plain (a marker), positive if they lie where i j > 0, negative if where i j < 0.
     """
     gradient, S4 = np.zeros(N_CORNER), np.empty(4)
     H[:] = 0.0
@@ -98,7 +99,10 @@ def normal_equations(image, window, p, curvature, noise, weights, first_pass, H,
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
             wx, wy = x - window[4], y - window[5]
-            if abs(window[6] * wx + window[7] * wy) > window[10] or abs(window[8] * wx + window[9] * wy) > window[11]:
+            wi, wj = window[6] * wx + window[7] * wy, window[8] * wx + window[9] * wy
+            if abs(wi) > window[10] or abs(wj) > window[11]:
+                continue
+            if window[13] * wi * wj > 0.0 and min(abs(wi), abs(wj)) > abs(window[13]):
                 continue
             dx, dy = x - p[0], y - p[1]
             along1, across1 = c1 * dx + s1 * dy, -s1 * dx + c1 * dy

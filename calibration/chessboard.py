@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
+from calibration.board import board_orders
 from calibration.corner_fit import CornerView, fit_view, local_axes
 from calibration.grey_levels import level_step
 
@@ -58,7 +59,7 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
     step = level_step(grey)
     if step > 1:  # an image whose values are multiples of a step is that image, whatever the step
         grey = grey // step
-    start = _rough_corners(_as_8_bit(grey), inner_corners, thorough)
+    start = _rough_corners(as_8_bit(grey), inner_corners, thorough)
     if start is None:
         columns, rows = inner_corners
         return BoardNotFound(
@@ -78,11 +79,16 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
     beyond = _larger_board(values, view, inner_corners)
     if beyond:
         return BoardNotFound(beyond)
+    return in_file_units(view, step, notes)
+
+
+def in_file_units(view: CornerView, step: int, notes: tuple[str, ...]) -> CornerView:
+    """A view of an image that was divided by the step of its grey values, in the grey values of the file."""
     noise = (view.noise[0] * step**2, view.noise[1] * step)
     return replace(view, notes=notes, contrast=view.contrast * step, noise=noise)
 
 
-def _as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
+def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
     """Grey values stretched to 8 bit, for the rough search only."""
     if grey.dtype == np.uint8:
         return grey
@@ -105,14 +111,6 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
         return None
     points = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     return points if len(points) == inner_corners[0] * inner_corners[1] else None
-
-
-def board_orders(inner_corners: tuple[int, int]) -> list[NDArray[np.intp]]:
-    """The turns of the board in its own plane that map its corners onto themselves: 2, or 4 for a square board."""
-    columns, rows = inner_corners
-    index = np.arange(columns * rows).reshape(rows, columns)
-    turns = (0, 1, 2, 3) if columns == rows else (0, 2)
-    return [np.rot90(index, k).ravel() for k in turns]
 
 
 def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Array | BoardNotFound:

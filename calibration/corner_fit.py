@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibration._corner_kernel import N_CORNER, fit_corners
 from calibration.arrays import Array, Mask
-from calibration.robust_corners import LEAST_SIGMA, saddle_points, smooth_grid
+from calibration.robust_corners import LEAST_SIGMA, WINDOW, saddle_points, smooth_grid
 
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
 MIN_WINDOW = 0.3
@@ -28,7 +28,7 @@ MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, ano
 
 def prepare() -> None:
     """Compile the fit of corners, or load it: some seconds once per installation, then nothing."""
-    fit_corners(np.zeros((8, 8)), np.zeros((0, 13)), np.zeros((0, N_CORNER)), np.zeros((0, 2)), np.zeros(2), 1, 1e-2)
+    fit_corners(np.zeros((8, 8)), np.zeros((0, 14)), np.zeros((0, N_CORNER)), np.zeros((0, 2)), np.zeros(2), 1, 1e-2)
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class CornerView:
     points: Array  # (n, 2) [px]
     covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
     accepted: Mask  # (n,)
-    reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds
+    reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds, or was not in view
     chi_square: Array  # (n,) reduced, of the pixels on the edges; NaN where a saddle point stands in for their fit
     contrast: Array  # (n,) light minus dark [grey]
     blur: Array  # (n,) sigma of the edges [px]
@@ -60,17 +60,28 @@ class CornerView:
         return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
 
 
-def fit_view(grey: Array, rough: Array, inner_corners: tuple[int, int]) -> CornerView:
-    """Fit every corner twice: first to learn blur, noise and the bend of the lines, then with them."""
+def fit_view(
+    grey: Array,
+    rough: Array,
+    inner_corners: tuple[int, int],
+    seen: Mask | None = None,
+    plain: float = 1.0,
+) -> CornerView:
+    """Fit every corner twice: first to learn blur, noise and the bend of the lines, then with them.
+
+    rough : (n, 2) [px] of all corners; where one is not `seen` (n,), the place where the others put it
+    plain : how far, in squares, the light squares are plain on either side of an edge: markers leave a margin
+    """
     noise, blur, curvature = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 2))
-    points, ok = rough, np.ones(len(rough), bool)
+    seen = np.ones(len(rough), bool) if seen is None else seen
+    points, ok = rough, seen
     axes = local_axes(points, ok, inner_corners)
-    starts = _starts(grey, points, axes, blur)
+    starts = _starts(grey, points, axes, blur, 0.7 * min(plain, 0.57))
     for iterations, tolerance in ((12, 1e-2), (30, 1e-5)):
-        windows = _windows(points, axes, blur, grey.shape)
+        windows = _windows(points, axes, blur, grey.shape, -plain * np.sign(starts[:, 6]))
         fit = _Fit(*fit_corners(grey, windows, starts, curvature, noise, iterations, tolerance))
-        displaced = _displacement(fit.found[:, :2], axes, inner_corners)
-        ok = fit.converged & (displaced < MAX_DISPLACEMENT)
+        displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
+        ok = fit.converged & (displaced < MAX_DISPLACEMENT) & seen
         if not ok.any():
             break
         noise, blur = _measured_noise(fit.sums[ok]), float(np.median(fit.found[ok, 4]))
@@ -79,8 +90,8 @@ def fit_view(grey: Array, rough: Array, inner_corners: tuple[int, int]) -> Corne
         curvature = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
         starts = np.where(ok[:, None], fit.found, starts)
     fit = _with_smaller_windows(grey, fit, windows, starts, curvature, noise)
-    displaced = _displacement(fit.found[:, :2], axes, inner_corners)
-    return _judged(grey, fit, displaced, noise, axes, rough, inner_corners)
+    displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
+    return _judged(grey, fit, displaced, noise, axes, rough, inner_corners, seen, plain)
 
 
 @dataclass(frozen=True)
@@ -141,8 +152,8 @@ def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array
     return np.stack([(H[:2, axis] - image * H[2, axis]) / w[:, None] for axis in (0, 1)], axis=1)
 
 
-def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...]) -> Array:
-    """Window of every corner as the kernel wants it (n, 13)."""
+def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array) -> Array:
+    """Window of every corner as the kernel wants it (n, 14); plain (n,) with the sign of the light quadrants."""
     A = np.swapaxes(axes, 1, 2)  # columns are the images of i and j
     inverse = np.linalg.inv(A)
     area = np.abs(np.linalg.det(A))
@@ -154,12 +165,15 @@ def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...]) ->
     size = np.array([shape[1], shape[0]])
     low, high = np.clip(low, 0, size - 1), np.clip(high, -1, size - 1)
     step = 0.5 * between.min(axis=1)
-    return np.column_stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1], points, inverse.reshape(-1, 4), half, step])
+    box = [low[:, 0], high[:, 0], low[:, 1], high[:, 1], points, inverse.reshape(-1, 4), half, step]
+    near = (EDGE_MARGIN * blur + 0.7) / between.min(axis=1)  # the marker's edge, blurred, stays outside
+    clear = np.where(np.abs(plain) < 1, np.maximum(np.abs(plain) - near, 0.5 * np.abs(plain)), 1.0)
+    return np.column_stack([*box, clear * np.sign(plain)])
 
 
-def _starts(grey: Array, points: Array, axes: Array, blur: float) -> Array:
-    """Start values (n, 9): levels from the four squares round the corner."""
-    offsets = 0.4 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) -> Array:
+    """Start values (n, 9): levels from the four squares round the corner, so many squares aside of both edges."""
+    offsets = aside * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
     at = np.rint(points[:, None] + offsets @ axes).astype(int)
     x = np.clip(at[..., 0], 0, grey.shape[1] - 1)
     y = np.clip(at[..., 1], 0, grey.shape[0] - 1)
@@ -244,7 +258,15 @@ def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple
 
 
 def _judged(
-    grey: Array, fit: _Fit, displaced: Array, noise: Array, axes: Array, rough: Array, counts: tuple[int, int]
+    grey: Array,
+    fit: _Fit,
+    displaced: Array,
+    noise: Array,
+    axes: Array,
+    rough: Array,
+    counts: tuple[int, int],
+    seen: Mask,
+    plain: float,
 ) -> CornerView:
     """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
     found, sums = fit.found, fit.sums
@@ -253,7 +275,7 @@ def _judged(
     with np.errstate(invalid="ignore", divide="ignore"):
         chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
     contrast = 2 * np.abs(found[:, 6])
-    converged = fit.converged & np.isfinite(fit.covariance).all((1, 2))
+    converged = fit.converged & np.isfinite(fit.covariance).all((1, 2)) & seen
     typical = float(np.median(contrast[converged])) if converged.any() else 0.0
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
     chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
@@ -261,22 +283,22 @@ def _judged(
     fine = converged & (displaced < MAX_DISPLACEMENT) & ~faint & (chi_square < chi_limit)
     covariance = fit.covariance * np.maximum(chi_square, 1.0)[:, None, None]
     points, reasons = found[:, :2].copy(), np.where(faint, "covered, or in glare", "").astype(object)
-    saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing)
-    expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts)
-    _, sigma_saddle = smooth_grid(saddles, counts)
+    saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing * min(plain / WINDOW, 1.0))
+    expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts, seen)
+    _, sigma_saddle = smooth_grid(saddles, counts, seen)
     if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points lie smoother than the fine fits do
         fine = np.zeros_like(fine)
-        expected, sigma = smooth_grid(saddles, counts)
+        expected, sigma = smooth_grid(saddles, counts, seen)
     # edges that fit badly on both sides alike leave the corner where it is: no more error than the grid's scatter shows
     stated = float(np.sqrt(np.median(np.trace(covariance[fine], axis1=1, axis2=2)) / 2)) if fine.any() else sigma
     covariance = np.maximum(min(sigma / stated, 1.0) ** 2, 1 / np.maximum(chi_square, 1.0))[:, None, None] * covariance
     sigma_saddle = max(sigma_saddle, LEAST_SIGMA)
     off = np.linalg.norm(saddles - expected, axis=-1)
-    stands = ~fine & ~faint & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
+    stands = ~fine & ~faint & seen & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
     points[~fine] = saddles[~fine]
     covariance[~fine] = sigma_saddle**2 * np.eye(2)
     chi_square = np.where(fine, chi_square, np.nan)
-    for i in np.flatnonzero(~fine & ~stands & ~faint):
+    for i in np.flatnonzero(~fine & ~stands & ~faint & seen):
         reasons[i] = f"{off[i]:.1f} px from where the other corners put it (they scatter by {sigma_saddle:.2f} px)"
     return CornerView(
         image_size=(grey.shape[1], grey.shape[0]),

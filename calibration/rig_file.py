@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
-from calibration.board import Board
+from calibration.board import Board, Target, target_of
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Allowance, Camera, StereoRig
-from calibration.errors import RigFileError
+from calibration.errors import CalibrationError, RigFileError
 from calibration.splines import LensField
 from calibration.stereo import StereoCalibration
 from calibration.stereo_model import Observations
@@ -32,7 +32,7 @@ _READ_ERRORS = (OSError, KeyError, ValueError, TypeError, RuntimeError, Attribut
 class CalibrationRecord:
     """What a rig file holds beside the rig: where it comes from."""
 
-    board: Board
+    board: Target
     board_points: Array  # (n, 3) [m] as refined
     table_view: int | None
     board_thickness: float  # [m]
@@ -209,8 +209,8 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     text = h5py.string_dtype()
     group.create_dataset("rejected_corners", data=json.dumps(record.rejected_corners), dtype=text)
     group["rejected_corners"].attrs["description"] = "JSON list of view, camera, corner, reason"
-    _put(group, "inner_corners", record.board.inner_corners, "1", "of the board, along i and along j")
-    _put(group, "square", record.board.square, "m", "side of a square")
+    group.create_dataset("board", data=json.dumps(record.board.described()), dtype=text)
+    group["board"].attrs["description"] = "JSON object: kind of target and its fields, lengths in m"
     _put(group, "board_points", record.board_points, "m", "target points in board axes as refined")
     _put(group, "board_thickness", record.board_thickness, "m", "from the table to the printed face")
     _put(group, "unexplained_sigma", record.unexplained_sigma, "px", "per axis, added to each corner's own noise")
@@ -333,13 +333,22 @@ def _lens_field(group: h5py.Group) -> LensField:
     return LensField(coefficients, spacing)
 
 
+def _board(group: h5py.Group) -> Target:
+    if "board" in group:
+        try:
+            return target_of(json.loads(group["board"].asstr()[()]))
+        except CalibrationError as error:
+            raise RigFileError(f"{group.name}: {error}") from error
+    counts = _get(group, "inner_corners", (2,), "iu")  # files that knew chessboards only
+    return Board((int(counts[0]), int(counts[1])), float(_get(group, "square", ())))
+
+
 def _read_record(group: h5py.Group) -> CalibrationRecord:
     def attribute(name: str) -> Any:
         return json.loads(group.attrs[name])
 
-    counts = _get(group, "inner_corners", (2,), "iu")
-    board = Board((int(counts[0]), int(counts[1])), float(_get(group, "square", ())))
-    n = board.inner_corners[0] * board.inner_corners[1]
+    board = _board(group)
+    n = len(board.points)
     pixels = _get(group, "pixels", (None, 2))
     m, n_views = len(pixels), len(attribute("view_names"))
     indices = [_get(group, name, (m,), "iu").astype(np.intp) for name in ("view", "camera", "point")]

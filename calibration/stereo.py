@@ -17,10 +17,10 @@ from calibration.assessment import (
     half_set_differences,
     stereo_covariance,
 )
-from calibration.board import Board
+from calibration.board import Board, Target
 from calibration.brief import Brief
 from calibration.camera import StereoRig
-from calibration.chessboard import BoardNotFound, CornerView, board_orders, find_corners
+from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
 from calibration.model_choice import TermsTried, choose_terms
@@ -33,9 +33,11 @@ from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_s
 
 CAMERA_NAMES = ("left", "right")
 SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
+LEAST_SEEN = 6  # images of every point of the target, to free its place: two of them determine it
 MAX_LOST = 0.3  # share of one image's corners that do not fit the others: beyond, the view as a whole is at fault
 MAX_VIEW_RATIO = 5.0  # a view's misfit against the median view's: beyond, the board moved between the two exposures
 Progress = Callable[[str, int, int], None]
+Finder = Callable[[NDArray, bool], CornerView | BoardNotFound]  # image, whether to search thoroughly
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class StereoCalibration(Brief):
 
     rig: StereoRig  # with covariance (30, 30)
     refinement: Refinement  # observations, residuals, what was kept
-    board: Board
+    board: Target
     board_points: Array  # (n, 3) [m] as refined; the declared ones where the board is taken as flat
     settings: CalibrationSettings
     table_view: int | None
@@ -113,7 +115,8 @@ class StereoCalibration(Brief):
         for camera, views in enumerate(self.corner_views):
             for v, view in enumerate(views):
                 if isinstance(view, CornerView):
-                    rejected += [(v, camera, int(i), view.reasons[i]) for i in np.flatnonzero(~view.accepted)]
+                    found = np.flatnonzero(~view.accepted & [reason != "" for reason in view.reasons])
+                    rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # without one: not in view
         r = self.refinement
         o = r.observations
         for i in np.flatnonzero(~r.kept):
@@ -148,22 +151,27 @@ def calibrate_stereo(
             f"{len(left_images)} left and {len(right_images)} right images: views are pairs, one image of each camera"
         )
     names = names or [(f"left {i}", f"right {i}") for i in range(len(left_images))]
-    _check_sizes(left_images, right_images, names)
+    check_sizes(left_images, right_images, names)
     settings = settings or CalibrationSettings()
-    views = _located([*left_images, *right_images], board, settings.threads, progress)
+    views = located(
+        [*left_images, *right_images],
+        lambda image, thorough: find_corners(image, board.inner_corners, thorough),
+        settings.threads,
+        progress,
+    )
     n = len(left_images)
     return calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
 
 
-def _located(
-    images: Sequence[NDArray], board: Board, threads: int, progress: Progress | None
+def located(
+    images: Sequence[NDArray], find: Finder, threads: int, progress: Progress | None = None
 ) -> list[CornerView | BoardNotFound]:
     """The board in every image. Where a sample over all of them shows none, the others are searched quickly first."""
     views: dict[int, CornerView | BoardNotFound] = {}
 
     def locate(index: int, thorough: bool) -> None:
         try:
-            views[index] = find_corners(images[index], board.inner_corners, thorough)
+            views[index] = find(images[index], thorough)
         except ValueError as error:
             views[index] = BoardNotFound(str(error))
         if progress:
@@ -181,7 +189,8 @@ def _located(
     return [views[index] for index in range(len(images))]
 
 
-def _check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:
+def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:
+    """Raises CalibrationError if the images of a camera are of different sizes."""
     for camera, images in enumerate((left, right)):
         for i, image in enumerate(images):
             if np.ndim(image) < 2:
@@ -197,7 +206,7 @@ def _check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Seque
 def calibrate_from_corners(
     left_views: Sequence[CornerView | BoardNotFound],
     right_views: Sequence[CornerView | BoardNotFound],
-    board: Board,
+    board: Target,
     settings: CalibrationSettings | None = None,
     table_view: int | None = None,
     board_thickness: float = 0.0,
@@ -232,9 +241,11 @@ def calibrate_from_corners(
             progress(text, 0, 0)
 
     report("refining")
+    seen = np.bincount(observations.point, minlength=len(board.points))
+    boards = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
     choice = (
         None if settings.distortion == "auto" else (settings.distortion,),
-        BOARD_MODELS if settings.board == "auto" else (settings.board,),
+        boards if settings.board == "auto" else (settings.board,),
     )
     refinement, candidates = choose_terms(observations, start, board.points, *choice, settings.equal_aspect, report)
     bad = _misfitting_views(refinement, names)
@@ -358,14 +369,12 @@ def _observations(views: tuple[list[CornerView | BoardNotFound], list[CornerView
 
 def _agree_on_order(
     views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]],
-    board: Board,
+    board: Target,
     names: Sequence[tuple[str, str]],
 ) -> tuple[tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]], str]:
     """Turn the right views so that all pairs tell of one stereo pose: for boards whose colouring is symmetric."""
     observations = _observations(views)
-    orders = board_orders(board.inner_corners)
-    if board.symmetry == 2 and len(orders) == 4:
-        orders = orders[::2]
+    orders = board.orders
     sizes = [next(v.image_size for v in side if isinstance(v, CornerView)) for side in views]
     poses = [start_camera(observations, c, board.points, sizes[c])[1] for c in (0, 1)]
     both = sorted(poses[0].keys() & poses[1].keys())
@@ -389,14 +398,14 @@ def _agree_on_order(
         if agreeing.any() and isinstance(view, CornerView):
             right[v] = view.reordered(orders[int(np.argmax(agreeing))])
     note = (
-        f"a board of {board.inner_corners[0]} x {board.inner_corners[1]} inner corners looks the same after a turn: "
-        "the two cameras were made to agree, but which corner is the lab frame's origin is a choice (i points to the "
-        "right in the left image). An odd by an even count leaves no choice."
+        f"{board} looks the same after a turn: the two cameras were made to agree, but which corner is the lab "
+        "frame's origin is a choice (i points to the right in the left image). "
+        + ("An odd by an even count leaves no choice." if isinstance(board, Board) else "A ChArUco board has none.")
     )
     return (views[0], right), note
 
 
-def _turn_of_order(order: NDArray[np.intp], board: Board) -> Array:
+def _turn_of_order(order: NDArray[np.intp], board: Target) -> Array:
     """Rotation (3, 3) with points[order] - centre = (points - centre) @ R.T."""
     d = board.points - board.points.mean(0)
     U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])

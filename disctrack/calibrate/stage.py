@@ -7,13 +7,15 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 
-from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
+from calibration import CalibrationSettings, StereoCalibration, StereoRig
+from calibration.board import Board, Target
 from calibration.corner_fit import prepare
 from calibration.rig_file import read_rig, write_rig
-from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
+from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.trajectory_file import Provenance
@@ -28,8 +30,8 @@ class CalibrationSource:
     """Everything that a calibration depends on."""
 
     name: str
-    views: ChessboardImages
-    board: Board
+    views: TargetImages
+    board: Target
     table_view: int | None
     board_thickness: float  # [m]
     settings: CalibrationSettings
@@ -41,8 +43,7 @@ class CalibrationSource:
             recording=self.name,
             inputs={"calibration views": self.views.sha256()},
             settings={
-                "inner_corners": list(self.board.inner_corners),
-                "square_m": self.board.square,
+                **_as_settings(self.board),
                 "table_view": self.table_view,
                 "board_thickness_m": self.board_thickness,
                 "distortion": self.settings.distortion,
@@ -51,6 +52,12 @@ class CalibrationSource:
                 "tolerances": dataclasses.asdict(self.settings.tolerances),
             },
         )
+
+
+def _as_settings(target: Target) -> dict[str, Any]:
+    if isinstance(target, Board):
+        return {"inner_corners": list(target.inner_corners), "square_m": target.square}
+    return target.described()
 
 
 @dataclass(frozen=True)
@@ -64,16 +71,16 @@ class CalibrationResult:
 
 def source_of(recording: Recording, settings: CalibrationSettings) -> CalibrationSource:
     """Views, board and table of a recording that has them."""
-    chessboard, table = recording.chessboard, recording.table
-    if chessboard is None or table is None:
+    views, table = recording.views, recording.table
+    if views is None or table is None:
         raise RecordingError(
             f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
             "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
         )
     return CalibrationSource(
         recording.name,
-        find_views(chessboard.left, chessboard.right, recording.folder),
-        Board(chessboard.inner_corners, chessboard.square),
+        find_views(views.left, views.right, recording.folder),
+        views.target,
         table.view,
         table.board_thickness,
         dataclasses.replace(settings, tolerances=recording.board_tolerances),

@@ -9,8 +9,10 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from calibration import Board, CalibrationSettings, StereoCalibration, calibrate_stereo
-from calibration.stereo import Progress
+from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
+from calibration.board import Target
+from calibration.stereo import Progress, check_sizes
+from disctrack.calibrate.targets import find_target
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import open_frames
@@ -43,7 +45,7 @@ View = Path | FrameView
 
 
 @dataclass(frozen=True)
-class ChessboardImages:
+class TargetImages:
     """Synchronised views; number i of the left and of the right show the board in the same place."""
 
     left: tuple[View, ...]
@@ -70,13 +72,13 @@ class ChessboardImages:
         return digest.hexdigest()
 
 
-def find_views(left: str, right: str, folder: Path) -> ChessboardImages:
+def find_views(left: str, right: str, folder: Path) -> TargetImages:
     """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
 
     Raises RecordingError if they do not pair up.
     """
     sides = [_views_of(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
-    views = ChessboardImages(*sides)
+    views = TargetImages(*sides)
     numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
     if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
         _refuse_unpaired(views, numbers)
@@ -99,7 +101,7 @@ def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
     return tuple(FrameView(files[0], reader, index) for index in range(len(reader)))
 
 
-def _refuse_unpaired(views: ChessboardImages, numbers: Sequence[Sequence[int | None]]) -> None:
+def _refuse_unpaired(views: TargetImages, numbers: Sequence[Sequence[int | None]]) -> None:
     """Different counts are an error; equal counts are, too, where the numbers overlap but for a few."""
     files = views.left, views.right
     alone = [
@@ -120,21 +122,20 @@ def calibrate_recording(
     recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
     """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
-    chessboard, table = recording.chessboard, recording.table
-    if chessboard is None or table is None:
+    declared, table = recording.views, recording.table
+    if declared is None or table is None:
         raise RecordingError(
             f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
             "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
         )
-    views = find_views(chessboard.left, chessboard.right, recording.folder)
-    board = Board(chessboard.inner_corners, chessboard.square)
+    views = find_views(declared.left, declared.right, recording.folder)
     settings = replace(settings or CalibrationSettings(), tolerances=recording.board_tolerances)
-    return calibrate_views(views, board, table.view, table.board_thickness, settings, progress)
+    return calibrate_views(views, declared.target, table.view, table.board_thickness, settings, progress)
 
 
 def calibrate_views(
-    views: ChessboardImages,
-    board: Board,
+    views: TargetImages,
+    target: Target,
     table_view: int | None = None,
     board_thickness: float = 0.0,
     settings: CalibrationSettings | None = None,
@@ -165,7 +166,10 @@ def calibrate_views(
         images[1].append(right)
     names = [(str(views.left[i]), str(views.right[i])) for i in used]
     position = None if table_view is None else used.index(table_view)
-    found = calibrate_stereo(*images, board, settings, position, board_thickness, names, progress)
+    check_sizes(*images, names)
+    settings = settings or CalibrationSettings()
+    target, seen_left, seen_right = find_target(*images, target, settings.threads, progress)
+    found = calibrate_from_corners(seen_left, seen_right, target, settings, position, board_thickness, names, progress)
     return found, tuple(problems)
 
 

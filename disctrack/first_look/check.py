@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import Board, CalibrationSettings, StereoCalibration, StereoRig
+from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.arrays import Mask
 from calibration.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
-from disctrack.calibrate.views import ChessboardImages, calibrate_views, find_views
+from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.first_look.declare import board_size, some_images
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.readers.blocks import iter_pair_blocks
-from disctrack.recording.declaration import ChessboardViews, Recording, read_recording
+from disctrack.recording.declaration import CalibrationViews, Recording, read_recording
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
@@ -145,20 +145,21 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
             return None
         seen.say("fine", "rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.1f} mm")
         return rig
-    chessboard, table = recording.chessboard, recording.table
-    assert chessboard is not None
+    declared, table = recording.views, recording.table
+    assert declared is not None
     assert table is not None
     try:
-        views = find_views(chessboard.left, chessboard.right, recording.folder)
+        views = find_views(declared.left, declared.right, recording.folder)
         if table.view >= len(views):
             raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
         chosen = sorted({*_spread(len(views), VIEWS_LOOKED_AT), table.view})
-        some = ChessboardImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen))
-        board = Board(chessboard.inner_corners, chessboard.square)
+        some = TargetImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen))
         settings = CalibrationSettings()
-        found, problems = calibrate_views(some, board, chosen.index(table.view), table.board_thickness, settings)
+        found, problems = calibrate_views(
+            some, declared.target, chosen.index(table.view), table.board_thickness, settings
+        )
     except DiscTrackError as error:
-        seen.say("fix", "chessboard", str(error), _other_board(recording, chessboard))
+        seen.say("fix", "chessboard", str(error), _other_board(recording, declared))
         return None
     seen.calibration = found
     used = len(chosen) - len(problems) - len(found.rejected_views)
@@ -173,8 +174,10 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
     return found.rig
 
 
-def _other_board(recording: Recording, declared: ChessboardViews) -> str:
-    """The board that the views show, if it is another than was declared."""
+def _other_board(recording: Recording, declared: CalibrationViews) -> str:
+    """The chessboard that the views show, if it is another than was declared."""
+    if recording.chessboard is None:
+        return ""
     try:
         images = [
             image
@@ -184,7 +187,7 @@ def _other_board(recording: Recording, declared: ChessboardViews) -> str:
     except DiscTrackError:
         return ""
     size, seen = board_size(images)
-    if size is None or size == declared.inner_corners:
+    if size is None or size == recording.chessboard.inner_corners:
         return ""
     return (
         f"{seen} of {len(images)} images tried show {size[0]} x {size[1]} inner corners: inner_corners = {list(size)}"

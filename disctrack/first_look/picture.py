@@ -59,7 +59,7 @@ def _draw_table(axes: Axes, images: tuple[NDArray, NDArray], seen: Check) -> Non
     found = seen.calibration
     assert found is not None
     axes.imshow(np.hstack(images))
-    square = found.board.square * max(found.board.inner_corners) / 3
+    square = float(np.ptp(found.board.points, axis=0).max()) / 2.7
     ends = np.array([[0, 0, 0], [square, 0, 0], [0, square, 0], [0, 0, square]])
     pixels, offset = found.rig.project(ends), 0.0
     for camera, image in enumerate(images):

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
 from calibration.tolerances import BoardTolerances
 from disctrack.disc import Disc, disc_from_mm
-from disctrack.errors import RecordingError
+from disctrack.errors import CalibrationError, RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep
 from disctrack.files.toml_tree import read_toml
 
@@ -26,8 +27,15 @@ KEYS: dict[str, tuple[str, ...]] = {
     "calibration": (
         "left",
         "right",
+        "target",
         "inner_corners",
         "square_mm",
+        "squares",
+        "marker_mm",
+        "dictionary",
+        "circles",
+        "marked",
+        "spacing_mm",
         "rig",
         "square_tolerance_mm",
         "flatness_tolerance_mm",
@@ -37,10 +45,21 @@ KEYS: dict[str, tuple[str, ...]] = {
     "air": ("pressure_hPa",),
 }
 
-# Keys that have a default; a calibration is either views or a rig.
+# What declares each kind of calibration target.
+TARGET_KEYS: dict[str, tuple[str, ...]] = {
+    "chessboard": ("inner_corners", "square_mm"),
+    "charuco": ("squares", "square_mm", "marker_mm", "dictionary"),
+    "circles": ("circles", "spacing_mm"),
+    "asymmetric_circles": ("circles", "spacing_mm"),
+    "dots": ("marked", "spacing_mm"),
+}
+
+# Keys that have a default, or belong to another target than a chessboard; a calibration is either views or a rig.
 OPTIONAL = {
     ("air", "pressure_hPa"),
     ("disc", "name"),
+    ("calibration", "target"),
+    *(("calibration", key) for keys in TARGET_KEYS.values() for key in keys if key not in TARGET_KEYS["chessboard"]),
     ("disc", "radius_tolerance_mm"),
     ("disc", "thickness_tolerance_mm"),
     ("calibration", "rig"),
@@ -52,13 +71,12 @@ OPTIONAL = {
 
 
 @dataclass(frozen=True)
-class ChessboardViews:
-    """Synchronised views of a flat chessboard."""
+class CalibrationViews:
+    """Synchronised views of a flat target."""
 
     left: str  # file pattern relative to the recording's folder
     right: str
-    inner_corners: tuple[int, int]  # along the long side, along the short side
-    square: float  # [m]
+    target: Target
 
 
 @dataclass(frozen=True)
@@ -72,7 +90,7 @@ class TableView:
 
 @dataclass(frozen=True)
 class Recording:
-    """What recording.toml declares, in SI units; exactly one of `chessboard` and `rig_file` is given."""
+    """What recording.toml declares, in SI units; exactly one of `views` and `rig_file` is given."""
 
     folder: Path
     name: str
@@ -80,7 +98,7 @@ class Recording:
     left: str  # file pattern, or one video file, relative to the folder
     right: str
     disc: Disc
-    chessboard: ChessboardViews | None
+    views: CalibrationViews | None
     table: TableView | None  # None only where a rig file brings the lab frame with it
     rig_file: Path | None
     gravity: float  # [m/s^2]
@@ -91,6 +109,11 @@ class Recording:
     def file(self) -> Path:
         """The recording.toml itself."""
         return self.folder / FILE_NAME
+
+    @property
+    def chessboard(self) -> Board | None:
+        """The chessboard, if the calibration is from one."""
+        return self.views.target if self.views is not None and isinstance(self.views.target, Board) else None
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -104,7 +127,7 @@ def read_recording(path: str | Path) -> Recording:
     _refuse_unknown_keys(file, declared)
     cameras, disc, markers = (_Section(file, declared, name) for name in ("cameras", "disc", "markers"))
     calibration = _Section(file, declared, "calibration")
-    chessboard, rig_file = _calibration_source(calibration)
+    views, rig_file = _calibration_source(calibration)
     for label in ("case", "surface"):  # what repeats are grouped by; kept with the results in `declared`
         if label in declared:
             _Section(file, declared, "").get(label, _text)
@@ -119,7 +142,7 @@ def read_recording(path: str | Path) -> Recording:
         left=cameras.get("left", _pattern),
         right=cameras.get("right", _pattern),
         disc=_disc(disc, markers),
-        chessboard=chessboard,
+        views=views,
         table=_table(file, declared, required=rig_file is None),
         rig_file=rig_file,
         board_tolerances=_tolerances(file, declared),
@@ -251,10 +274,19 @@ def _table_source(value: Any) -> str:
     return str(value)
 
 
-def _corner_counts(value: Any) -> tuple[int, int]:
-    if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int and 2 <= n <= 1000 for n in value):
-        raise _Unfit("two whole numbers, inner corners along the long and the short side, e.g. [9, 6]")
-    return value[0], value[1]
+def _counts_of(what: str) -> Callable[[Any], tuple[int, int]]:
+    def convert(value: Any) -> tuple[int, int]:
+        if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int and 1 <= n <= 1000 for n in value):
+            raise _Unfit(f"two whole numbers, {what}, e.g. [9, 6]")
+        return value[0], value[1]
+
+    return convert
+
+
+def _target_kind(value: Any) -> str:
+    if not isinstance(value, str) or value not in TARGET_KEYS:
+        raise _Unfit("one of " + ", ".join(f'"{name}"' for name in TARGET_KEYS))
+    return value
 
 
 def _centres(value: Any) -> list[list[float]]:
@@ -292,25 +324,47 @@ def _disc(disc: _Section, markers: _Section) -> Disc:
     return disc_from_mm(*sizes, centres_mm, diameter_mm, **tolerances)
 
 
-def _calibration_source(section: _Section) -> tuple[ChessboardViews | None, Path | None]:
-    views = [key for key in ("left", "right", "inner_corners", "square_mm") if key in section]
+def _calibration_source(section: _Section) -> tuple[CalibrationViews | None, Path | None]:
+    kind = section.get("target", _target_kind) if "target" in section else "chessboard"
+    of_targets = {key: [name for name, keys in TARGET_KEYS.items() if key in keys] for key in KEYS["calibration"]}
+    for key, kinds in of_targets.items():
+        if kinds and key in section and kind not in kinds and "rig" not in section:
+            named = " or ".join(f'target = "{name}"' for name in kinds)
+            raise section.error(f"{key} belongs to {named}; the target here is {kind}: {', '.join(TARGET_KEYS[kind])}.")
+    views = [key for key in ("left", "right", *dict.fromkeys(sum(TARGET_KEYS.values(), ()))) if key in section]
     if "rig" in section:
         if views:
             raise section.error(f"has both rig and {', '.join(views)}. Keep the rig file, or the chessboard views.")
         return None, section.file.parent / section.get("rig", _pattern)
-    left, right = section.get("left", _pattern), section.get("right", _pattern)
-    corners = section.get("inner_corners", _corner_counts)
-    return ChessboardViews(left, right, corners, section.get("square_mm", _positive) * 1e-3), None
+    return CalibrationViews(section.get("left", _pattern), section.get("right", _pattern), _target(section, kind)), None
+
+
+def _target(section: _Section, kind: str) -> Target:
+    """The target as declared. Raises RecordingError."""
+    try:
+        if kind == "chessboard":
+            corners = section.get("inner_corners", _counts_of("inner corners along the long and the short side"))
+            return Board(corners, section.get("square_mm", _positive) * 1e-3)
+        if kind == "charuco":
+            squares = section.get("squares", _counts_of("columns and rows of squares, dark and light"))
+            square, marker = (section.get(key, _positive) * 1e-3 for key in ("square_mm", "marker_mm"))
+            return CharucoBoard(squares, square, marker, section.get("dictionary", _text))
+        spacing = section.get("spacing_mm", _positive) * 1e-3
+        if kind == "dots":
+            return DotTarget(spacing, section.get("marked", _counts_of("steps to the marked dots along x and y")))
+        circles = section.get("circles", _counts_of("circles in a row, number of rows"))
+        return CircleGrid(circles, spacing, kind == "asymmetric_circles")
+    except CalibrationError as error:
+        raise section.error(str(error)) from error
 
 
 def _tolerances(file: Path, declared: Mapping[str, Any]) -> BoardTolerances:
     """What is not declared takes its default."""
     given: dict[str, float] = {}
     calibration = _Section(file, declared, "calibration")
-    if "square_tolerance_mm" in calibration and "square_mm" in calibration:
-        given["square"] = calibration.get("square_tolerance_mm", _not_negative) / calibration.get(
-            "square_mm", _positive
-        )
+    side = "square_mm" if "square_mm" in calibration else "spacing_mm"
+    if "square_tolerance_mm" in calibration and side in calibration:
+        given["square"] = calibration.get("square_tolerance_mm", _not_negative) / calibration.get(side, _positive)
     if "flatness_tolerance_mm" in calibration:
         given["flatness"] = calibration.get("flatness_tolerance_mm", _not_negative) * 1e-3
     if "board_thickness_tolerance_mm" in declared.get("table", {}):

@@ -1,0 +1,280 @@
+"""ChArUco boards and grids of circles: located where an independent homography puts them, calibrated end to end.
+
+The prints are drawn by OpenCV (markers) or by the closed form of a disc's edge (circles), brought into the image by
+OpenCV's warp at six times the resolution, and averaged over the pixels; it shares no line with the code under test.
+"""
+
+import json
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration import BoardNotFound, CalibrationError, CornerView
+from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target, target_of
+from calibration.charuco import find_charuco
+from disctrack.calibrate.circles import find_circles
+from disctrack.calibrate.views import calibrate_recording
+from disctrack.errors import RecordingError
+from disctrack.recording.declaration import read_recording
+
+CHARUCO = CharucoBoard((9, 6), 12e-3, 8.5e-3, "DICT_4X4_50")
+SYMMETRIC = CircleGrid((7, 6), 15e-3)
+ASYMMETRIC = CircleGrid((4, 11), 8e-3, asymmetric=True)
+K = np.array([[620.0, 0.0, 201.0], [0.0, 615.0, 148.0], [0.0, 0.0, 1.0]])
+SIZE = (400, 300)
+FINE = 6  # samples of the warp per pixel, each way
+PIXEL = 0.1e-3  # [m] of the drawn print
+RIM = 200  # light pixels round it
+
+
+@dataclass(frozen=True)
+class Print:
+    """A drawn print and where its pixels lie on the target."""
+
+    image: np.ndarray
+    board_from_pixel: np.ndarray  # (3, 3) homogeneous: x right, y up [m]
+
+
+def print_of(target: Target, diameter: float = 8e-3) -> Print:
+    if isinstance(target, CharucoBoard):
+        columns, rows = target.squares
+        side = round(target.square / PIXEL)
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+        board = cv2.aruco.CharucoBoard(target.squares, target.square, target.marker, dictionary)
+        image = np.pad(board.generateImage((columns * side, rows * side)), RIM, constant_values=255)
+        # the lower left inner corner lies between pixels, one square from the left, one from below
+        origin = np.array([RIM + side - 0.5, RIM + (rows - 1) * side - 0.5])
+    else:
+        low, high = target.points[:, :2].min(0), target.points[:, :2].max(0)
+        width, height = (int(n) for n in np.ceil((high - low) / PIXEL) + 2 * RIM)
+        origin = np.array([RIM, height - 1.0 - RIM])
+        image = np.full((height, width), 255, np.uint8)
+        for x, y in (target.points[:, :2] / PIXEL) * [1, -1] + origin:
+            x0, y0, half = round(x), round(y), round(0.6 * diameter / PIXEL)
+            v, u = np.mgrid[y0 - half : y0 + half + 1, x0 - half : x0 + half + 1]
+            ink = np.clip(0.5 + 0.5 * diameter / PIXEL - np.hypot(u - x, v - y), 0, 1)
+            image[v, u] = np.rint(255 * (1 - ink))
+    return Print(image, np.array([[PIXEL, 0, -PIXEL * origin[0]], [0, -PIXEL, PIXEL * origin[1]], [0, 0, 1]]))
+
+
+def photograph(printed: Print, R, t, camera_matrix=K, rng=None, light=(25.0, 215.0)) -> np.ndarray:
+    """Image (300, 400) of the print at pose R, t in the camera's axes: blur of 0.6 px, noise of 1.5 grey values."""
+    H = camera_matrix @ np.column_stack([R[:, 0], R[:, 1], t]) @ printed.board_from_pixel
+    fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])
+    size = (SIZE[0] * FINE, SIZE[1] * FINE)
+    big = cv2.warpPerspective(printed.image, fine @ H, size, flags=cv2.INTER_LINEAR, borderValue=130)
+    grey = cv2.resize(cv2.GaussianBlur(big.astype(np.float32), (0, 0), 0.6 * FINE), SIZE, interpolation=cv2.INTER_AREA)
+    noise = 0.0 if rng is None else rng.normal(0, 1.5, grey.shape)
+    return np.clip(np.rint(light[0] + (light[1] - light[0]) * grey / 255 + noise), 0, 255).astype(np.uint8)
+
+
+def pose(target: Target, degrees, distance=0.33, aside=(0.0, 0.0)):
+    """Upright and facing the camera, then turned by these angles about x, y, z."""
+    x, y, z = (cv2.Rodrigues(np.radians(a) * axis)[0] for a, axis in zip(degrees, np.eye(3), strict=True))
+    R = x @ y @ z @ np.diag([1.0, -1.0, -1.0])
+    return R, np.array([*aside, distance]) - R @ target.points.mean(0)
+
+
+def pixels_of(target: Target, R, t, camera_matrix=K) -> np.ndarray:
+    image = (target.points @ R.T + t) @ camera_matrix.T
+    return image[:, :2] / image[:, 2:]
+
+
+def normalised_errors(view: CornerView, truth: np.ndarray) -> np.ndarray:
+    e = (view.points - truth)[view.accepted]
+    return np.einsum("ni,nij,nj->n", e, np.linalg.inv(view.covariance[view.accepted]), e)
+
+
+def test_charuco_corners_are_located_several_times_better_than_opencvs(rng):
+    R, t = pose(CHARUCO, (20, -15, 10), distance=0.28)
+    image, truth = photograph(print_of(CHARUCO), R, t, rng=rng), pixels_of(CHARUCO, R, t)
+    view = find_charuco(image, CHARUCO)
+    assert isinstance(view, CornerView), view
+    assert view.accepted.all()
+    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.006  # its own sigma is 0.003 px
+    assert 0.5 < np.mean(normalised_errors(view, truth)) / 2 < 2.5
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    detector = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard((9, 6), 12e-3, 8.5e-3, dictionary))
+    corners, ids, _, _ = detector.detectBoard(image)
+    theirs = np.asarray(corners).reshape(-1, 2) - truth[np.ravel(ids)]
+    assert np.sqrt(np.mean(theirs**2)) > 0.02
+
+
+def test_a_charuco_board_may_reach_out_of_the_image(rng):
+    R, t = pose(CHARUCO, (-10, 20, 170), aside=(0.07, 0.04))
+    truth = pixels_of(CHARUCO, R, t)
+    view = find_charuco(photograph(print_of(CHARUCO), R, t, rng=rng), CHARUCO)
+    assert isinstance(view, CornerView), view
+    inside = ((truth > 0) & (truth < np.array(SIZE) - 1)).all(1)
+    assert not view.accepted[~inside].any()
+    assert set(view.reasons) == {""}  # none was struck: they were not in view
+    assert 8 <= view.accepted.sum() < len(truth)
+    assert np.abs(view.points - truth)[view.accepted].max() < 0.03
+
+
+def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
+    R, t = pose(CHARUCO, (0, 10, 0))
+    image = photograph(print_of(CHARUCO), R, t, rng=rng)
+    other = find_charuco(image, CharucoBoard((9, 6), 12e-3, 8.5e-3, "DICT_6X6_250"))
+    assert isinstance(other, BoardNotFound)
+    assert "dictionary" in other.reason
+    with pytest.raises(CalibrationError, match="DICT_4X4_50"):
+        find_charuco(image, CharucoBoard((9, 6), 12e-3, 8.5e-3, "4X4"))
+
+
+@pytest.mark.parametrize("light", [(25.0, 215.0), (215.0, 25.0)], ids=["dark", "light"])
+@pytest.mark.parametrize("grid", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
+def test_circles_are_located_where_their_centres_are_not_their_ellipses(grid, light, rng):
+    R, t = pose(grid, (38, 12, 20), distance=0.27)
+    image, truth = photograph(print_of(grid), R, t, rng=rng, light=light), pixels_of(grid, R, t)
+    view = find_circles(image, grid)
+    assert isinstance(view, CornerView), view
+    assert view.accepted.all()
+    assert_allclose(view.points, truth, atol=0.03)  # in the right order, from the printed side
+    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.008
+    assert np.mean(normalised_errors(view, truth)) / 2 < 2.5
+    # the ellipse's centre is off by radius^2 x tilt / distance: 0.08 px here, which OpenCV's grid finder returns
+    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    found, centres = cv2.findCirclesGrid(image if light[0] < light[1] else 255 - image, grid.circles, flags=kind)
+    assert found
+    nearest = np.linalg.norm(np.asarray(centres).reshape(-1, 1, 2) - truth, axis=-1).min(1)
+    assert np.sqrt(np.mean(nearest**2) / 2) > 0.03
+
+
+def test_a_lens_that_bends_the_grid_does_not_shift_its_circles(rng):
+    """k1 = -0.25 over 30 deg: the circles' images are bent by what shifts a round template by 0.02 px."""
+    R, t = pose(SYMMETRIC, (10, -20, 0), distance=0.22)
+    camera, distortion = np.array([[450.0, 0, 201.0], [0, 450.0, 148.0], [0, 0, 1.0]]), np.array([-0.25, 0.08, 0, 0, 0])
+    S = 5
+    u = (np.stack(np.meshgrid(np.arange(SIZE[0] * S), np.arange(SIZE[1] * S)), axis=-1) + 0.5) / S - 0.5
+    until = (cv2.TERM_CRITERIA_COUNT, 30, 0.0)
+    ab = cv2.undistortPoints(u.reshape(-1, 1, 2), camera, distortion, criteria=until)
+    plane = np.column_stack([ab.reshape(-1, 2), np.ones(u.size // 2)]) @ np.linalg.inv(np.column_stack([R[:, :2], t])).T
+    place = plane[:, :2] / plane[:, 2:] / SYMMETRIC.spacing
+    number = np.clip(np.rint(place), 0, np.array(SYMMETRIC.circles) - 1)
+    ink = (np.linalg.norm(place - number, axis=1) * SYMMETRIC.spacing < 4.5e-3).reshape(SIZE[1], S, SIZE[0], S)
+    grey = cv2.GaussianBlur(215.0 - 190.0 * ink.mean((1, 3)), (0, 0), 0.7) + rng.normal(0, 1.0, SIZE[::-1])
+    view = find_circles(np.clip(np.rint(grey), 0, 255).astype(np.uint8), SYMMETRIC)
+    assert isinstance(view, CornerView), view
+    truth = cv2.projectPoints(SYMMETRIC.points, cv2.Rodrigues(R)[0], t, camera, distortion)[0].reshape(-1, 2)
+    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.01
+
+
+def test_a_page_without_the_grid_holds_none(rng):
+    blank = np.clip(rng.normal(128, 20, SIZE[::-1]), 0, 255).astype(np.uint8)
+    assert isinstance(find_circles(blank, ASYMMETRIC), BoardNotFound)
+    assert isinstance(find_charuco(blank, CHARUCO), BoardNotFound)
+
+
+@pytest.mark.parametrize(
+    ("target", "symmetry"),
+    [
+        (Board((9, 6), 8e-3), 1),
+        (Board((9, 5), 8e-3), 2),
+        (Board((6, 6), 8e-3), 4),
+        (CHARUCO, 1),
+        (SYMMETRIC, 2),
+        (CircleGrid((6, 6), 1e-2), 4),
+        (ASYMMETRIC, 1),
+        (CircleGrid((4, 10), 1e-2, asymmetric=True), 2),
+        (DotTarget(3.5e-3, (5, 3), ((0, 0), (5, 0), (0, 3))), 1),
+    ],
+    ids=str,
+)
+def test_targets_know_their_symmetry_and_survive_a_file(target, symmetry):
+    assert target.symmetry == symmetry
+    for order in target.orders:  # a turn keeps all distances
+        d = target.points[order] - target.points[order].mean(0)
+        unturned = target.points - target.points.mean(0)
+        assert_allclose(d @ d.T, unturned @ unturned.T, atol=1e-15)
+    assert target_of(json.loads(json.dumps(target.described()))) == target
+
+
+DECLARED = """
+[cameras]
+frame_rate_hz = 1000.0
+left = "left/*.png"
+right = "right/*.png"
+[disc]
+radius_mm = 37.5
+thickness_mm = 6.0
+mass_g = 209.69
+[markers]
+diameter_mm = 7.0
+centres_mm = [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]
+[calibration]
+left = "views/left*.png"
+right = "views/right*.png"
+%s
+[table]
+view = 0
+board_thickness_mm = 3.0
+[gravity]
+g_m_s2 = 9.81
+"""
+AS_CHARUCO = 'target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5\ndictionary = "DICT_4X4_50"'
+AS_CIRCLES = 'target = "asymmetric_circles"\ncircles = [4, 11]\nspacing_mm = 8.0'
+
+
+@pytest.mark.parametrize(
+    ("target", "declared"), [(CHARUCO, AS_CHARUCO), (ASYMMETRIC, AS_CIRCLES)], ids=["charuco", "circles"]
+)
+def test_a_recording_with_another_target_is_calibrated(target, declared, tmp_path, rng):
+    printed = print_of(target)
+    R_pair = cv2.Rodrigues(np.array([0.0, -0.5, 0.0]))[0]
+    meeting = np.array([0.0, 0.0, 0.33])
+    t_pair = meeting - R_pair @ meeting
+    angles = [
+        (0, 14, 0),
+        (25, 10, 5),
+        (-22, 15, -10),
+        (10, 40, 20),
+        (5, -12, 90),
+        (30, 20, -40),
+        (-25, 0, 30),
+        (0, 30, 10),
+    ]
+    (tmp_path / "views").mkdir()
+    poses = []
+    for v, degrees in enumerate(angles):
+        R, t = pose(target, degrees, aside=tuple(rng.uniform(-0.01, 0.01, 2)))
+        poses.append((R, t))
+        cv2.imwrite(str(tmp_path / f"views/left_{v}.png"), photograph(printed, R, t, rng=rng))
+        right = photograph(printed, R_pair @ R, R_pair @ t + t_pair, rng=rng)
+        cv2.imwrite(str(tmp_path / f"views/right_{v}.png"), right)
+    (tmp_path / "recording.toml").write_text(DECLARED % declared)
+    recording = read_recording(tmp_path)
+    assert recording.chessboard is None
+    found, problems = calibrate_recording(recording)
+    assert not problems
+    assert not found.rejected_views
+    assert found.rms_px < 0.02
+    rig, sigma = found.rig, np.sqrt(np.diag(found.rig.covariance))
+    assert abs(rig.left.fx - K[0, 0]) < 4 * sigma[0] + 0.05
+    assert np.all(np.abs(rig.t_right_left - t_pair) < 4 * sigma[21:24] + 2e-6)
+    R, t = poses[0]
+    table = t - 3e-3 * R[:, 2]
+    assert np.all(np.abs(rig.t_left_world - table) < 4 * sigma[27:30] + 2e-6)
+    assert np.degrees(np.arccos(np.clip(rig.R_left_world[:, 2] @ R[:, 2], -1, 1))) < 0.1
+    assert (rig.R_left_world[:, 0] @ R[:, 0]) > 0.9999  # x along the rows of the upright print
+
+
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [
+        ('target = "checkers"\ninner_corners = [9, 6]\nsquare_mm = 8.0', 'one of "chessboard", "charuco"'),
+        ('target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5', "dictionary is missing"),
+        (AS_CHARUCO.replace("8.5", "12.5"), "does not fit into a square"),
+        ('target = "circles"\ncircles = [7, 6]\nsquare_mm = 12.0', "square_mm belongs to"),
+        ("circles = [7, 6]\nspacing_mm = 12.0", "circles belongs to"),
+        ('target = "circles"\ncircles = [7]\nspacing_mm = 12.0', "two whole numbers"),
+        ('target = "dots"\nmarked = [5, 3]', "spacing_mm is missing"),
+    ],
+)
+def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(declared, said, tmp_path):
+    (tmp_path / "recording.toml").write_text(DECLARED % declared)
+    with pytest.raises(RecordingError, match=said):
+        read_recording(tmp_path)
