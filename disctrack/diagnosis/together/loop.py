@@ -205,7 +205,7 @@ def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
     numbers = sorted({k for k in NUMBERS if k < n} | {n})
     whole = Linearisation(system, after, everything)
     scores = {s.candidate.name: s for s in score_all(whole, everything)}
-    first = _sigmas_of_first(system, after, numbers)
+    first = sigmas_of_first(system, after, numbers)
     bounds = []
     for c in everything:
         by_number = {k: first[k][c.name] for k in numbers}
@@ -220,7 +220,7 @@ def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
     return tuple(bounds)
 
 
-def _sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> dict[int, dict[str, Array]]:
+def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> dict[int, dict[str, Array]]:
     """Standard deviations of every candidate's numbers from so many recordings, beside all that the fit moves."""
     known = {q.name: q for q in fit_.quantities}
     new = {q.name: q for c in system.candidates for q in c.quantities if q.name not in known}

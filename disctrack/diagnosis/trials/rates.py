@@ -133,8 +133,10 @@ def _changed(a: Faults | Unseen, null: Faults | Unseen) -> dict[str, Any]:
     return {f.name: getattr(a, f.name) for f in fields(a) if getattr(a, f.name) != getattr(null, f.name)}
 
 
-def trajectory_of(recording: Filmed, planted: Planted, n: int | None = None) -> Trajectory:
-    """The measured trajectory, of its first `n` frames if given."""
+def trajectory_of(
+    recording: Filmed, planted: Planted, n: int | None = None, rig_seed: int | None = None
+) -> Trajectory:
+    """The measured trajectory, of its first `n` frames if given.   rig_seed : as `measured`"""
     return measured(
         planted.effects,
         faults=planted.faults,
@@ -146,6 +148,7 @@ def trajectory_of(recording: Filmed, planted: Planted, n: int | None = None) -> 
         omega3=recording.omega3,
         declared_rate=recording.rate,
         base={"km.k_m": recording.k_m},
+        rig_seed=rig_seed,
     )
 
 

@@ -101,7 +101,7 @@ def measured(
     motion         : in place of the rolling model's
     base           : laws that every diagnosis knows of, in place of k_m = 0.381e-7
     laws           : by formula, that `effects` may name
-    rig_seed       : of the calibration's error, equal for recordings of one calibration; without it, their own
+    rig_seed       : of the errors of calibration and laboratory, equal for recordings of one day; else their own
     disc           : in place of the scene's
     """
     rng = np.random.default_rng([20261121, seed])
@@ -115,7 +115,7 @@ def measured(
     sigma = np.sqrt(np.diag(covariance))
     of_rig = rng if rig_seed is None else np.random.default_rng([20261122, rig_seed])
     error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
-    u, prints = _of_the_laboratory(u, disc, rng)
+    u, prints = _of_the_laboratory(u, disc, of_rig)
     true_rig = _on_the_true_table(rig_after_faults(believed_rig.perturbed(error), scene), u)
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
     if motion is None:
@@ -129,7 +129,7 @@ def measured(
     ]
     pixels = np.stack(views, axis=1)
     if u.laboratory != Laboratory():
-        pixels = shifted_dots(rng, pixels, scene.cameras.image_size[0], u.laboratory)
+        pixels = shifted_dots(of_rig, pixels, scene.cameras.image_size[0], u.laboratory)
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     dots = np.broadcast_to(sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
     return _tracked(pixels, dots, motion(true_times), believed_rig, disc, declared_rate)
