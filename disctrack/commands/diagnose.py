@@ -49,6 +49,7 @@ def _together(arguments: argparse.Namespace) -> int:
             model=arguments.model,
             overwrite=arguments.overwrite,
             reuse=not arguments.overwrite,
+            settle=arguments.plan,
             processes=arguments.jobs or default_threads(),
         )
     files = [outputs.relative(file) for file in outcome.files]

@@ -46,10 +46,8 @@ class Plan:
             half_thickness=published.disc.half_thickness * self.thickness,
             marker_centres_body=published.disc.marker_centres_body * [1, 1, self.thickness],
         )
-        air = {  # boundary layers go with sqrt(density), the viscous layer does not know the pressure
-            "air_bildsten.beta": np.sqrt(self.pressure),
-            "air_quadratic.a": self.pressure,
-        }
+        laws = {e: e.density_power for e in CATALOGUE.values() if e.density_power}
+        air = {f"{e.name}.{e.parameters[0].name}": self.pressure**power for e, power in laws.items()}
         longest = self.longest or published.longest
         start = published.start * max(1.0, 1.3 * longest / 1.5) ** (2 / 3)
         return replace(

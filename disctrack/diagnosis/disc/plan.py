@@ -137,10 +137,18 @@ class Plan:
 class Planner:
     """The say of this recording on laws, cameras and dots, and that of recordings beside it."""
 
-    def __init__(self, system: DiscSystem, fit: Fit, candidates: Sequence[Candidate], noise: float = 1.0) -> None:
+    def __init__(
+        self,
+        system: DiscSystem,
+        fit: Fit,
+        candidates: Sequence[Candidate],
+        noise: float = 1.0,
+        said: Callable[[Sequence[str]], Array] | None = None,
+    ) -> None:
         """Fit : of the enlarged model.   candidates : whose columns will be asked for.
 
         noise : variance of the dots over that stated
+        said : rows (m, k) of what is known of quantities by their names, where that is more than this recording says
         """
         self.system, self.fit, self._noise = system, fit, noise
         new = {q.name: q for c in candidates for q in c.quantities}
@@ -156,7 +164,7 @@ class Planner:
         names = [f"rig.common_{j}" for j in range(n_rig)] + [q.name for q in (*laws, *self.tested)]
         self.column = {name: j for j, name in enumerate(names)}
         self.candidates = tuple(candidates)
-        self.now = self._said(system, fit.values, Proposal())
+        self.now = self._said(system, fit.values, Proposal()) if said is None else said(names)
 
     def amounts(self, candidate: Candidate) -> Array:
         """(k,) fitted sizes."""
@@ -337,10 +345,19 @@ def separations(
     return best
 
 
-def plan(system: DiscSystem, fit: Fit, questions: Sequence[Question], noise: float = 1.0) -> Plan:
-    """What each of many recordings would bring to the questions: starts first, then changes of the best of them."""
+def plan(
+    system: DiscSystem,
+    fit: Fit,
+    questions: Sequence[Question],
+    noise: float = 1.0,
+    said: Callable[[Sequence[str]], Array] | None = None,
+) -> Plan:
+    """What each of many recordings would bring to the questions: starts first, then changes of the best of them.
+
+    said : as for `Planner`
+    """
     candidates = {c.name: c for q in questions for c in (q.effect, q.rival) if c is not None}
-    planner = Planner(system, fit, list(candidates.values()), noise)
+    planner = Planner(system, fit, list(candidates.values()), noise, said)
 
     def answers(rows: Array) -> tuple[float, ...]:
         return tuple(

@@ -96,6 +96,15 @@ class Crew:
             ) from error
         return [found[i] for i in numbers]
 
+    def ask(self, number: int, method: str, *arguments: Any) -> Any:
+        """Result of a method of one object, as they are counted now."""
+        everyone = self._kept
+        self._kept = [everyone[number]]
+        try:
+            return self.call(method, [arguments])[0]
+        finally:
+            self._kept = everyone
+
     def reduce(self, requests: Sequence[Request]) -> list[Reduced | None]:
         """As a `Reducer`."""
         return self.call("reduce", [(values, names) for _, values, names in requests])

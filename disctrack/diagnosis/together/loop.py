@@ -15,6 +15,7 @@ from scipy import stats
 
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.model_file import PAPER
+from disctrack.diagnosis.disc.plan import Plan, Question
 from disctrack.diagnosis.engine.fit import Fit, triangle
 from disctrack.diagnosis.engine.score import Linearisation, score_all
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
@@ -23,7 +24,7 @@ from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses
 from disctrack.diagnosis.together.crew import Crew
 from disctrack.diagnosis.together.fitting_in import Blocks, FitsIn, apart
 from disctrack.diagnosis.together.joint import JointSystem
-from disctrack.diagnosis.together.recordings import Alone, Item, Recorded, build, in_common, labels_of
+from disctrack.diagnosis.together.recordings import Alone, Item, Recorded, Say, build, in_common, labels_of
 from disctrack.diagnosis.together.sharing import Member, Sharing
 from disctrack.errors import AnalysisError, DiscTrackError
 
@@ -31,6 +32,7 @@ TEST_EVERY = 3  # of the recordings, every so many is foretold from the others
 ROUNDS = 3  # of leaving recordings out
 NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
 UPPER = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
+OPEN = 6  # questions that further recordings are sought for
 OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
 
 
@@ -76,6 +78,7 @@ class TogetherDiagnosis:
     bounds: tuple[Bound, ...]
     dependences: tuple[Dependence, ...]
     notes: tuple[str, ...]
+    plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
 
     @property
     def used(self) -> tuple[str, ...]:
@@ -89,11 +92,13 @@ def diagnose_together(
     settings: Settings | None = None,
     processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
+    settle: bool = False,
 ) -> TogetherDiagnosis:
     """What does the model lack, of all recordings together?
 
     model : as `diagnose_trajectory`
     processes : among which the recordings are dealt out; the answer does not depend on their number
+    settle : also compute which further recording would settle what is left open
     Raises AnalysisError where fewer than two recordings can be used.
     """
     settings = replace(settings or Settings(), noise=1.0)
@@ -127,8 +132,10 @@ def diagnose_together(
         diagnosis, alone = _with_memory(system, diagnosis, crew)
         by_recording = _of_recordings(items, kept, reasons, system, diagnosis, alone)
         bounds = _bounds(system, diagnosis)
+        proposed = _plan(system, diagnosis, bounds, crew) if settle else None
     dependences = _dependences(system, diagnosis)
-    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, _notes(by_recording))
+    notes = _notes(by_recording)
+    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, notes, proposed)
 
 
 def _enough(kept: Sequence[int], recordings: Sequence[Recorded], reasons: dict[int, str]) -> None:
@@ -238,6 +245,36 @@ def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> d
             for c in system.candidates
         }
     return found
+
+
+def _plan(system: JointSystem, diagnosis: Diagnosis, bounds: Sequence[Bound], crew: Crew) -> Plan | None:
+    """Recordings beside all these, with disc, surface and cameras of the longest of them."""
+    sharing, after = system.sharing, diagnosis.after
+    longest = int(np.argmax(system.weights))
+    local = {c.name for c in sharing.members[longest].candidates}
+    found = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
+    open_sizes = [b for b in bounds if b.upper is not None and b.candidate.kind == "motion"]
+    open_sizes.sort(key=lambda b: -float(b.sigma[0]) / b.candidate.quantities[0].typical)
+    questions = [*found, *(Question(b.candidate) for b in open_sizes)]
+    questions = [q for q in questions if {c.name for c in (q.effect, q.rival) if c is not None} <= local][:OPEN]
+    if not questions:
+        return None
+    known = {q.name: q for q in after.quantities}
+    tested = [q for x in questions for c in (x.effect, x.rival) if c is not None for q in c.quantities]
+    new = {q.name: q for q in tested if q.name not in known}
+    everything = {**known, **new}
+    names = {there: shared for there, shared in sharing.shared_names(longest).items() if shared in everything}
+    others = [n for n in everything if n not in set(names.values())]
+    _, derivative = system.linearise({q.name: q.null for q in new.values()} | after.values, [*others, *names.values()])
+    rows = derivative.reshape(-1, derivative.shape[-1])
+    priors = np.zeros((len(others), rows.shape[1]))
+    priors[:, : len(others)] = np.diag([1.0 / everything[n].prior_sigma for n in others])
+    R = triangle(np.concatenate([rows, priors]))
+    said = Say(tuple(names), R[len(others) :, len(others) :])
+    extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
+    values = sharing.local_values(longest, after.values)
+    answer = crew.ask(longest, "planned", values, extra, questions, said)
+    return answer if isinstance(answer, Plan) else None
 
 
 def _spread(base: Array, mine: Array) -> Array:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from disctrack.diagnosis.engine.search import Diagnosis
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.engine.system import Quantity
+from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.output import effect_json, tried_json
 from disctrack.diagnosis.pages.words import effect_text, quantity_text
 from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
@@ -66,7 +67,7 @@ def lines(answer: TogetherDiagnosis) -> list[str]:
     ]
     said += [f"{'law':<13} {text}" for text in _laws(d)]
     said += [f"{'depends':<13} {_dependence(x)}" for x in answer.dependences]
-    return said
+    return said if answer.plan is None else [*said, *planned.lines(answer.plan)]
 
 
 def _free(d: Diagnosis) -> list[Quantity]:
@@ -130,6 +131,7 @@ def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
             }
             for x in answer.dependences
         ],
+        "plan": planned.as_json(answer.plan),
         "tried": [tried_json(t) for t in d.tried],
         "settings": vars(d.settings),
     }
@@ -187,6 +189,7 @@ def whole_page(answer: TogetherDiagnosis, pictures: str) -> str:
         section("How the laws depend on what was declared", [_dependence_table(x) for x in answer.dependences]),
         section("Each recording against the others", [_recordings(answer)]),
         section("What many recordings bring", [_by_number(answer)]),
+        section("What would settle it", planned.html(answer.plan)),
         section("What was tried", [_tried(answer)]),
     ]
     return page("Many recordings: what does the model lack?", parts)

@@ -13,6 +13,7 @@ from calibration.arrays import Array
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.large_faults import find_large
 from disctrack.diagnosis.disc.model_file import PAPER, Declared, declared_model
+from disctrack.diagnosis.disc.plan import Plan, Question, plan
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.disc.systematic import (
@@ -110,6 +111,23 @@ class Item:
     model: str = PAPER
 
 
+@dataclass(frozen=True)
+class Say:
+    """What all recordings say of some quantities, whatever the others are: rows of a least-squares problem."""
+
+    names: tuple[str, ...]
+    rows: Array  # (m, k)
+
+    def __call__(self, names: Sequence[str]) -> Array:
+        """(m, names) rows with columns for these; zero for those that nothing is known of."""
+        column = {n: j for j, n in enumerate(self.names)}
+        found = np.zeros((len(self.rows), len(names)))
+        for j, name in enumerate(names):
+            if name in column:
+                found[:, j] = self.rows[:, column[name]]
+        return found
+
+
 class DiscMember:
     """One recording of the disc: prepared, fitted alone, and then asked for what it says of the shared quantities."""
 
@@ -187,6 +205,18 @@ class DiscMember:
             found.degrees_of_freedom,
             found.converged,
         )
+
+    def planned(self, values: Values, names: Sequence[str], questions: Sequence[Question], said: Say) -> Plan:
+        """Recordings that would answer questions; `said` is what all recordings together know of quantities.
+
+        values : of the shared quantities.   names : of those that are no part of the base
+        """
+        known = {q.name: q for c in self.system.candidates for q in c.quantities}
+        quantities = (*self.system.base, *(known[n] for n in names))
+        everything = {**self.base.values, **self._reduction.own_values(values), **self._with_faults(values)}
+        zero = np.zeros((len(quantities),) * 2)
+        fitted = Fit(quantities, everything, zero, 0.0, 0.0, 1, True, 0)
+        return plan(self.system, fitted, questions, said=said)
 
     def _member(self) -> Member:
         system, disc = self.system, self.system.disc

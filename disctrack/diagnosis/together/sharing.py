@@ -167,6 +167,16 @@ class Sharing:
                 values[local] = self._local_nulls[i][local] + amount
         return values
 
+    def shared_names(self, i: int) -> dict[str, str]:
+        """The member's quantities that are shared as they are, and its rig's common ones: name there -> shared name."""
+        member = self.members[i]
+        found = {stem: _named(stem, self.group(member, q)) for stem, q in member.linked.items()}
+        for local, terms in self._terms[i].items():
+            same = [n for n, factor in terms.items() if factor == 1.0]
+            if local not in member.links and same:
+                found[local] = same[0]
+        return found
+
     def mixing(self, i: int, local: Sequence[str], names: Sequence[str]) -> np.ndarray:
         """(local, names) derivative of the member's quantities by the shared ones."""
         column = {n: j for j, n in enumerate(names)}

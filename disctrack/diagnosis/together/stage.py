@@ -36,12 +36,14 @@ def run_together(
     model: str = PAPER,
     overwrite: bool = False,
     reuse: bool = False,
+    settle: bool = False,
     processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
 ) -> TogetherOutcome:
     """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
 
     output : folder; without it `together_diagnosis` in the deepest folder that holds all files
+    settle : also compute which further recordings would settle what is left open
     reuse : an earlier result that is complete and of the same files, model and version
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
@@ -57,7 +59,7 @@ def run_together(
     folder = Path(output) if output is not None else common_folder(paths) / FOLDER
     report = folder / "diagnosis.json"
     known = Path(model).read_text(encoding="utf-8") if Path(model).is_file() else model
-    made_from = {"model": known, "files": [read_setup(p).fingerprint for p in paths]}
+    made_from = {"model": known, "plan": settle, "files": [read_setup(p).fingerprint for p in paths]}
     origin = origin_of(paths[0], made_from)
     told = reusable(folder, origin) if reuse else None
     if told is not None:
@@ -66,7 +68,7 @@ def run_together(
         raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
     refuse_input(report)
     recordings = _told_apart([read_recorded(p) for p in paths], paths)
-    result = diagnose_together(recordings, model, processes=processes, progress=progress)
+    result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle)
     drawn = figures(result)
     files, pictures = draw(folder, drawn, ["png"])
     html = folder / "diagnosis.html"
