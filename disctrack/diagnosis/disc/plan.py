@@ -109,7 +109,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Row:
+class Proposed:
     """One proposal and what it would bring to each question."""
 
     proposal: Proposal
@@ -123,14 +123,14 @@ class Plan:
 
     questions: tuple[Question, ...]
     now: tuple[float, ...]  # the answers of this recording alone
-    rows: tuple[Row, ...]
+    rows: tuple[Proposed, ...]
 
-    def best(self, i: int) -> Row | None:
+    def best(self, i: int) -> Proposed | None:
         """The proposal that answers question i best."""
         known = [r for r in self.rows if np.isfinite(r.answers[i])]
         if not known:
             return None
-        pick: Callable[..., Row] = min if self.questions[i].rival is None else max
+        pick: Callable[..., Proposed] = min if self.questions[i].rival is None else max
         return pick(known, key=lambda r: r.answers[i])
 
 
@@ -370,7 +370,7 @@ def plan(
     for proposal in starts():
         made = planner.with_(proposal)
         if made is not None:
-            rows.append(Row(proposal, made[1], answers(made[0])))
+            rows.append(Proposed(proposal, made[1], answers(made[0])))
     first = Plan(tuple(questions), now, tuple(rows))
     bases = {Proposal(): None} | {b.proposal: None for i in range(len(questions)) if (b := first.best(i)) is not None}
     for base in list(bases)[:3]:
@@ -379,7 +379,7 @@ def plan(
                 continue
             made = planner.with_(replace(base, **change))
             if made is not None:
-                rows.append(Row(replace(base, **change), made[1], answers(made[0])))
+                rows.append(Proposed(replace(base, **change), made[1], answers(made[0])))
     return Plan(tuple(questions), now, tuple(rows))
 
 

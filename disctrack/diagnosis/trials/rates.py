@@ -133,9 +133,7 @@ def _changed(a: Faults | Unseen, null: Faults | Unseen) -> dict[str, Any]:
     return {f.name: getattr(a, f.name) for f in fields(a) if getattr(a, f.name) != getattr(null, f.name)}
 
 
-def trajectory_of(
-    recording: Filmed, planted: Planted, n: int | None = None, rig_seed: int | None = None
-) -> Trajectory:
+def trajectory_of(recording: Filmed, planted: Planted, n: int | None = None, rig_seed: int | None = None) -> Trajectory:
     """The measured trajectory, of its first `n` frames if given.   rig_seed : as `measured`"""
     return measured(
         planted.effects,
