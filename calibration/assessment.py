@@ -214,8 +214,12 @@ def assess(
     inflation: float,
     halves: HalfSets | None,
     motion: PairMotion | None,
+    wide: tuple[str, ...] = (),
 ) -> Assessment:
-    """Collect the figures and judge them; the second rig has the tolerances of the board in its covariance."""
+    """Collect the figures and judge them; the second rig has the tolerances of the board in its covariance.
+
+    wide : what `wide_lens.too_wide` found
+    """
     kept = refinement.observations[refinement.kept]
     share = (coverage(refinement, 0), coverage(refinement, 1))
     tilt, spread = tilts(refinement)
@@ -235,6 +239,7 @@ def assess(
             "or hold the board still; the sigmas of the pair allow for it",
             *warnings,
         )
+    warnings = (*wide, *warnings)
     point_length = np.linalg.norm(point_sigma, axis=-1)
     pixel_length = np.linalg.norm(pixel_sigma, axis=-1)
     triangulation = (float(np.sqrt(np.mean(point_length**2))), float(point_length.max()))
@@ -253,7 +258,7 @@ def assess(
         place_sigma=place,
         pairs=pairs,
         motion=motion,
-        verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, motion, chosen),
+        verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, motion, chosen, wide),
         warnings=warnings,
     )
 
@@ -333,12 +338,15 @@ def _verdict(
     halves: HalfSets | None,
     motion: PairMotion | None,
     chosen: TermsTried | None,
+    wide: tuple[str, ...],
 ) -> str:
     """The worst of what the figures say, with the reason, then the figures."""
     rms = refinement.rms()
     held_out = chosen.held_out_rms_px if chosen is not None and np.isfinite(chosen.held_out_rms_px) else rms
     limits = (0.05, GOOD_RMS_PX, POOR_RMS_PX)
     judged = [(int(np.searchsorted(limits, held_out)), f"views left out of the fit give {held_out:.4f} px")]
+    if wide:
+        judged.append((3, wide[0].partition(":")[0]))
     if pairs < MIN_GOOD_VIEWS:
         judged.append((2 if pairs > 3 else 3, f"only {pairs} views were seen by both cameras"))
     if held_out > 2 * rms:

@@ -23,17 +23,18 @@ from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
-from calibration.model_choice import TermsTried, choose_terms
+from calibration.model_choice import TermsTried, choose_terms, fit_poses
 from calibration.pairs import motion_between_exposures, readmitted
 from calibration.refinement import Refinement
-from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
-from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
+from calibration.start import MIN_POINTS, MIN_VIEWS, common_pair, start_camera, start_stereo
+from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations, predict
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
+from calibration.wide_lens import too_wide
 
 CAMERA_NAMES = ("left", "right")
 SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
-LEAST_SEEN = 6  # images of every point of the target, to free its place: two of them determine it
+LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
 MAX_LOST = 0.3  # share of one image's corners that do not fit the others: beyond, the view as a whole is at fault
 MAX_VIEW_RATIO = 5.0  # a view's misfit against the median view's: beyond, the board moved between the two exposures
 Progress = Callable[[str, int, int], None]
@@ -228,11 +229,13 @@ def calibrate_from_corners(
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
     observations = _observations(views)
     start, agrees = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
+    wide = too_wide(observations, board.points, start.cameras)
     start, agrees = readmitted(observations, start, board.points, agrees, MAX_VIEW_RATIO)
     for v in np.flatnonzero(~agrees):
         if int(v) not in rejected:
             rejected[int(v)] = (
                 f"{names[v][0]}, {names[v][1]}: the board moved between the exposures, or the images are not a pair"
+                + (", or the lens is wider than the model" if wide else "")
             )
     observations = observations[~np.isin(observations.view, list(rejected))]
 
@@ -250,6 +253,11 @@ def calibrate_from_corners(
     refinement, candidates = choose_terms(observations, start, board.points, *choice, settings.equal_aspect, report)
     bad = _misfitting_views(refinement, names)
     if bad:
+        odd = _odd_images(refinement, [v for v in bad if v != table_view])
+        for v, camera in odd.items():
+            name, reason = CAMERA_NAMES[1 - camera], bad.pop(v)
+            warnings.append(f"view {v} is used in the {name} camera only: {reason}")
+            observations = observations[(observations.view != v) | (observations.camera != camera)]
         rejected |= bad
         observations = observations[~np.isin(observations.view, list(bad))]
         terms = refinement.terms
@@ -261,7 +269,10 @@ def calibrate_from_corners(
         raise CalibrationError(f"the table view {table_view} cannot be used: {rejected[table_view]}")
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
-        raise CalibrationError(f"only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}")
+        lens = f"{'; '.join(wide)}. " if wide else ""
+        raise CalibrationError(
+            f"{lens}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}"
+        )
     report("trying a field of the lenses")
     lens = fit_lens_field(refinement, board.points)
     if lens is not None:
@@ -282,7 +293,7 @@ def calibrate_from_corners(
     )
     halves = half_set_differences(refinement, inflation)
     motion = motion_between_exposures(refinement)
-    assessment = assess(refinement, candidates, rig, with_board, table_view, inflation, halves, motion)
+    assessment = assess(refinement, candidates, rig, with_board, table_view, inflation, halves, motion, wide)
     return StereoCalibration(
         rig=with_board,
         refinement=refinement,
@@ -435,6 +446,25 @@ def _misfitting_views(refinement: Refinement, names: Sequence[tuple[str, str]]) 
                 "blurred, or the board moved between the exposures"
             )
     return bad
+
+
+def _odd_images(refinement: Refinement, views: Sequence[int]) -> dict[int, int]:
+    """{view: camera} of pairs whose images disagree while the other camera's image fits the rest, with its own pose."""
+    o = refinement.observations
+    every = [refinement.rms(o.view == v) for v in np.unique(o.view)]
+    limit = MAX_VIEW_RATIO * float(np.nanmedian(every))
+    odd = {}
+    for v in views:
+        alone = []
+        for camera in (0, 1):
+            image = o[(o.view == v) & (o.camera == camera)]
+            if len(image) >= MIN_POINTS:
+                model = fit_poses(image, refinement.model, max(refinement.unexplained_sigma, 1e-3))
+                square = np.sum((image.pixels - predict(model, image)[0]) ** 2, axis=-1)
+                alone.append((float(np.sqrt(np.mean(square))), camera))
+        if len(alone) == 2 and min(alone)[0] < limit:
+            odd[v] = 1 - min(alone)[1]
+    return odd
 
 
 __all__ = [
