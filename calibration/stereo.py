@@ -254,10 +254,10 @@ def calibrate_from_corners(
     bad = _misfitting_views(refinement, names)
     if bad:
         odd = _odd_images(refinement, [v for v in bad if v != table_view])
-        for v, camera in odd.items():
-            name, reason = CAMERA_NAMES[1 - camera], bad.pop(v)
-            warnings.append(f"view {v} is used in the {name} camera only: {reason}")
-            observations = observations[(observations.view != v) | (observations.camera != camera)]
+        for view, camera in odd.items():
+            name, reason = CAMERA_NAMES[1 - camera], bad.pop(view)
+            warnings.append(f"view {view} is used in the {name} camera only: {reason}")
+            observations = observations[(observations.view != view) | (observations.camera != camera)]
         rejected |= bad
         observations = observations[~np.isin(observations.view, list(bad))]
         terms = refinement.terms
@@ -269,9 +269,9 @@ def calibrate_from_corners(
         raise CalibrationError(f"the table view {table_view} cannot be used: {rejected[table_view]}")
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
-        lens = f"{'; '.join(wide)}. " if wide else ""
+        also = f"{'; '.join(wide)}. " if wide else ""
         raise CalibrationError(
-            f"{lens}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}"
+            f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}"
         )
     report("trying a field of the lenses")
     lens = fit_lens_field(refinement, board.points)
