@@ -16,10 +16,11 @@ from calibration.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS
-from disctrack.track import tracking as tracker
+from disctrack.track.assembly import MIN_GOOD_DOT_IMAGES, TrackingSettings
 from disctrack.track.dots import dot_centres, normalised_maps
 from disctrack.track.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
+from disctrack.track.tracking import check_images
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
 
@@ -61,10 +62,10 @@ class Tracker:
     about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
     """
 
-    def __init__(self, rig: StereoRig, disc: Disc, settings: tracker.TrackingSettings | None = None) -> None:
+    def __init__(self, rig: StereoRig, disc: Disc, settings: TrackingSettings | None = None) -> None:
         self.rig, self.disc = rig, disc
         self.frame = -1
-        self._settings = settings or tracker.TrackingSettings()
+        self._settings = settings or TrackingSettings()
         maps_x, maps_y = (
             np.stack(part) for part in zip(*(normalised_maps(camera) for camera in rig.cameras), strict=True)
         )
@@ -109,7 +110,7 @@ class Tracker:
     def _as_block(self, left: Image, right: Image) -> NDArray:
         if self._pair.shape[2:] != left.shape or self._pair.dtype != left.dtype:
             self._pair = np.empty((1, 2, *left.shape), left.dtype)
-            tracker.check_images(self._pair, self.rig)
+            check_images(self._pair, self.rig)
         self._pair[0, 0], self._pair[0, 1] = left, right
         return self._pair
 
@@ -144,7 +145,7 @@ class Tracker:
         status = FrameStatus.MEASURED
         if (per_camera == 0).any():
             status = FrameStatus.ONE_CAMERA
-        elif per_camera.sum() < tracker.MIN_GOOD_DOT_IMAGES:
+        elif per_camera.sum() < MIN_GOOD_DOT_IMAGES:
             status = FrameStatus.FEW_MARKERS
         q = np.concatenate([t, angles])
         return LivePose(self.frame, q, R, covariance, status, pixels[0], residuals, chi_square)

@@ -10,8 +10,9 @@ from numpy.testing import assert_array_equal
 from disctrack import frames
 from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.track.as_printed import AsBuilt
+from disctrack.track.assembly import _fit_all
 from disctrack.track.following import empty_tables
-from disctrack.track.tracking import MOST_STRETCHES, _fit_all, stretch_edges
+from disctrack.track.tracking import MOST_STRETCHES, stretch_edges
 
 
 @pytest.mark.parametrize(
@@ -63,7 +64,7 @@ def test_blocks_begin_at_the_breaks_and_hold_every_frame_once():
 
 
 def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_their_number(rendered_pairs, monkeypatch):
-    monkeypatch.setattr("disctrack.track.tracking.FITTED_AT_ONCE", 512)
+    monkeypatch.setattr("disctrack.track.assembly.FITTED_AT_ONCE", 512)
     rig, disc = rendered_pairs.rig, rendered_pairs.disc
     R, t = frames.rotation_from_euler(*rendered_pairs.q[:, 3:].T), rendered_pairs.q[:, :3]
     pixels = rendered_pairs.true_pixels

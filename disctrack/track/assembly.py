@@ -1,0 +1,265 @@
+"""From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Array, Mask
+from calibration.camera import StereoRig
+from calibration.causes import causes
+from disctrack import frames
+from disctrack.disc import Disc
+from disctrack.track.as_printed import MIN_MARKER_SHIFT, AsBuilt, refine_as_built
+from disctrack.track.dots import NoiseModel, TemplateLimits
+from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
+from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
+from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
+from disctrack.track.own_scatter import SharedFaults, split_scatter, without_shared_faults
+from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
+from disctrack.track.slips import slips_in_words
+from disctrack.track.table_contact import TableFromDisc, table_from_disc
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+MIN_GOOD_DOT_IMAGES = 6
+FITTED_AT_ONCE = 4096  # frames
+SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """What a user may choose; the whole of it is written into the result."""
+
+    limits: TemplateLimits = field(default_factory=TemplateLimits)
+    refine_markers: bool = True  # the dots' places on the disc, over the whole sequence
+    refine_rig: bool = (
+        False  # the rig within its own calibration covariance; hides a camera that moved, so not by default
+    )
+    reject_outliers: bool = True
+    table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
+    search_always: bool = False  # at every frame where the disc is lost, whatever it costs: for single, unrelated poses
+    first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (first_pass.py)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """A trajectory and what the run found out on the way."""
+
+    trajectory: Trajectory
+    noise: tuple[NoiseModel, NoiseModel]  # left, right
+    blur_px: tuple[float, float]
+    as_built: AsBuilt
+    variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared
+    noise_factor: float  # the part of it that changes from frame to frame (`own_scatter`), by which the covariances of
+    # dots and poses are multiplied; what is left of the other makes `Trajectory.systematic_covariance`
+    systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
+    shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
+    table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
+    acquisitions: int  # times the disc had to be searched for without a prior and was found
+    warnings: tuple[str, ...]
+    doubts: tuple[str, ...] = ()  # what puts the result in question: images that are copies of others
+
+
+def assemble(
+    followers: list[Follower],
+    tables: Tables,
+    settings: TrackingSettings,
+    frame_rate: float,
+    gravity: float,
+    time: Array,
+    pairs: range,
+) -> Tracking:
+    """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds."""
+    first = next((follower for follower in followers if follower.measured), followers[0])
+    repeated = repeats(tables.digest)
+    alone = repeated & ~repeated.all(axis=1, keepdims=True)
+    tables.pixels[alone] = np.nan  # over the edges of stretches, too
+    tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
+    tables.covariance_px2 *= unexpected_misfit(tables.misfit, tables.n_pixels)[..., None, None]
+    field = first.setup.rig.lens_field
+    if field is not None:
+        tables.pixels = field.corrected(tables.pixels)
+    outlying = _outlying(tables, first.setup)
+    R, t = (np.where(outlying.reshape(-1, *[1] * (part.ndim - 1)), np.nan, part) for part in (tables.R, tables.t))
+    as_built = refine_as_built(
+        tables.pixels,
+        tables.covariance_px2,
+        first.setup.rig,
+        first.setup.disc,
+        R,
+        t,
+        refine_markers=settings.refine_markers,
+        refine_rig=settings.refine_rig,
+        max_frames=SHARED_FRAMES,
+    )
+    faults = without_shared_faults(
+        tables.pixels,
+        tables.covariance_px2,
+        first.setup.rig,
+        first.setup.disc,
+        R,
+        t,
+        max_frames=SHARED_FRAMES,
+    )
+    if settings.refine_markers and faults is not None:
+        as_built = _without_false_shifts(as_built, first.setup.rig, first.setup.disc, faults)
+    fits = _fit_all(tables, as_built, settings.reject_outliers)
+    ordinary = replace(
+        fits,
+        degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
+        used=fits.used & ~outlying[:, None, None],
+    )
+    scatter = split_scatter(ordinary, tables.covariance_px2, faults)
+    factor, noise_factor = scatter.whole, scatter.noise
+    tables.covariance_px2 *= noise_factor  # in place: nobody else holds them
+    systematic = fits.covariance * scatter.systematic
+    fits.covariance[...] *= noise_factor
+    fits = replace(fits, chi_square=fits.chi_square / factor)
+    struck = (np.isfinite(tables.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
+    verdicts = judge_poses(
+        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / frame_rate, as_built.disc.radius
+    )
+    contradicted = verdicts.status == FrameStatus.CONTRADICTED
+    slips = slips_in_words(
+        contradicted, fits, tables.pixels, tables.covariance_px2, as_built.rig, as_built.disc.marker_centres_body, pairs
+    )
+    fits.covariance[...] *= verdicts.factor[:, None, None]
+    fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
+    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
+    shared = _shared_sigma(fits, systematic, rig)
+    # what the dots have been corrected by, and what has gone into the covariance
+    as_built = replace(as_built, rig=replace(rig, lens_field=None, allowances=()))
+    trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
+    warnings = warnings_of(first, factor, faults, scatter, table, trajectory)
+    return Tracking(
+        trajectory=trajectory,
+        noise=first.law.noise,
+        blur_px=first.law.blur,
+        as_built=as_built,
+        variance_factor=factor,
+        noise_factor=noise_factor,
+        shared_sigma=shared,
+        systematic_px=scatter.systematic_px,
+        table=table,
+        acquisitions=sum(f.acquisitions for f in followers),
+        warnings=warnings,
+        doubts=(
+            *repeats_in_words(repeated, pairs),
+            *slips,
+            *(text for text in warnings if text.startswith((MISFIT, ONE_SIDED))),
+        ),
+    )
+
+
+def _outlying(tables: Tables, setup: TrackingSetup) -> Mask:
+    """(n,) True where the dots miss the pose that was tracked by far more than in the other frames."""
+    n = len(tables.t)
+    residuals = np.full(tables.pixels.shape, np.nan)
+    for first in range(0, n, FITTED_AT_ONCE):
+        rows = slice(first, first + FITTED_AT_ONCE)
+        pixels, _ = marker_pixels(tables.R[rows], tables.t[rows], setup.rig, setup.disc.marker_centres_body)
+        W = whitening(tables.covariance_px2[rows])
+        known: Mask = np.asarray(np.isfinite(tables.covariance_px2[rows]).all((-1, -2)))
+        residuals[rows] = np.where(known[..., None], (W @ (tables.pixels[rows] - pixels)[..., None])[..., 0], np.nan)
+    return outlying_frames(residuals)
+
+
+def _without_false_shifts(as_built: AsBuilt, rig: StereoRig, declared: Disc, faults: SharedFaults) -> AsBuilt:
+    """Where cameras and clock are wrong, dots refined alone would be moved to make up for that: take the joint ones."""
+    if not as_built.reduced_chi_square_after > FAULTY * max(1.0, faults.reduced_chi_square):
+        return as_built
+    shift = faults.marker_shift
+    if np.sqrt(np.mean(shift**2)) < MIN_MARKER_SHIFT:
+        shift = np.zeros_like(shift)
+    disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
+    sigma = faults.marker_shift_sigma
+    return replace(as_built, rig=rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
+
+
+def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFits:
+    """The poses of all frames, some thousands at a time: what a fit needs beside its result is five times as large."""
+    n, whole = len(tables.t), dict[str, NDArray]()
+    for first in range(0, n, FITTED_AT_ONCE):
+        rows = slice(first, first + FITTED_AT_ONCE)
+        part = fit_poses(
+            tables.pixels[rows],
+            tables.covariance_px2[rows],
+            as_built.rig,
+            as_built.disc.marker_centres_body,
+            tables.R[rows],
+            tables.t[rows],
+            reject_outliers=reject_outliers,
+        )
+        for name, value in vars(part).items():
+            if name not in whole:
+                whole[name] = np.empty((n, *value.shape[1:]), value.dtype)
+            whole[name][rows] = value
+    return PoseFits(**whole)
+
+
+def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig) -> tuple[tuple[float, str], ...]:
+    """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what."""
+    rows = np.flatnonzero(fits.converged & np.isfinite(systematic).all(axis=(1, 2)))
+    if not rows.size:
+        return ()
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(SHARED_FRAMES, len(rows))).astype(int))]
+    repeats = np.mean(np.diagonal(systematic[rows], axis1=1, axis2=2), axis=0)
+    sigma, most = causes(rig, fits.sensitivity[rows], {"what repeats in the dots": repeats})
+    return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
+
+
+def _trajectory(
+    fits: PoseFits,
+    verdicts: Verdicts,
+    systematic: Array,
+    tables: Tables,
+    as_built: AsBuilt,
+    time: Array,
+    pairs: range,
+    frame_rate: float,
+    gravity: float,
+) -> Trajectory:
+    euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
+    euler[~fits.converged] = np.nan
+    status = tables.frame_status.copy()
+    followed = status == FrameStatus.MEASURED
+    per_camera = fits.used.sum(axis=2)
+    total = per_camera.sum(axis=1)
+    status[followed & (total < MIN_GOOD_DOT_IMAGES)] = FrameStatus.FEW_MARKERS
+    status[followed & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
+    status[followed & (total < 3)] = FrameStatus.MARKERS_NOT_FOUND
+    status[followed & (total >= 3) & ~fits.converged] = FrameStatus.NOT_CONVERGED
+    refused = verdicts.status != FrameStatus.MEASURED
+    status[refused] = verdicts.status[refused]
+    marker_status = tables.status.copy()
+    seen = tables.status == MarkerStatus.MEASURED
+    kept = fits.used & ~refused[:, None, None]
+    marker_status[seen & ~kept & (fits.converged | refused)[:, None, None]] = MarkerStatus.REJECTED
+    for without_answer in (euler, fits.t_world_body, fits.R_world_body, fits.covariance, fits.sensitivity, systematic):
+        without_answer[refused] = np.nan
+    squared = np.where(fits.used, np.sum(fits.residuals_px**2, axis=-1), 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.sqrt(squared.sum(axis=2) / per_camera)
+        quaternion = frames.continuous_quaternions(frames.quaternion_from_rotation(fits.R_world_body))
+    return Trajectory(
+        time=time,
+        frame=np.array(pairs, dtype=np.int64),
+        q=np.column_stack([fits.t_world_body, euler]),
+        pose_covariance=fits.covariance,
+        calibration_sensitivity=fits.sensitivity,
+        systematic_covariance=systematic,
+        quaternion=quaternion,
+        frame_status=status,
+        reprojection_rms_px=rms,
+        reduced_chi_square=fits.reduced_chi_square,
+        markers_px=tables.pixels,
+        markers_covariance_px2=tables.covariance_px2,
+        markers_residual_px=fits.residuals_px,
+        marker_status=marker_status,
+        disc=as_built.disc,
+        rig=as_built.rig,
+        frame_rate=frame_rate,
+        gravity=gravity,
+    )

@@ -1,0 +1,100 @@
+"""What a run says about its own result: what makes it worse, and what puts it in question."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.arrays import Array, Mask
+from disctrack import frames
+from disctrack.disc import symmetry_order
+from disctrack.track.following import Follower
+from disctrack.track.own_scatter import Scatter, SharedFaults
+from disctrack.track.table_contact import TableFromDisc
+from disctrack.trajectory import FrameStatus, Trajectory
+
+MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
+FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
+DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
+ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
+HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
+ONE_SIDED = "the dots of only one camera make sense"
+MISFIT = "the dots miss their fitted places"
+
+
+def repeats_in_words(repeated: Mask, pairs: range) -> tuple[str, ...]:
+    """Images that are copies of earlier ones, as (n, 2)."""
+    said = []
+    for camera, copies in zip(frames.CAMERAS, (repeated & ~repeated.all(axis=1, keepdims=True)).T, strict=True):
+        rows = np.flatnonzero(copies)
+        if len(rows):
+            shown = ", ".join(str(pairs[row]) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
+            said.append(
+                f"{camera} camera: {len(rows)} image(s) are copies of earlier ones (frame {shown}): the camera or its "
+                "recorder lost these; the frames are measured without them"
+            )
+    return tuple(said)
+
+
+def _table_gap(trajectory: Trajectory) -> Array:
+    """Height of the disc's lowest point above the table [m] in the frames that have a pose; empty without a table."""
+    if not trajectory.rig.world_is_table:
+        return np.empty(0)
+    z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
+    return z - trajectory.disc.resting_height(theta)
+
+
+def warnings_of(
+    follower: Follower,
+    variance_factor: float,
+    faults: SharedFaults | None,
+    scatter: Scatter,
+    table: TableFromDisc | None,
+    trajectory: Trajectory,
+) -> tuple[str, ...]:
+    """One sentence each."""
+    warnings = []
+    own = variance_factor if faults is None else max(1.0, faults.reduced_chi_square)
+    systematic_px = max(scatter.systematic_px)
+    one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
+    if one > both:
+        warnings.append(
+            f"{ONE_SIDED} in {one} of {one + both} measured frames: are left and right "
+            "exchanged, does the rig belong to this recording, does one camera look at the underside?"
+        )
+    order = symmetry_order(follower.setup.disc)
+    if order > 1:
+        warnings.append(
+            f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
+            "multiples of that (its rate is not affected)"
+        )
+    for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
+        if saturation is not None:
+            warnings.append(
+                f"{camera} camera: the light round the dots is clipped at grey value {saturation}, which hides part of "
+                "their edges and of the noise: positions may be off by a micrometre. Expose for a shorter time"
+            )
+    if variance_factor > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
+        warnings.append(
+            f"{MISFIT} by {np.sqrt(variance_factor / own):.1f} times their own "
+            f"scatter ({systematic_px:.3f} px): a camera moved, was refocused or lags since the calibration. "
+            "disctrack diagnose tells which; calibrate again, or check the synchronisation"
+        )
+    elif scatter.noise > 4.0:
+        warnings.append(
+            f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
+            "round, or their edges are not sharp, or the images were processed"
+        )
+    if table is not None and table.probability < DISAGREE:
+        warnings.append(
+            f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
+            "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
+            "is, or the cameras moved together since the table view"
+        )
+    gap = _table_gap(trajectory)
+    if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:
+        warnings.append(
+            f"the disc's lowest point lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
+            f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
+            "this recording, the cameras moved together, or the disc is in the air"
+        )
+    return tuple(warnings)
