@@ -11,7 +11,7 @@ from calibration.camera import N_INTRINSIC, StereoRig
 from calibration.causes import causes
 from calibration.errors import CalibrationError
 from calibration.model_choice import TermsTried
-from calibration.normal_equations import Problem, minimise
+from calibration.normal_equations import Problem, minimise, scaled_solve
 from calibration.pairs import PairMotion
 from calibration.refinement import Refinement
 
@@ -30,7 +30,7 @@ class HalfSets:
     baseline: float  # [m] even minus odd
     rotation: float  # [rad] between the two relative orientations
     focal_px: tuple[float, float]  # left, right, mean of fx and fy
-    sigmas: float  # root mean square difference in units of its predicted standard deviation; about 1 is right
+    sigmas: float  # root of chi-square per parameter, of the difference by its predicted covariance; about 1 is right
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,6 @@ def half_set_differences(refinement: Refinement, inflation: float) -> HalfSets |
     difference = even - odd
     C = inflation * (C_even + C_odd)
     s = len(difference)
-    normalised = difference / np.sqrt(np.diag(C))
     basis = refinement.problem.stereo_basis
     full = basis @ difference
     t = refinement.model.t_right_left
@@ -135,7 +134,8 @@ def half_set_differences(refinement: Refinement, inflation: float) -> HalfSets |
         baseline=float(full[21:24] @ t / np.linalg.norm(t)),
         rotation=float(np.linalg.norm(full[18:21])),
         focal_px=(float(full[0:2].mean()), float(full[N_INTRINSIC : N_INTRINSIC + 2].mean())),
-        sigmas=float(np.sqrt(np.sum(normalised**2) / s)),
+        # of all parameters together: most differences are along directions that the views tell badly
+        sigmas=float(np.sqrt(difference @ scaled_solve(C, difference) / s)),
     )
 
 

@@ -54,7 +54,7 @@ class Normal:
         carried, own = self._eliminated(pose)
         total = self.shared
         schur = total + damping * np.diag(np.diag(total)) - self._by_poses(carried)
-        step = _scaled_solve(schur, (self.gradient - np.einsum("vsi,vi->vs", self.cross, own)).sum(0))
+        step = scaled_solve(schur, (self.gradient - np.einsum("vsi,vi->vs", self.cross, own)).sum(0))
         return step, own - carried @ step
 
     def _eliminated(self, pose: Array) -> tuple[Array, Array]:
@@ -79,12 +79,12 @@ class Normal:
         """Of the shared parameters (s, s), of each pose (v, 6, 6), and between shared and pose (v, s, 6)."""
         carried, _ = self._eliminated(self.pose)
         information = self.shared - self._by_poses(carried)
-        shared = _scaled_solve(information, np.eye(len(information)))
+        shared = scaled_solve(information, np.eye(len(information)))
         cross = -shared @ np.swapaxes(carried, 1, 2)
         return shared, np.linalg.inv(self.pose) - carried @ cross, cross
 
 
-def _scaled_solve(A: Array, b: Array) -> Array:
+def scaled_solve(A: Array, b: Array) -> Array:
     """Solve A x = b after scaling A to a unit diagonal: the parameters' units differ by 10^6."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
     columns = scale if b.ndim == 1 else scale[:, None]
