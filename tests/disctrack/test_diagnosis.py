@@ -40,7 +40,7 @@ ALWAYS = {"table tilt 0.35 deg", "centre of mass 0.1 mm off", "right camera 0.25
 def test_a_hidden_effect_is_found_named_and_sized(name):
     planted, faults, names = HIDDEN[name]
     effects = {k: v for k, v in planted.items() if k.partition(".")[0] in CATALOGUE}
-    result = diagnose_trajectory(measured(effects, faults=faults, seed=len(name)))
+    result = diagnose_trajectory(measured(effects, faults=faults, seed=len(name), n=300))
     found = result.diagnosis.found
     assert result.diagnosis.verdict == "found", result.sentence
     assert found[0].candidate.name in names
@@ -68,7 +68,7 @@ def test_nothing_is_found_where_nothing_is_hidden():
 
 def test_two_effects_are_found_together():
     hidden = {"table_tilt.tilt_x": 0.002, "kz.k_z": 2e-5}
-    result = diagnose_trajectory(measured(hidden, seed=6))
+    result = diagnose_trajectory(measured(hidden, seed=6, n=250, declared_rate=500.0))
     assert {f.candidate.name for f in result.diagnosis.found} == {"table_tilt", "kz"}
     assert result.learned is None  # two named effects beat a law without a name
     for key, value in hidden.items():
@@ -77,7 +77,7 @@ def test_two_effects_are_found_together():
 
 def test_a_camera_that_turned_is_told_from_an_effect_of_the_motion():
     turned = Faults(right=CameraFault(rotation_deg=(0.02, 0.0, 0.0)))
-    result = diagnose_trajectory(measured(faults=turned, seed=8))
+    result = diagnose_trajectory(measured(faults=turned, seed=8, n=250, declared_rate=500.0))
     (found,) = result.diagnosis.found
     assert found.candidate.kind == "measurement"
     names = {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
