@@ -43,28 +43,33 @@ def dim(sample_clip):
     return render_disc(q, rig, disc, scene, np.random.default_rng(5)), rig, disc, q[:, :3]
 
 
+@pytest.fixture(scope="module")
+def plain(dim):
+    return follow(*dim[:3])
+
+
 @pytest.mark.parametrize("scale", [16, 13])
-def test_poses_do_not_depend_on_the_unit_of_grey(dim, scale):
+def test_poses_do_not_depend_on_the_unit_of_grey(dim, plain, scale):
     images, rig, disc, _ = dim
-    plain, scaled = follow(images, rig, disc), follow(images * np.uint16(scale), rig, disc)
+    scaled = follow(images * np.uint16(scale), rig, disc)
     # metres and radians; the same sums in other units, so round-off only
     assert_allclose(scaled.trajectory.q, plain.trajectory.q, rtol=0, atol=1e-9)
     assert_allclose(scaled.trajectory.pose_covariance, plain.trajectory.pose_covariance, rtol=1e-6)
     assert scaled.noise[0].step == scale
 
 
-def test_twelve_bits_scatter_less_than_the_same_frames_rounded_to_eight(dim):
+def test_twelve_bits_scatter_less_than_the_same_frames_rounded_to_eight(dim, plain):
     images, rig, disc, centres = dim
     eight = np.rint(images * (255 / 4095)).astype(np.uint8)
     assert 10 < eight.max() < 20  # the premise: rounding to whole grey values of 8 bits is felt
-    errors = [np.std(follow(frames, rig, disc).trajectory.q[:, :3] - centres, axis=0) for frames in (images, eight)]
+    followed = (plain, follow(eight, rig, disc))
+    errors = [np.std(tracking.trajectory.q[:, :3] - centres, axis=0) for tracking in followed]
     # measured 0.5 on 60 frames; the ratio of two standard deviations of 24 scatters by 0.2 of itself, the mean by 0.12
     assert np.mean(errors[0] / errors[1]) < 0.75
 
 
-def test_predicted_sigmas_hold_for_twelve_bits(dim):
-    images, rig, disc, centres = dim
-    found = follow(images, rig, disc).trajectory
+def test_predicted_sigmas_hold_for_twelve_bits(dim, plain):
+    found, centres = plain.trajectory, dim[3]
     sigma = np.sqrt(np.diagonal(found.pose_covariance, axis1=1, axis2=2)[:, :3])
     # 24 frames of 3 coordinates: chi-square / n scatters by sqrt(2 / 72) = 0.17
     assert 0.5 < np.mean(((found.q[:, :3] - centres) / sigma) ** 2) < 1.6
@@ -78,9 +83,8 @@ def test_clipped_light_is_told_and_light_below_it_is_not(dim):
     assert [w.split()[0] for w in warnings if f"clipped at grey value {clipped.max()}" in w] == ["left", "right"]
 
 
-def test_the_overlay_shows_deep_frames_as_bright_as_those_of_eight_bits(dim, rng):
-    images, rig, disc, _ = dim
-    trajectory = follow(images[:4], rig, disc).trajectory
+def test_the_overlay_shows_deep_frames_as_bright_as_those_of_eight_bits(dim, plain, rng):
+    images, trajectory = dim[0], plain.trajectory
     bright = np.clip(12 * images[2].astype(int) + rng.integers(0, 12, images[2].shape), 0, 4095).astype(np.uint16)
     shown = [draw_pair(pair, trajectory, 2) for pair in (bright, np.rint(bright * (255 / 4095)).astype(np.uint8))]
     assert np.abs(shown[0].astype(int) - shown[1]).max() <= 1  # one is rounded, the other cut
