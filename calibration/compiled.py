@@ -1,23 +1,94 @@
-"""numba's njit and cfunc, with a memory that knows what it was compiled from.
+"""numba's njit and cfunc, with a memory that knows what it was compiled from, and code that ships with the packages.
 
 numba keeps compiled code on disk until the file of the function itself changes. What was compiled into it from other
 files (functions that it calls, constants) could change unseen, and the old code would run on. Here it is kept for as
 long as the contents of the function's file and of all modules of these packages that it imports are the same; files
 that were compiled from others are overwritten. A function that is given helpers from elsewhere names them in an
 attribute `compiled_with`.
+
+Of the seconds that the first compilation of a large function takes, a tenth is LLVM's work for the machine at hand; the
+rest does not depend on it. So the largest functions ship as LLVM's intermediate code (folder `ahead`, written by
+tests/ship_compiled.py), which is optimised on the user's machine. It is taken where sources, types, system, Python and
+numba are those that it was made with; everywhere else numba compiles as ever.
 """
 
 from __future__ import annotations
 
+import gzip
+import hashlib
 import inspect
+import pickle
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from numba import cfunc, njit
-from numba.core.caching import CacheImpl
+import llvmlite.binding as llvm
+import numba
+from numba import cfunc
+from numba.core.caching import CacheImpl, FunctionCache
+from numba.core.serialize import dumps
 
 from calibration.sources import PACKAGES, sha256_with_imports
 
-__all__ = ["cfunc", "njit"]
+__all__ = ["cfunc", "dumps", "njit"]
+
+AHEAD = Path(__file__).parent / "ahead"
+
+
+def njit(function: Any = None, *, cache: bool = False, **rules: Any) -> Any:
+    """`numba.njit`; with cache=True what is compiled is kept, or taken from what ships."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**rules)(function)
+        if cache:
+            dispatcher._cache = _ShippedOrKept(function)
+        return dispatcher
+
+    return compiled if function is None else compiled(function)
+
+
+class _ShippedOrKept(FunctionCache):
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        kept = super().load_overload(sig, target_context)
+        if kept is not None:
+            return kept
+        codegen = target_context.codegen()
+        entry = _shipped(self._py_func, sig, self._impl.locator.get_source_stamp(), codegen)
+        if entry is None:
+            return None
+        self._cache_file.save(self._index_key(sig, codegen), entry)
+        return super().load_overload(sig, target_context)
+
+
+def shipped_file(function: Callable[..., Any], sig: Any) -> Path:
+    """Where the intermediate code of a function for these argument types is."""
+    types = hashlib.sha256(str(sig).encode()).hexdigest()[:8]
+    return AHEAD / f"{function.__module__}.{function.__qualname__}-{types}.gz"
+
+
+def made_for(stamp: str, sig: Any) -> tuple[str, ...]:
+    """What must be the same where intermediate code is made and where it is used."""
+    python = f"{sys.implementation.name} {sys.version_info.major}.{sys.version_info.minor}"
+    return stamp, str(sig), llvm.get_process_triple(), python, numba.__version__
+
+
+def _shipped(function: Callable[..., Any], sig: Any, stamp: str, codegen: Any) -> Any:
+    """What numba would keep of the function, from the intermediate code that ships; None where it is for others."""
+    try:
+        with gzip.open(shipped_file(function, sig)) as file:
+            if pickle.load(file) != made_for(stamp, sig):
+                return None
+            name, bitcode, (*others, environments) = pickle.load(file)
+    except OSError:
+        return None
+    library = codegen.create_library(name)
+    library._final_module = llvm.parse_bitcode(bitcode)
+    library._optimize_final_module()
+    module = library._final_module
+    left = {variable.name for variable in module.global_variables}
+    used = tuple(environment for environment in environments if environment.env_name in left)
+    return (name, "object", (codegen._tm.emit_object(module), module.as_bitcode())), *others, used
 
 
 def _aware_of_sources(locator: Any) -> Any:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import sys
 from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
 
-PACKAGES = ("calibration", "disctrack")
+PACKAGES = ("calibration", "disctrack")  # side by side
+_HOME = Path(__file__).parents[1]
 _IMPORTS = re.compile(r"^\s*from ((?:calibration|disctrack)(?:\.\w+)*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
@@ -65,9 +65,6 @@ def _read(file: str) -> tuple[bytes, frozenset[str]]:
 
 @cache
 def _files_of(module: str) -> tuple[str, ...]:
-    """The module's file, and that of a package on the way to it; () where it is none."""
-    top, *parts = module.split(".")
-    if top not in sys.modules:
-        return ()
-    path = Path(str(sys.modules[top].__file__)).parent.joinpath(*parts)
-    return tuple(str(file) for file in (path.with_suffix(".py"), path / "__init__.py") if parts and file.is_file())
+    """The module's file, and that of its package; () where it is none."""
+    path = _HOME.joinpath(*module.split("."))
+    return tuple(str(file) for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file())

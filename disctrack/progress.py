@@ -58,10 +58,10 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def compiling(what: str, seconds: int) -> Iterator[None]:
+def compiling(what: str, seconds: int | str) -> Iterator[None]:
     """Say on stderr what is compiled and for how long, unless it is over at once because it was compiled before.
 
-    seconds: of processor time that it took where it was measured.
+    seconds: of processor time that it took where it was measured, with and without code that ships for this Python.
     """
     began, over = time.perf_counter(), threading.Event()
     told = f"compiling the inner loops of {what}: once per installation, about {seconds} s of a free core"

@@ -18,11 +18,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Compile what reading, calibrating and tracking use; returns the exit code."""
     with compiling("readers", 1):
         png.prepare()
-    with compiling("corners", 8):
+    with compiling("corners", "1 to 8"):
         corner_fit.prepare()
-    with compiling("tracking, 8 bit", 20):
+    with compiling("tracking, 8 bit", "5 to 20"):
         prepare(np.uint8)
-    with compiling("tracking, 16 bit", 20):
+    with compiling("tracking, 16 bit", "5 to 20"):
         prepare(np.uint16)
     print(f"inner loops are compiled; kept in {kernels.track_frames.stats.cache_path}")
     return DONE

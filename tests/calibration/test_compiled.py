@@ -1,0 +1,55 @@
+"""Functions that ship as intermediate code are those that numba would compile."""
+
+import gzip
+import pickle
+
+import numpy as np
+import pytest
+
+from calibration import compiled
+from calibration._corner_kernel import fit_corners
+from disctrack.readers import _png
+from disctrack.track._kernels import track_frames
+
+SHIPPED = {"fit_corners": (fit_corners, 1), "_undo_filters": (_png._undo_filters, 2), "track_frames": (track_frames, 2)}
+
+
+def headers(function):
+    name = f"{function.__module__}.{function.__qualname__}-*.gz"
+    for file in compiled.AHEAD.glob(name):
+        with gzip.open(file) as content:
+            yield pickle.load(content)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_what_ships_was_made_from_the_present_sources(name):
+    dispatcher, n = SHIPPED[name]
+    found = list(headers(dispatcher.py_func))
+    assert len(found) == n
+    stamp = dispatcher._cache._impl.locator.get_source_stamp()
+    if any(made[0] != stamp for made in found):
+        pytest.skip("made from other sources, so it is compiled here: python tests/ship_compiled.py makes it anew")
+
+
+def test_shipped_code_does_what_the_function_says(rng):
+    raw = rng.integers(0, 256, (6, 41), dtype=np.uint8)
+    raw[:, 0] = [0, 1, 2, 3, 4, 4]
+    expected, got = np.empty((6, 40), np.uint8), np.empty((6, 40), np.uint8)
+    with np.errstate(over="ignore"):
+        _png._undo_filters.py_func(raw, 1, expected)
+    _png._undo_filters(raw, 1, got)
+    np.testing.assert_array_equal(got, expected)
+
+
+def test_code_for_other_sources_types_or_programs_is_left_alone(monkeypatch, tmp_path):
+    function = _png._undo_filters.py_func
+    codegen = _png._undo_filters.targetctx.codegen()
+    _png.prepare()
+    for sig in _png._undo_filters.overloads:
+        with gzip.open(compiled.shipped_file(function, sig)) as content:
+            stamp = pickle.load(content)[0]
+        assert compiled._shipped(function, sig, "other sources", codegen) is None
+        assert compiled._shipped(function, (*sig, 1), stamp, codegen) is None
+        monkeypatch.setattr(compiled.numba, "__version__", "0.0")
+        assert compiled._shipped(function, sig, stamp, codegen) is None
+        monkeypatch.undo()
