@@ -81,28 +81,14 @@ def assemble(
     field = first.setup.rig.lens_field
     if field is not None:
         tables.pixels = field.corrected(tables.pixels)
-    outlying = _outlying(tables, first.setup)
-    R, t = (np.where(outlying.reshape(-1, *[1] * (part.ndim - 1)), np.nan, part) for part in (tables.R, tables.t))
-    as_built = refine_as_built(
-        tables.pixels,
-        tables.covariance_px2,
-        first.setup.rig,
-        first.setup.disc,
-        R,
-        t,
-        refine_markers=settings.refine_markers,
-        refine_rig=settings.refine_rig,
-        max_frames=SHARED_FRAMES,
-    )
-    faults = without_shared_faults(
-        tables.pixels,
-        tables.covariance_px2,
-        first.setup.rig,
-        first.setup.disc,
-        R,
-        t,
-        max_frames=SHARED_FRAMES,
-    )
+    outlying = _outlying(tables, first.setup.rig, first.setup.disc)
+    as_built, faults = _shared(tables, first.setup, settings, outlying)
+    if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
+        centres = first.setup.disc.marker_centres_body + faults.marker_shift
+        more = _outlying(tables, first.setup.rig, replace(first.setup.disc, marker_centres_body=centres)) & ~outlying
+        if more.any():
+            outlying |= more
+            as_built, faults = _shared(tables, first.setup, settings, outlying)
     if settings.refine_markers and faults is not None:
         as_built = _without_false_shifts(as_built, first.setup.rig, first.setup.disc, faults)
     fits = _fit_all(tables, as_built, settings.reject_outliers)
@@ -153,16 +139,35 @@ def assemble(
     )
 
 
-def _outlying(tables: Tables, setup: TrackingSetup) -> Mask:
-    """(n,) True where the dots miss the pose that was tracked by far more than in the other frames."""
+def _shared(
+    tables: Tables, setup: TrackingSetup, settings: TrackingSettings, outlying: Mask
+) -> tuple[AsBuilt, SharedFaults | None]:
+    """What the frames share, from those that are not outlying (n,)."""
+    R, t = (np.where(outlying.reshape(-1, *[1] * (part.ndim - 1)), np.nan, part) for part in (tables.R, tables.t))
+    seen = tables.pixels, tables.covariance_px2, setup.rig, setup.disc, R, t
+    as_built = refine_as_built(
+        *seen, refine_markers=settings.refine_markers, refine_rig=settings.refine_rig, max_frames=SHARED_FRAMES
+    )
+    return as_built, without_shared_faults(*seen, max_frames=SHARED_FRAMES)
+
+
+def _outlying(tables: Tables, rig: StereoRig, disc: Disc) -> Mask:
+    """(n,) True where the dots miss the pose that was tracked, after one more step, by far more than in others."""
     n = len(tables.t)
     residuals = np.full(tables.pixels.shape, np.nan)
     for first in range(0, n, FITTED_AT_ONCE):
         rows = slice(first, first + FITTED_AT_ONCE)
-        pixels, _ = marker_pixels(tables.R[rows], tables.t[rows], setup.rig, setup.disc.marker_centres_body)
+        pixels, J = marker_pixels(tables.R[rows], tables.t[rows], rig, disc.marker_centres_body)
         W = whitening(tables.covariance_px2[rows])
-        known: Mask = np.asarray(np.isfinite(tables.covariance_px2[rows]).all((-1, -2)))
-        residuals[rows] = np.where(known[..., None], (W @ (tables.pixels[rows] - pixels)[..., None])[..., 0], np.nan)
+        residual = (W @ (tables.pixels[rows] - pixels)[..., None])[..., 0]
+        known: Mask = np.asarray(np.isfinite(residual).all(-1))
+        known &= np.isfinite(tables.covariance_px2[rows]).all((-1, -2))
+        r = np.where(known[..., None], residual, 0.0)
+        J = np.where(known[..., None, None], W @ J, 0.0)
+        gradient = np.einsum("ncdij,ncdi->nj", J, r)
+        normal = np.einsum("ncdij,ncdik->njk", J, J)
+        step = (np.linalg.pinv(normal, hermitian=True) @ gradient[..., None])[..., 0]
+        residuals[rows] = np.where(known[..., None], r - np.einsum("ncdij,nj->ncdi", J, step), np.nan)
     return outlying_frames(residuals)
 
 
