@@ -5,7 +5,7 @@ The disc is followed through each stretch in `following`; what comes of it is pu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
+from calibration.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
@@ -41,6 +42,7 @@ from disctrack.trajectory import FrameStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
+STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
 
@@ -91,6 +93,7 @@ def track(
             + (" on one line" if disc.n_markers > 2 else "")
             + ": a pose needs at least three dots that are not on one line"
         )
+    read_blocks, stuck = _without_stuck_pixels(read_blocks, pairs)
     tables = empty_tables(n, disc.n_markers)
     with ThreadPoolExecutor(2) as pool:  # 0.1 s each
         maps = list(pool.map(normalised_maps, rig.cameras))
@@ -158,6 +161,7 @@ def track(
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     tracking = assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
+    tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
     if any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts):
         one_sided = np.flatnonzero(tracking.trajectory.frame_status == FrameStatus.ONE_CAMERA)
         if arranged := _arrangement(read_blocks, rig, disc, pairs[one_sided[0] :]):
@@ -187,6 +191,33 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     while n >= SHORTEST_SPLIT * count**2 and count < MOST_STRETCHES and symmetry_order(disc) == 1:
         count *= 2
     return [pairs.start + k * n // count for k in range(count + 1)]
+
+
+def _without_stuck_pixels(
+    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], pairs: range
+) -> tuple[Callable[[int, int], Iterable[BlockOfPairs]], list[str]]:
+    """Blocks in which pixels that do not see are replaced by their neighbours, and what is to be said of them."""
+    stop = min(pairs.start + STUCK_FRAMES, pairs.stop)
+    first = [(block.images[block.readable.all(axis=1)]).copy() for block in read_blocks(pairs.start, stop)]
+    images = np.concatenate(first) if first else np.zeros((0, 2, 1, 1), np.uint8)
+    stuck = [stuck_pixels(images[:, camera]) for camera in (0, 1)]
+    if stuck[0] is None and stuck[1] is None:
+        return read_blocks, []
+
+    def repaired(start: int, stop: int) -> Iterator[BlockOfPairs]:
+        for block in read_blocks(start, stop):
+            for camera, mask in enumerate(stuck):
+                if mask is not None:
+                    for image in block.images[:, camera]:
+                        repair(image, mask)
+            yield block
+
+    told = [
+        f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in for them"
+        for name, mask in zip(frames.CAMERAS, stuck, strict=True)
+        if mask is not None
+    ]
+    return repaired, told
 
 
 def _cut(block: BlockOfPairs, edges: Sequence[int]) -> list[range]:

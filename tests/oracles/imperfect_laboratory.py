@@ -59,6 +59,41 @@ IDEAL = Imperfections(**{f.name: 0.0 for f in fields(Imperfections)})
 
 
 @dataclass(frozen=True)
+class Trouble:
+    """What goes wrong with sensor and light in single recordings; nothing by default."""
+
+    contrast: float = 1.0  # of the scene, about a middle grey: 0.24 leaves 40 grey values between ink and paper
+    stuck_pixels: int = 0  # of each camera that show full scale, and as many that show nothing
+    flicker: float = 0.0  # of the light, 100 Hz, amplitude over mean
+    hand: range = range(0)  # frames in which a hand hides half of the disc
+    gleam: range = range(0)  # frames in which a saturated gleam lies on one dot
+    gleam_dot: int = 2
+
+    def before(self, camera, radiance, poses, dots, frame, frame_rate):
+        """The scene's light as it reaches the sensor."""
+        radiance = 110 + self.contrast * (radiance - 110)
+        R, t, _ = poses[1]
+        y, x = np.mgrid[: camera.size, : camera.size]
+        if frame in self.hand:
+            centre = camera.project(t[None])[0]
+            edge = 12 * np.sin(0.1 * y + 0.3 * frame)  # fingers that move
+            hand = np.clip(x - centre[0] + edge, 0, 1)
+            radiance = radiance + hand * (120 + 10 * np.sin(0.07 * x) - radiance)
+        if frame in self.gleam:
+            u, v = camera.project((np.append(dots[self.gleam_dot], HALF_THICKNESS) @ R.T + t)[None])[0]
+            radiance = radiance + 900 * np.exp(-0.5 * ((x - u - 3) ** 2 + (y - v + 2) ** 2) / 6.0**2)
+        return radiance * (1 + self.flicker * np.sin(2 * np.pi * 100 * frame / frame_rate + 0.4))
+
+    def after(self, camera, image):
+        """The image with its stuck pixels."""
+        if self.stuck_pixels:
+            where = np.random.default_rng(int(1e3 * camera.focal)).permutation(image.size)[: 2 * self.stuck_pixels]
+            image = image.copy()
+            image.flat[where[::2]], image.flat[where[1::2]] = 255, 0
+        return image
+
+
+@dataclass(frozen=True)
 class Plan:
     """A recording."""
 
@@ -76,6 +111,7 @@ class Plan:
     paper: float = 190.0
     ink: float = 25.0
     blur: float = 0.62  # [px]
+    trouble: Trouble = Trouble()
 
 
 class Camera:
@@ -211,7 +247,7 @@ def _deeper(camera, R, t, height):
     return o[0] + s * d[0], o[1] + s * d[1]
 
 
-def disc_image(camera, plan, poses, dots, rng):
+def disc_image(camera, plan, poses, dots, rng, frame=0):
     """One image; poses: (R, t, weight) over the exposure, the middle one second."""
     size, soft = plan.size, camera.table.copy()
     R, t, _ = poses[1]
@@ -253,7 +289,8 @@ def disc_image(camera, plan, poses, dots, rng):
             step = np.hypot(G[0, 0] * x + G[1, 0] * y, G[0, 1] * x + G[1, 1] * y) / rho
             cover = cover + weight * np.clip(0.5 - (rho - DOT_RADIUS) / step, 0, 1)
         soft[y0:y1, x0:x1] += gathered(cover, plan.blur) * (plan.ink - soft[y0:y1, x0:x1])
-    return camera.expose(soft, rng)
+    soft = plan.trouble.before(camera, soft, poses, dots, frame, plan.frame_rate)
+    return plan.trouble.after(camera, camera.expose(soft, rng))
 
 
 def motion(plan):
@@ -315,7 +352,7 @@ def write(folder, plan):
         if not faults.exposure:
             poses = [(*poses[1][:2], w) for w in (0.0, 1.0, 0.0)]
         for name, camera in zip(("left", "right"), cameras, strict=True):
-            save(f"{name}/{i:06d}.png", disc_image(camera, plan, poses, dots, rng))
+            save(f"{name}/{i:06d}.png", disc_image(camera, plan, poses, dots, rng, i))
     centres = ", ".join(f"[{x * 1e3:.4f}, {y * 1e3:.4f}]" for x, y in DOTS)
     (folder / "recording.toml").write_text(
         f"""name = "{folder.name}"

@@ -1,0 +1,57 @@
+"""Pixels of a sensor that do not see: hot, dead or stuck at a value, found in images of a scene that moves.
+
+A dot or a corner is fitted to a thousand pixels; one that is off by half the range, at the same place in every image,
+pulls it by more than the noise of all others. Cameras replace such pixels by their neighbours; many do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Image, Mask
+
+OFF = 0.12  # of the images' range, by which a pixel differs from the median of its neighbours in every image
+STEADY = 0.04  # of the range: it changes by no more than that, whatever passes
+MIN_IMAGES = 4
+MOST = 0.01  # of all pixels: more are a pattern of the scene
+
+
+def stuck_pixels(images: Sequence[Image] | NDArray) -> Mask | None:
+    """(height, width) True where a pixel is stuck in all grey images (n, height, width); None where none is."""
+    if len(images) < MIN_IMAGES:
+        return None
+    low, high = np.array(images[0]), np.array(images[0])
+    scale = float(np.ptp(low))
+    off = np.ones(low.shape, bool)
+    for image in images:
+        level = cv2.medianBlur(np.ascontiguousarray(image), 3)
+        off &= np.abs(image.astype(np.int32) - level) > OFF * scale
+        if not off.any():
+            return None
+        np.minimum(low, image, out=low)
+        np.maximum(high, image, out=high)
+    off &= high.astype(np.int32) - low <= STEADY * scale
+    return off if 0 < off.sum() <= MOST * off.size else None
+
+
+def repair(images: NDArray, stuck: Mask) -> None:
+    """Replace, in place, the stuck pixels of images (..., height, width) by the median of their good neighbours."""
+    width = stuck.shape[1]
+    y, x = np.nonzero(stuck)
+    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+    v, u = y[:, None] + steps[:, 0], x[:, None] + steps[:, 1]
+    inside = (v >= 0) & (v < stuck.shape[0]) & (u >= 0) & (u < width)
+    good = inside & ~stuck[np.where(inside, v, 0), np.where(inside, u, 0)]
+    index = np.where(inside, v * width + u, 0)
+    # good ones first; places of others are taken by the good ones in turn
+    order = np.take_along_axis(index, np.argsort(~good, axis=1, kind="stable"), axis=1)
+    n = good.sum(axis=1)
+    order = np.take_along_axis(order, np.arange(len(steps)) % np.maximum(n, 1)[:, None], axis=1)[n > 0]
+    flat = images.reshape(-1, stuck.size)
+    if not np.shares_memory(flat, images):
+        raise ValueError("images must be contiguous, or one by one")
+    flat[:, (y * width + x)[n > 0]] = np.median(flat[:, order], axis=-1).astype(images.dtype)

@@ -1,0 +1,53 @@
+"""Pixels that do not see are found in a moving scene and replaced; a sharp scene has none."""
+
+import numpy as np
+from numpy.testing import assert_array_equal
+
+from calibration.stuck_pixels import repair, stuck_pixels
+
+
+def scene(rng, frames=6, size=120):
+    """Dark dots with sharp edges, and squares, that move by two pixels a frame over a texture that rests."""
+    y, x = np.mgrid[:size, :size]
+    still = 90 + 10 * np.sin(0.9 * x) * np.sin(0.7 * y)
+    images = []
+    for i in range(frames):
+        image = still.copy()
+        for u, v in ((30, 40), (80, 70)):
+            image[np.hypot(x - u - 2 * i, y - v) < 12] = 25
+        image[95:, :] = np.where((x + 2 * i)[95:] // 9 % 2, 20, 200)
+        images.append(image + rng.normal(0, 1.5, image.shape))
+    return np.clip(np.rint(images), 0, 255).astype(np.uint8)
+
+
+def test_a_scene_without_faults_has_no_stuck_pixels(rng):
+    assert stuck_pixels(scene(rng)) is None
+    assert stuck_pixels(scene(rng)[:2]) is None  # two images tell nothing
+
+
+def test_hot_and_dead_pixels_are_found_and_replaced(rng):
+    clean = scene(rng)
+    where = rng.permutation(clean[0].size)[:40]
+    for images in (clean, clean.astype(np.uint16) * 64):
+        seen = images.copy()
+        seen.reshape(len(seen), -1)[:, where[::2]], seen.reshape(len(seen), -1)[:, where[1::2]] = images.max(), 0
+        found = stuck_pixels(seen)
+        assert set(np.flatnonzero(found)) <= set(where)
+        assert found.sum() >= 26  # a dead one in the dark, or a hot one on white, is hard to tell, and harmless
+        mended = seen.copy()
+        for image in mended:
+            repair(image, found)
+        assert_array_equal(mended[:, ~found], seen[:, ~found])
+        scale = images.max() / 255
+        off = np.abs(mended[:, found].astype(float) - images[:, found]) / scale
+        assert np.median(off) < 5  # the texture
+        assert np.percentile(off, 90) < 60  # on the edge of a square the neighbours disagree
+
+
+def test_neighbouring_stuck_pixels_do_not_stand_in_for_each_other(rng):
+    images = scene(rng)
+    mask = np.zeros(images[0].shape, bool)
+    mask[10:12, 10:12] = mask[0, 0] = True
+    images[:, mask] = 255
+    repair(images[0], mask)
+    assert np.all(images[0][mask] < 120)
