@@ -11,6 +11,7 @@ from disctrack.diagnosis.together.crew import Crew
 from disctrack.diagnosis.together.fitting_in import Blocks, apart
 from disctrack.diagnosis.together.joint import JointSystem
 from disctrack.diagnosis.together.sharing import Sharing
+from disctrack.errors import AnalysisError
 from tests.oracles.decaying_runs import build, fitted_at_once, renamed, runs
 
 
@@ -141,3 +142,11 @@ def test_the_number_of_processes_changes_no_bit(rng):
             found.append(diagnose(system, system.sharing.start(), Settings(noise=1.0)).after)
     assert found[0].values == found[1].values
     assert (found[0].covariance == found[1].covariance).all()
+
+
+def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
+    crew = Crew(build, [*runs(rng, 1), None])
+    good, bad = crew.call("share", [(["state.a", "state.b"],)] * 2)
+    assert good is None
+    assert isinstance(bad, AnalysisError)
+    assert "TypeError" in str(bad)

@@ -24,7 +24,7 @@ class Crew:
     """Objects made by `build` from items, one for each, that answer calls of their methods."""
 
     def __init__(self, build: Build, items: Sequence[Any], processes: int = 1) -> None:
-        """What `build` raises of DiscTrackErrors is kept in place of its object.
+        """What `build` raises is kept in place of its object, as a DiscTrackError.
 
         build : a module's function, as it has to be found by other processes
         """
@@ -107,7 +107,8 @@ class Crew:
 
     def reduce(self, requests: Sequence[Request]) -> list[Reduced | None]:
         """As a `Reducer`."""
-        return self.call("reduce", [(values, names) for _, values, names in requests])
+        found = self.call("reduce", [(values, names) for _, values, names in requests])
+        return [None if isinstance(answer, DiscTrackError) else answer for answer in found]
 
 
 def _built(build: Build, item: Any) -> Any:
@@ -115,6 +116,8 @@ def _built(build: Build, item: Any) -> Any:
         return build(item)
     except DiscTrackError as error:
         return error
+    except Exception as error:  # whatever is wrong with one recording, the others are diagnosed
+        return AnalysisError(f"{type(error).__name__}: {error}")
 
 
 def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
@@ -124,6 +127,8 @@ def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
         return getattr(thing, method)(*arguments)
     except DiscTrackError as error:
         return error
+    except Exception as error:
+        return AnalysisError(f"{type(error).__name__}: {error}")
 
 
 def _work(connection: Connection, build: Build, items: dict[int, Any]) -> None:

@@ -317,6 +317,11 @@ def _notes(recordings: Sequence[OfRecording]) -> tuple[str, ...]:
     notes = [f"{r.name} {r.reason}" if r.reason.startswith("does") else f"{r.name} was left out: {r.reason}"
              for r in recordings if r.reason]  # fmt: skip
     for r in recordings:
+        if r.fits_in is not None and r.fits_in.p_value * len(recordings) < OWN_LEVEL:
+            notes.append(
+                f"{r.name} does not fit the others (p = {r.fits_in.p_value:.1g}), and yet is among them: more than a "
+                "third would have to go, and the sizes are those of no recording"
+            )
         if r.alone is not None and r.alone.converged:
             excess = (r.alone.chi_square / r.alone.degrees - 1) / np.sqrt(2 / r.alone.degrees)
             if stats.norm.sf(excess) * len(recordings) < OWN_LEVEL and r.alone.chi_square > 1.1 * r.alone.degrees:
