@@ -11,20 +11,21 @@ from calibration.brief import Brief
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
-from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment, learn, without_idle_terms
+from disctrack.diagnosis.disc.learned_law import LearnedLaw, learn, with_law, without_idle_terms
 from disctrack.diagnosis.disc.left_over import LeftOver, left_over
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.disc.plan import open_questions, plan, separations
+from disctrack.diagnosis.disc.regimes import regimes
 from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
 from disctrack.diagnosis.engine.memory import with_memory
 from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
-from disctrack.diagnosis.pages.words import sentence
+from disctrack.diagnosis.pages.words import law_text, sentence
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
@@ -64,7 +65,11 @@ def diagnose_trajectory(
     diagnosis, remarks = refine_shapes(system, diagnosis)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    moment, learned = _beyond_the_catalogue(system, diagnosis)
+    learned, also = _beyond_the_catalogue(system, diagnosis)
+    parts = None
+    if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
+        parts = regimes(system, _judged(diagnosis, system), diagnosis.before, diagnosis.noise)
+        also = (*also, parts.text)
     if learned is not None:
         system = system.knowing(learned.law.effect)
         reason = (
@@ -91,9 +96,9 @@ def diagnose_trajectory(
         for f in diagnosis.found
         if f.cannot_be_told_from and separate
     }
-    notes = (*answer.notes, *remarks)
+    notes = (*answer.notes, *remarks, *also)
     return DiscDiagnosis(
-        system, diagnosis, declared.name, text, before, after, energy, moment, learned, apart, notes=notes
+        system, diagnosis, declared.name, text, before, after, energy, learned, apart, notes=notes, regimes=parts
     )
 
 
@@ -130,39 +135,52 @@ def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:
     return diagnosis.judged.over(system) if isinstance(diagnosis.judged, Wrapped) else system
 
 
-def _with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
-    start = dict(base.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    return fit(system, (*base.quantities, *law.candidate.quantities), start)
+def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Learned | None, tuple[str, ...]]:
+    """A law outside the catalogue if that describes the data better, for its length, than the catalogue does.
 
-
-def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[MissingMoment | None, Learned | None]:
-    """The missing moment, and its law if that describes the data better, for its length, than the catalogue does."""
+    Beside it remarks on what describes them as well.
+    """
     if diagnosis.verdict == "nothing missing" or (diagnosis.verdict == "found" and len(diagnosis.found) < 2):
-        return None, None
+        return None, ()
     base = diagnosis.before
-    moment, law = learn(system, base, diagnosis.noise)
+    law = learn(system, base, diagnosis.noise)
     if law is None or diagnosis.held_out_before is None:
-        return moment, None
+        return None, ()
     system = system.knowing(law.effect)
     judged = _judged(diagnosis, system)
-    fitted = _with_law(judged, base, law)
+    fitted = with_law(judged, base, law)
     shorter = without_idle_terms(law, fitted)
     if fitted.converged and shorter is not law:
         law, system = shorter, system.knowing(shorter.effect)
         judged = _judged(diagnosis, system)
-        fitted = _with_law(judged, base, law)
+        fitted = with_law(judged, base, law)
     price = float(np.log(np.sum(system.weights)))
     lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
     saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])
     rows = training_rows(system, diagnosis.settings.train_fraction)
     held = held_out(judged, fitted.quantities, fitted.values, rows)
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise
-    if not (fitted.converged and saved > 0 and held_gain > 0):
-        return moment, None
+    if not (fitted.converged and saved > 0):
+        return None, _also(diagnosis, law, fitted)
     gain = (base.cost - fitted.cost) / diagnosis.noise
     work = energy_balance(system, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(system.time[-1] - system.time[0])
-    return moment, Learned(law, fitted, held, gain, float(held_gain), power)
+    notes = [f"{other} describes what is missing as well" for other in law.alike]
+    if diagnosis.found and diagnosis.after.reduced_chi_square <= diagnosis.settings.at_noise * diagnosis.noise:
+        known = ", ".join(f.candidate.name for f in diagnosis.found)
+        notes.append(
+            f"known effects together ({known}) leave {diagnosis.after.reduced_chi_square:.4g} of the expected variance "
+            f"where the law leaves {fitted.reduced_chi_square:.4g}: with their prices the law is ahead by {saved:.4g}"
+        )
+    return Learned(law, fitted, held, gain, float(held_gain), power), tuple(notes)
+
+
+def _also(diagnosis: Diagnosis, law: LearnedLaw, fitted: Fit) -> tuple[str, ...]:
+    """A law that describes the data too, though not in fewer numbers than the known effects."""
+    if not fitted.converged or fitted.reduced_chi_square > diagnosis.settings.at_noise * diagnosis.noise:
+        return ()
+    text = law_text(law, fitted)
+    return (f"a single law beside the catalogue describes the data too ({fitted.reduced_chi_square:.4g}): {text}",)
 
 
 def run_diagnose(
@@ -194,8 +212,6 @@ def run_diagnose(
         raise AnalysisError(f"{path}: {error}") from error
     result = with_plan(result) if settle else result
     beside = evidence(result) if result.before is not None else None
-    if beside is not None and result.moment is None:
-        result = replace(result, moment=beside.moment)
     document = {"recording": provenance.recording, **as_json(result, beside)}
     write_diagnosis(path, result, beside, document)
     write_whole(report, json_file(document))

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 from calibration.brief import Brief
 from disctrack.diagnosis.disc.errors import Errors
-from disctrack.diagnosis.disc.learned_law import LearnedLaw, MissingMoment
+from disctrack.diagnosis.disc.learned_law import LearnedLaw
 from disctrack.diagnosis.disc.plan import Plan, Separation
+from disctrack.diagnosis.disc.regimes import Regimes
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.held_out import HeldOut
@@ -37,11 +38,11 @@ class DiscDiagnosis(Brief):
     before: Errors | None  # None where the base fit did not converge
     after: Errors | None
     energy: dict[str, float]  # [J]
-    moment: MissingMoment | None = None  # that the model fails to supply, where it was asked for
     learned: Learned | None = None
     separated_by: dict[str, dict[str, Separation | None]] = field(default_factory=dict)  # effect -> rival -> recording
     plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
     notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
+    regimes: Regimes | None = None  # where a model that fails holds
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""

@@ -50,12 +50,14 @@ class ModelFreeEvidence:
 def evidence(result: DiscDiagnosis) -> ModelFreeEvidence:
     """All that a report shows beside a diagnosis whose base fit converged."""
     system, before = result.system, result.diagnosis.before
-    moment, of_law = result.moment, None
+    moment, of_law = None, None
     # a fit that fails by whole turns has no linear response to ask for
     if before.converged and not any(f.candidate.name == "slip_start" for f in result.diagnosis.found):
-        moment = moment or missing_moment(probe(system, before))
-        if result.after_fit is not before:
-            of_law = missing_moment(probe(system, before, result.after_fit.values), moment.scale)
+        blocks = probe(system, before)
+        moment = missing_moment(blocks) if blocks is not None else None
+        blocks = probe(system, before, result.after_fit.values) if result.after_fit is not before else None
+        if moment is not None and blocks is not None:
+            of_law = missing_moment(blocks, moment.scale)
     energy = energy_balance(system, before.values) if before.converged else {}
     return ModelFreeEvidence(_measured(system), moment, of_law, energy, _longer(result))
 

@@ -1,26 +1,32 @@
 """A law for what no catalogue names: the missing moment as a function of time, and as few terms that describe it.
 
-The motion's responses to short moments (probes) resolve the residual into a moment over time. Every term of a library
-is a course of that moment, so that its predicted residual is a sum of probes; terms are taken in by the gain of
-chi-square and kept if they are also chosen when parts of the recording are left out. What survives becomes an effect
-by formula and is fitted like any other.
+The motion's first-order response to any moment and force (rolling.responses) turns every law of a library into a
+predicted residual. The law that gains most is fitted in full beside its nearest rivals, and the next is looked for in
+what it leaves, while each pays for its numbers and for having been looked for among so many. What survives is an effect
+by formula like any other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, prior_rows, triangle
-from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.diagnosis.disc.law_library import Family, families
+from disctrack.diagnosis.disc.motion import STATE_SCALES, state_of
+from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
+from disctrack.diagnosis.engine.fit import Fit, fit, prior_rows, triangle
+from disctrack.diagnosis.engine.nuisances import is_linear, projection
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
 from disctrack.rolling import Model
-from disctrack.rolling.effects import Effect, effect_from_formulas
+from disctrack.rolling.effects import Effect, Parameter, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
+from disctrack.rolling.responses import COMPONENTS, Responses, responses
 
 AXES = ("n", "m", "z")
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
@@ -28,38 +34,17 @@ MAX_PROBES = 90
 WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
 PARTS = 10  # of the recording, half of which are drawn for each resample
 RESAMPLES = 40
-KEPT_SHARE = 0.6  # of the resamples in which a term must be chosen
 MAX_TERMS = 3
-MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped the smoothed moment may not help the motion
-# Names of records.KINEMATICS in formulas; a term locked to an angle has it as an argument.
-LIBRARY = {
-    "constant": "1.0",
-    "sign omega_z": "sign(omega_z, 0.1)",
-    "omega_z": "omega_z",
-    "omega_z |omega_z|": "omega_z * magnitude(omega_z)",
-    "omega_z^3": "omega_z * omega_z * omega_z",
-    "thetadot": "thetadot",
-    "thetadot |thetadot|": "thetadot * magnitude(thetadot)",
-    "psidot": "psidot",
-    "psidot |psidot|": "psidot * magnitude(psidot)",
-    "psidot^3": "psidot * psidot * psidot",
-    "phidot sin theta": "phidot * sin_theta",
-    "omega_3": "omega3",
-    "sin theta": "sin_theta",
-    "1 / sin theta": "1.0 / sin_theta",
-    "cos psi": "cos(psi)",
-    "sin psi": "sin(psi)",
-    "cos 2 psi": "cos(2.0 * psi)",
-    "sin 2 psi": "sin(2.0 * psi)",
-    "cos phi": "cos(phi)",
-    "sin phi": "sin(phi)",
-    "cos 2 phi": "cos(2.0 * phi)",
-    "sin 2 phi": "sin(2.0 * phi)",
-    "cos (psi + phi)": "cos(psi + phi)",
-    "sin (psi + phi)": "sin(psi + phi)",
-    "time": "time",
-}
-_LOCKED = ("psi)", "phi)")
+REFITTED = 5  # families that are fitted in full in each round ...
+OF_ONE_KIND = 2  # ... of them of one kind
+MAX_ITERATIONS = 15  # of a law that describes the data; others wander
+MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
+EXACT = 0.02  # of chi-square: what a first-order gain may err by where the residual is large
+ALIKE = 10.0  # chi-square with its price, by which two laws differ that both describe the residual
+INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
+INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
+CHUNK = 240  # columns of the library that are held at a time
+_LOCKED = ("psi)", "phi)", "psi +", "psi -", "phi -")
 
 
 @dataclass(frozen=True)
@@ -74,19 +59,30 @@ class MissingMoment:
 
 @dataclass(frozen=True)
 class LearnedLaw:
-    """Terms that describe the missing moment."""
+    """Families of terms that describe what is missing."""
 
     candidate: Candidate  # of the effect by formula
     effect: type[Effect]
-    terms: tuple[tuple[str, str], ...]  # (axis, function)
-    share: tuple[float, ...]  # of the resamples that chose each term
-    locked: bool  # to an angle of the body or of the table
-    laws: dict[str, str]  # function of each term -> formula
+    families: tuple[Family, ...]
+    values: Values = field(default_factory=dict)  # of everything, where its fit ended
+    share: tuple[float, ...] = ()  # of the resamples in which each family gains more than its price
+    alike: tuple[str, ...] = ()  # other laws that describe the data as well
 
     @property
     def formulas(self) -> dict[str, str]:
         """Component of the wrench -> formula."""
         return dict(self.effect.formulas or {})
+
+    @property
+    def title(self) -> str:
+        """What the law means, in words."""
+        return "; and ".join(family.title for family in self.families)
+
+    @property
+    def locked(self) -> bool:
+        """To an angle of the body or of the table?"""
+        parts = [f for family in self.families if family.kind != "place" for p in family.terms for f in p.items()]
+        return any(c.startswith("M") and mark in f for c, f in parts for mark in _LOCKED)
 
 
 @dataclass(frozen=True)
@@ -139,103 +135,215 @@ def _unit(columns: Array) -> Array:
     return columns / np.where(length > 0, length, 1.0)
 
 
-def probe(system: DiscSystem, fit: Fit, other: Values | None = None) -> _Blocks:
-    """Responses of the dots to short moments along n0, m0, k, compressed part by part.
+def responding(system: DiscSystem, fit_: Fit) -> tuple[Responses, NDArray[np.intp]] | None:
+    """Responses along the fitted motion, and which of their instants are the frames'; None where it does not roll."""
+    instants = system.instants(fit_.values)
+    per_frame = int(np.ceil(INSTANTS_PER_SECOND * float(np.median(np.diff(instants)))))
+    n = len(instants)
+    fine = np.interp(np.arange(per_frame * (n - 1) + 1) / per_frame, np.arange(n), instants)
+    found = responses(system.model_with(fit_.values), state_of(fit_.values), fine, THETA_END)
+    return None if found is None else (found, np.arange(n) * per_frame)
+
+
+def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> _Blocks | None:
+    """Responses of the dots to short moments along n0, m0, k, compressed part by part; None where the disc slips.
 
     other : values whose prediction takes the place of the data, so that its moment is read in the same way
     """
-    q = system.poses(fit.values)
-    span = float(system.time[-1] - system.time[0])
-    turns = max(float(np.abs(q[-1, i] - q[0, i])) / (2 * np.pi) for i in (3, 5))
+    along = responding(system, fit_)
+    if along is None:
+        return None
+    motion, frames = along
+    span = float(motion.time[-1] - motion.time[0])
+    turns = max(float(np.abs(motion.q[-1, i] - motion.q[0, i])) / (2 * np.pi) for i in (3, 5))
     k = int(np.clip(np.ceil(PROBES_PER_TURN * turns), 20, MAX_PROBES))
-    middles = system.time[0] + span * (np.arange(k) + 0.5) / k
-    names = [f"wrench_probe.M_{axis}" for axis in AXES]
-    residual, derivative = system.linearise(fit.values, fit.names)
-    right, matrix = prior_rows(fit.quantities, fit.values)
+    middles = motion.time[0] + span * (np.arange(k) + 0.5) / k
+    residual, derivative = system.linearise(fit_.values, fit_.names)
+    right, matrix = prior_rows(fit_.quantities, fit_.values)
     if other is not None:
         residual, right = residual - system.linearise(other, [])[0], np.zeros_like(right)
-    columns = np.zeros((*residual.shape, 3, k))
-    for i, middle in enumerate(middles):
-        values = fit.values | {"wrench_probe.t_0": float(middle), "wrench_probe.width": WIDTH * span / k}
-        columns[..., i] = system.linearise(values, names)[1]
-    width = residual.shape[1]
-    everything = np.concatenate(
-        [derivative, columns.reshape(len(residual), width, 3 * k), residual[..., None]], axis=-1
-    )
+    bells = np.exp(-0.5 * ((motion.time[:, None] - middles) / (WIDTH * span / k)) ** 2)
+    courses = np.zeros((len(bells), len(COMPONENTS), len(AXES), k))
+    for i in range(len(AXES)):
+        courses[:, i, i] = bells
+    moved = motion.of(courses.reshape(len(bells), len(COMPONENTS), -1))[frames]
+    by_start = derivative[..., [fit_.names.index(f"state.{name}") for name in STATE_SCALES]]
+    everything = np.concatenate([derivative, by_start @ moved, residual[..., None]], axis=-1)
     parts = np.array_split(np.arange(len(residual)), PARTS)
     triangles = tuple(triangle(everything[rows].reshape(-1, everything.shape[-1])) for rows in parts)
     prior = np.concatenate([matrix, np.zeros((len(matrix), 3 * k)), right[:, None]], axis=1)
-    return _Blocks(triangles, prior, len(fit.names), middles, span / k)
+    return _Blocks(triangles, prior, len(fit_.names), middles, span / k)
 
 
-def _harmonics(moment: MissingMoment, blocks: _Blocks) -> dict[str, str]:
-    """Functions of time alone at the strongest line of each component of the moment: a hum locked to nothing.
+@dataclass(frozen=True)
+class Proposal:
+    """What a family gains to first order."""
 
-    The line of the smoothed moment is the start; the rate that gains most chi-square nearby is taken.
+    family: Family
+    gain: float  # decrease of chi-square
+    values: Array  # coefficients of its terms
+
+
+class _Scan:
+    """Gains of families at one fit. All that is asked of a frame's dots is compressed to the eight numbers of a state.
+
+    A column of the least-squares problem is D g: D (n, w, 8) by the initial state, g (n, 8) the response. Inner
+    products of columns, cleared of what the fitted quantities W absorb, are sums over g' (D' D) g less those of W' D g.
     """
-    k = len(moment.time)
-    spectrum = np.abs(np.fft.rfft(moment.moment * np.hanning(k)[:, None], 8 * k, axis=0))
-    lines = 2 * np.pi * np.fft.rfftfreq(8 * k, float(moment.time[1] - moment.time[0]))
-    slowest = 4 * np.pi / float(moment.time[-1] - moment.time[0])
-    spectrum[lines < slowest] = 0.0
-    R = triangle(np.vstack([*blocks.triangles, blocks.prior]))
-    Q = np.linalg.qr(_unit(R[:, : blocks.n_fitted]))[0]
-    cleared = R[:, blocks.n_fitted :] - Q @ (Q.T @ R[:, blocks.n_fitted :])
-    found: dict[str, str] = {}
-    for axis, peak in enumerate(spectrum.argmax(axis=0)):
-        probes = cleared[:, axis * k : (axis + 1) * k]
-        near = lines[peak] + slowest * np.linspace(-0.5, 0.5, 41)
-        gains = []
-        for rate in near:
-            waves = np.stack([np.cos(rate * moment.time), np.sin(rate * moment.time)], axis=-1)
-            U = np.linalg.qr(_unit(probes @ waves))[0]
-            gains.append(np.sum((U.T @ cleared[:, -1]) ** 2))
-        rate_text = f"{near[int(np.argmax(gains))]:.5g}"
-        found |= {f"{f} {rate_text} t": f"{f}({rate_text} * time)" for f in ("cos", "sin")}
-    return found
+
+    def __init__(self, system: DiscSystem, fit_: Fit) -> None:
+        along = responding(system, fit_)
+        assert along is not None
+        self.motion, self._frames = along
+        moved = [q for q in fit_.quantities if not is_linear(q)]
+        common = projection(system, fit_.quantities, fit_.values)
+        values = fit_.values | dict(zip(common.names, common.null.tolist(), strict=True))
+        residual, derivative = system.linearise(values, [q.name for q in moved])
+        right, matrix = prior_rows(moved, fit_.values)
+        stacked = common.cleared(np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)]))
+        stacked = np.vstack([stacked, np.column_stack([matrix, right])])
+        Q = np.linalg.qr(_unit(stacked[:, :-1]))[0]
+        left = stacked[:, -1] - Q @ (Q.T @ stacked[:, -1])
+        basis = Q[: residual.size]
+        if common.names:
+            basis = np.column_stack([common.rows, basis])
+        n, w = residual.shape
+        D = derivative[..., [[q.name for q in moved].index(f"state.{name}") for name in STATE_SCALES]]
+        self._normal = np.swapaxes(D, 1, 2) @ D
+        self._absorbed = np.swapaxes(basis.reshape(n, w, -1), 1, 2) @ D
+        self._right = np.einsum("nw,nwk->nk", left[: residual.size].reshape(n, w), D)
+        self.chi_square = float(left @ left)
+        k = kinematics(self.motion.q, self.motion.qdot, system.disc, system.model.gravity, self.motion.time)
+        space: dict[str, Any] = {name: np.asarray(k[name]) for name in k.dtype.names or ()}
+        space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
+        space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
+        self._space, self._courses = space, dict[str, Array]()
+
+    def _course(self, formula: str) -> Array:
+        if formula not in self._courses:
+            values = eval(formula, {"__builtins__": {}}, self._space)  # formulas of the library only
+            self._courses[formula] = np.broadcast_to(np.asarray(values, float), self.motion.time.shape)
+        return self._courses[formula]
+
+    def proposals(self, library: Iterable[Family]) -> list[Proposal]:
+        """The families with their gains."""
+        found: list[Proposal] = []
+        waiting = iter(library)
+        while True:
+            chunk, n = list[Family](), 0
+            while n < CHUNK and (more := list(islice(waiting, 1))):
+                chunk += more
+                n += len(more[0].terms)
+            if not chunk:
+                return found
+            found += self._gains(chunk, n)
+
+    def _gains(self, chunk: Sequence[Family], n: int) -> list[Proposal]:
+        courses = np.zeros((len(self.motion.time), len(COMPONENTS), n))
+        self._courses.clear()
+        terms = [parts for family in chunk for parts in family.formulas()]
+        for column, parts in enumerate(terms):
+            for component, formula in parts.items():
+                courses[:, COMPONENTS.index(component), column] = self._course(formula)
+        g = self.motion.of(courses)[self._frames]
+        seen = self._normal @ g
+        taken = np.tensordot(self._absorbed, g, axes=([0, 2], [0, 1]))
+        right = np.tensordot(self._right, g, axes=([0, 1], [0, 1]))
+        found, first = [], 0
+        for family in chunk:
+            own = slice(first, first + len(family.terms))
+            first = own.stop
+            before = np.einsum("nkp,nkq->pq", g[..., own], seen[..., own])
+            gram = before - taken[:, own].T @ taken[:, own]
+            found.append(_proposal(family, gram, np.diag(before), right[own]))
+        return found
 
 
-def courses(system: DiscSystem, fit: Fit, time: Array, laws: Mapping[str, str]) -> dict[str, Array]:
-    """Each function of the library along the fitted motion, at the given instants (k,)."""
-    from disctrack.diagnosis.disc.errors import simulated
-
-    motion = simulated(system, fit.values)
-    k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time)
-    space: dict[str, Any] = {name: np.asarray(k[name]) for name in k.dtype.names or ()}
-    space |= {"cos": np.cos, "sin": np.sin, "magnitude": np.abs, "sign": lambda x, w: x / np.sqrt(x * x + w * w)}
-    found: dict[str, Array] = {}
-    for name, formula in laws.items():
-        values = eval(formula, {"__builtins__": {}}, space)  # formulas of this module only
-        found[name] = np.interp(time, motion.time, np.broadcast_to(values, motion.time.shape))
-    return found
+def _proposal(family: Family, gram: Array, before: Array, right: Array) -> Proposal:
+    """Gain and values from the normal equations of one family; directions that nothing shows count for nothing."""
+    length = np.sqrt(np.maximum(before, 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(length, length))
+    seen = eigenvalues > INVISIBLE
+    along = vectors[:, seen].T @ (right / length)
+    values = vectors[:, seen] @ (along / eigenvalues[seen]) / length
+    return Proposal(family, float(np.sum(along**2 / eigenvalues[seen])), values)
 
 
-def learn(system: DiscSystem, fit: Fit, noise: float) -> tuple[MissingMoment, LearnedLaw | None]:
-    """The missing moment, and the law of few terms that describes it; None if no term survives.
+def learn(system: DiscSystem, base: Fit, noise: float) -> LearnedLaw | None:
+    """The law of few terms that describes what is missing; None if none survives, or where the disc slips.
 
     The law is called "learned", or "learned_2" and so on where the model has learned laws already.
     noise : variance of the residual's noise over that stated
     """
-    blocks = probe(system, fit)
-    moment = missing_moment(blocks)
-    laws = LIBRARY | _harmonics(moment, blocks)
-    library = courses(system, fit, blocks.time, laws)
-    terms = [(axis, term) for axis in AXES for term in library]
-    k = len(blocks.time)
-    mixing = np.zeros((3 * k, len(terms)))
-    for column, (axis, term) in enumerate(terms):
-        first = AXES.index(axis) * k
-        mixing[first : first + k, column] = library[term] / (WIDTH * np.sqrt(2 * np.pi))
-    reduced = [_with_terms(T, blocks.n_fitted, mixing) for T in (*blocks.triangles, blocks.prior)]
-    chosen = _forward(np.vstack(reduced), blocks.n_fitted, noise)
-    if not chosen:
-        return moment, None
-    share = _stability(reduced, blocks.n_fitted, noise, chosen)
-    kept = [(t, s) for t, s in zip(chosen, share, strict=True) if s >= KEPT_SHARE]
-    if not kept:
-        return moment, None
-    scale = _values(np.vstack(reduced), blocks.n_fitted, [t for t, _ in kept])
-    return moment, _law([terms[t] for t, _ in kept], [s for _, s in kept], scale, _free_name(system.model), laws)
+    name = _free_name(system.model)
+    price = float(np.log(np.sum(system.weights)))
+    rate = float(1.0 / np.median(np.diff(system.time)))
+    law: LearnedLaw | None = None
+    current, length, alike = base, base.cost / noise, tuple[str, ...]()
+    at_noise = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
+    while law is None or (len(law.families) < MAX_TERMS and current.reduced_chi_square > at_noise):
+        known = system if law is None else system.knowing(law.effect)
+        if responding(known, current) is None:
+            break
+        scan = _Scan(known, current)
+        library = list(families(scan.motion.q, scan.motion.time, rate))
+        looked = 2.0 * float(np.log(len(library)))
+        worth = [p for p in scan.proposals(library) if p.gain / noise > price * p.family.n_numbers + looked]
+        trials = [
+            _refitted(system, base, law, current, p, name) for p in _various(worth, scan.chi_square, noise, price)
+        ]
+        lengths = [t.cost / noise + price * _numbers(one) + looked * len(one.families) for one, t in trials]
+        if not trials or min(lengths) >= length:
+            break
+        best = int(np.argmin(lengths))
+        alike = tuple(
+            one.title for (one, _), other in zip(trials, lengths, strict=True) if 0 < other - lengths[best] < ALIKE
+        )
+        (law, current), length = trials[best], lengths[best]
+    if law is None:
+        return None
+    law = replace(law, alike=alike, share=_stability(system, law, current, noise))
+    return without_idle_terms(law, current)
+
+
+def _numbers(law: LearnedLaw) -> int:
+    return sum(family.n_numbers for family in law.families)
+
+
+def _various(proposals: Sequence[Proposal], chi_square: float, noise: float, price: float) -> list[Proposal]:
+    """The best ones, not more than some of a kind: to first order many of a kind are alike."""
+
+    def rank(p: Proposal) -> tuple[float, float]:
+        left = (chi_square - p.gain) / noise
+        return price * p.family.n_numbers + max(left, EXACT * chi_square / noise), left
+
+    ranked = sorted(proposals, key=rank)
+    found, kinds = list[Proposal](), list[str]()
+    for p in ranked:
+        if kinds.count(p.family.kind) < OF_ONE_KIND:
+            found.append(p)
+            kinds.append(p.family.kind)
+        if len(found) == REFITTED:
+            break
+    return found
+
+
+def _refitted(
+    system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Proposal, name: str
+) -> tuple[LearnedLaw, Fit]:
+    """The law enlarged by a family, fitted to the data."""
+    before = law.families if law else ()
+    values = [current.values[n] for n in law.candidate.names] if law else []
+    enlarged = _law((*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]), name)
+    start = replace(enlarged, values=current.values)
+    fitted = with_law(system.knowing(enlarged.effect), base, start)
+    return replace(enlarged, values=fitted.values), fitted
+
+
+def with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    """The base model's fit with the law's numbers fitted along."""
+    start = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    return fit(system, (*base.quantities, *law.candidate.quantities), start, MAX_ITERATIONS)
 
 
 def _free_name(model: Model) -> str:
@@ -243,79 +351,110 @@ def _free_name(model: Model) -> str:
     return next(name for name in names if model.effect(name) is None)
 
 
-def _with_terms(T: Array, n_fitted: int, mixing: Array) -> Array:
-    return np.column_stack([T[:, :n_fitted], T[:, n_fitted:-1] @ mixing, T[:, -1]])
-
-
-def _forward(rows: Array, n_fitted: int, noise: float) -> list[int]:
-    """Indices of the terms taken in one after the other while each pays the price of having been looked for."""
-    R = triangle(rows)
-    Q = np.linalg.qr(_unit(R[:, :n_fitted]))[0]
-    cleared = R[:, n_fitted:] - Q @ (Q.T @ R[:, n_fitted:])
-    before = np.linalg.norm(R[:, n_fitted:-1], axis=0)
-    right, columns = cleared[:, -1], cleared[:, :-1]
-    n_terms = columns.shape[1]
-    price = 2 * np.log(n_terms) + np.log(max(len(rows), 2)) + 6
-    chosen: list[int] = []
-    for _ in range(MAX_TERMS):
-        length = np.linalg.norm(columns, axis=0)
-        usable = length > 1e-4 * np.maximum(before, 1e-300)
-        gains = np.where(usable, (columns.T @ right) / np.where(usable, length, 1.0), 0.0) ** 2 / noise
-        best = int(np.argmax(gains))
-        # what a further term adds must also be worth the words: a hundredth of what the residual holds
-        if gains[best] < max(price, 0.01 * float(right @ right) / noise if chosen else price):
-            break
-        chosen.append(best)
-        direction = columns[:, best] / length[best]
-        right = right - direction * (direction @ right)
-        columns = columns - np.outer(direction, direction @ columns)
-    return chosen
-
-
-def _stability(reduced: Sequence[Array], n_fitted: int, noise: float, chosen: Sequence[int]) -> list[float]:
-    """How often each term is chosen from a random half of the recording's parts."""
+def _stability(system: DiscSystem, law: LearnedLaw, fitted: Fit, noise: float) -> tuple[float, ...]:
+    """How often each family gains more than its price in a random half of the recording's parts."""
+    known = system.knowing(law.effect)
+    residual, derivative = known.linearise(fitted.values, fitted.names)
+    if not (np.isfinite(residual).all() and np.isfinite(derivative).all()):
+        return tuple(0.0 for _ in law.families)
+    # the data as the law's numbers at zero would leave them, to first order
+    missing = [q.name for q in law.candidate.quantities if not _is_shape(q)]
+    index = [fitted.names.index(name) for name in missing]
+    residual = residual + derivative[..., index] @ np.array([fitted.values[name] for name in missing])
+    stacked = np.concatenate([derivative, residual[..., None]], axis=-1)
+    right, matrix = prior_rows(fitted.quantities, fitted.values)
+    prior = np.column_stack([matrix, right])
+    parts = [
+        triangle(stacked[r].reshape(-1, stacked.shape[-1])) for r in np.array_split(np.arange(len(stacked)), PARTS)
+    ]
     rng = np.random.default_rng(PARTS)
-    *parts, prior = reduced
-    counts = np.zeros(len(chosen))
+    price = float(np.log(np.sum(system.weights)))
+    counts = np.zeros(len(law.families))
     for _ in range(RESAMPLES):
-        drawn = rng.permutation(len(parts))[: max(len(parts) // 2, 1)]
-        again = _forward(np.vstack([*(parts[i] for i in drawn), prior]), n_fitted, noise)
-        counts += [term in again for term in chosen]
-    return (counts / RESAMPLES).tolist()
+        drawn = rng.permutation(PARTS)[: PARTS // 2]
+        R = triangle(np.vstack([*(parts[i] for i in drawn), prior]))
+        for i, family in enumerate(law.families):
+            own = [
+                fitted.names.index(n) for n in law.candidate.names if n.rpartition("_")[2] == str(i) or f"_{i}_" in n
+            ]
+            others = [j for j in range(len(fitted.names)) if j not in own]
+            left = [_left(R, columns) for columns in (others, [*others, *own])]
+            counts[i] += (left[0] - left[1]) / noise > price * family.n_numbers
+    return tuple((counts / RESAMPLES).tolist())
 
 
-def _values(rows: Array, n_fitted: int, terms: Sequence[int]) -> Array:
-    R = triangle(rows)
-    matrix = R[:, [*range(n_fitted), *(n_fitted + t for t in terms)]]
-    length = np.where(np.linalg.norm(matrix, axis=0) > 0, np.linalg.norm(matrix, axis=0), 1.0)
-    return np.asarray((np.linalg.lstsq(matrix / length, R[:, -1], rcond=1e-12)[0] / length)[n_fitted:], float)
+def _left(R: Array, columns: Sequence[int]) -> float:
+    A = _unit(R[:, list(columns)])
+    x = np.linalg.lstsq(A, R[:, -1], rcond=1e-10)[0]
+    return float(np.sum((R[:, -1] - A @ x) ** 2))
 
 
-def _law(
-    terms: Sequence[tuple[str, str]], share: Sequence[float], scale: Array, name: str, laws: Mapping[str, str]
-) -> LearnedLaw:
-    formulas: dict[str, str] = {}
-    for i, (axis, term) in enumerate(terms):
-        piece = f"c_{i} * ({laws[term]})"
-        formulas[f"M_{axis}"] = f"{formulas[f'M_{axis}']} + {piece}" if f"M_{axis}" in formulas else piece
-    effect = effect_from_formulas(name, formulas, source="regression on the residual of this recording")
-    quantities = tuple(
-        Quantity(f"{name}.c_{i}", "SI", 0.01 * abs(float(v)) or 1e-9, meaning=f"M_{axis} by {term}")
-        for i, ((axis, term), v) in enumerate(zip(terms, scale, strict=True))
-    )
-    candidate = Candidate(name, name, "motion", effect.title, effect.source, quantities, tuple(float(v) for v in scale))
-    locked = any(mark in laws[term] for _, term in terms for mark in _LOCKED)
-    return LearnedLaw(candidate, effect, tuple(terms), tuple(share), locked, {term: laws[term] for _, term in terms})
+_SHAPES = {  # smallest and largest value, and a sensible step
+    "rate": (0.0, np.inf, 0.1),
+    "edge": (-np.inf, np.inf, 1e-4),
+    "softness": (1e-4, 0.1, 1e-4),
+    "instant": (-np.inf, np.inf, 1e-3),
+    "angle": (-np.inf, np.inf, 0.01),
+    "direction": (-np.inf, np.inf, 0.01),
+    "width": (0.02, 2.0, 0.01),
+}
+
+
+def _is_shape(q: Quantity) -> bool:
+    return q.name.partition(".")[2].partition("_")[0] in _SHAPES
+
+
+def _law(chosen: Sequence[Family], values: Array, name: str) -> LearnedLaw:
+    """The effect by formula of these families; values (k,): family by family, coefficients and then shapes."""
+    formulas = dict[str, str]()
+    quantities, parameters = list[Quantity](), list[Parameter]()
+    start = iter(np.asarray(values, float).tolist())
+    for i, family in enumerate(chosen):
+        inside = {shape: f"{shape}_{i}" for shape in family.shape}
+        for j, parts in enumerate(family.terms):
+            number = f"c_{i}" if len(family.terms) == 1 else f"c_{i}_{j}"
+            value = next(start)
+            quantities.append(
+                Quantity(f"{name}.{number}", "SI", 0.01 * abs(value) or 1e-9, meaning=f"{family.title}, term {j + 1}")
+            )
+            parameters.append(Parameter(number, "SI", value, family.title))
+            for component, formula in parts.items():
+                piece = f"{number} * ({formula.format(**inside)})"
+                formulas[component] = f"{formulas[component]} + {piece}" if component in formulas else piece
+        for shape, own in inside.items():
+            value, (lower, upper, step) = next(start), _SHAPES[shape]
+            value = float(np.clip(value, lower, upper))
+            text = f"{shape} of {family.title}"
+            quantities.append(Quantity(f"{name}.{own}", "SI", step, value, lower, upper, meaning=text))
+            parameters.append(Parameter(own, "SI", value, text, value, lower, upper, is_shape=True))
+    title = "; ".join(f"{k} = {v}" for k, v in formulas.items())
+    source = "regression on the residual of this recording"
+    effect = effect_from_formulas(name, formulas, tuple(parameters), title=title, source=source)
+    begin = tuple(float(v) for v in values)
+    candidate = Candidate(name, name, "motion", effect.title, effect.source, tuple(quantities), begin)
+    return LearnedLaw(candidate, effect, tuple(chosen))
 
 
 def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same."""
-    names = law.candidate.names
-    kept = [i for i, n in enumerate(names) if abs(fitted.values[n]) > MIN_SIGMAS * fitted.sigma(n)]
-    if not kept or len(kept) == len(names):
+    kept, values, share = list[Family](), list[float](), list[float]()
+    names = iter(law.candidate.quantities)
+    for number, family in enumerate(law.families):
+        own = [next(names) for _ in range(family.n_numbers)]
+        amounts = own[: len(family.terms)]
+        busy = [
+            i for i, q in enumerate(amounts) if abs(fitted.values[q.name]) > MIN_SIGMAS * max(fitted.sigma(q.name), 0.0)
+        ]
+        if not busy:
+            continue
+        share += law.share[number : number + 1]
+        kept.append(replace(family, terms=tuple(family.terms[i] for i in busy)))
+        values += [fitted.values[amounts[i].name] for i in busy]
+        values += [fitted.values[q.name] for q in own[len(family.terms) :]]
+    if not kept or len(values) == len(law.candidate.quantities):
         return law
-    scale = np.array([fitted.values[names[i]] for i in kept])
-    return _law([law.terms[i] for i in kept], [law.share[i] for i in kept], scale, law.candidate.name, law.laws)
+    shorter = _law(kept, np.array(values), law.candidate.name)
+    return replace(shorter, values=fitted.values, share=tuple(share), alike=law.alike)
 
 
 def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:

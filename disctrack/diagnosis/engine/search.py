@@ -26,6 +26,7 @@ CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not t
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
+FIRST_STEPS, PROMISING = 6, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -231,8 +232,18 @@ class _Search:
         for c in extra:
             if c.threshold:
                 starts = [dict(zip(c.names, s, strict=True)) for s in self.system.starts(c, current.fit.values)]
+        if extra and all(
+            c.threshold for c in extra
+        ):  # a refit beyond a threshold is long: only where it leads somewhere
+            starts = [s for s in starts if self._promising(current, together, s)]
         fits = [self._fit(together, current.fit.values | start) for start in starts]
         return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else current.fit
+
+    def _promising(self, current: Trial, together: Sequence[Candidate], start: Values) -> bool:
+        """Have some steps from this start removed a good part of the residual?"""
+        values = dict(current.fit.values) | dict(start)
+        few = fit(self.system, self._quantities(together), values, max_iterations=FIRST_STEPS)
+        return few.cost < PROMISING * current.fit.cost
 
     def _judged(self, current: Trial, trial: Trial) -> Trial:
         """With the free run over held-out data."""

@@ -166,7 +166,7 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
     figure = Figure(figsize=(9.5, 5.4), layout="constrained")
     grid = figure.subplots(3, 1, sharex=True)
     law = None if of_law is None else (of_law.time, of_law.moment)
-    if result.learned is not None:
+    if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
         law = result.system.time, learned_moment(result.system, result.learned.fit, result.learned.law)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
         dress(axes)

@@ -142,6 +142,8 @@ def _learned(learned: Learned) -> dict[str, Any]:
         "title": law.candidate.title,
         "source": law.candidate.source,
         "formulas": law.formulas,
+        "meaning": law.title,
+        "alike": list(law.alike),
         "share_of_resamples": list(law.share),
         "phase_locked": law.locked,
         "mean_power_W": learned.power,
@@ -171,6 +173,12 @@ def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> d
         "after": (_errors(result.after, tuple(a for _, a in longer)) or {})
         | {"parameters": _declared(result.after_fit)},
         "noise_variance_over_stated": diagnosis.noise,
+        "holds": {
+            name: None if span is None else vars(span)
+            for name, span in (("first", result.regimes.first), ("last", result.regimes.last))
+        }
+        if result.regimes
+        else {},
         "energy_J": result.energy,
         "energy_before_J": beside.energy_before if beside else {},
         "tried": [tried_json(t) for t in diagnosis.tried],
@@ -208,12 +216,12 @@ def write_diagnosis(
         what = "mass times measured acceleration, minus the force of the model before"
         variables["missing_force"] = Variable(force, ("time", "contact_axis"), "N", what)
         variables["missing_force_sigma"] = Variable(sigma, ("time", "contact_axis"), "N", f"standard deviation: {what}")
-    if result.moment is not None:
-        axes["probe_time"] = Variable(result.moment.time, ("probe_time",), "s", "middle of a probe of the moment")
+    if beside is not None and beside.moment is not None:
+        axes["probe_time"] = Variable(beside.moment.time, ("probe_time",), "s", "middle of a probe of the moment")
         dims = ("probe_time", "contact_axis")
         what = "contact moment that the model before fails to supply"
-        variables["missing_moment"] = Variable(result.moment.moment, dims, "N m", what)
-        variables["missing_moment_sigma"] = Variable(result.moment.sigma, dims, "N m", f"standard deviation: {what}")
+        variables["missing_moment"] = Variable(beside.moment.moment, dims, "N m", what)
+        variables["missing_moment_sigma"] = Variable(beside.moment.sigma, dims, "N m", f"standard deviation: {what}")
     attributes = {
         "verdict": result.diagnosis.verdict,
         "sentence": result.sentence,

@@ -63,7 +63,7 @@ def law_text(law: LearnedLaw, fit: Fit) -> str:
         for q in law.candidate.quantities
     )
     formulas = "; ".join(f"{component} = {formula}" for component, formula in law.formulas.items())
-    return f"{formulas} with {numbers} (SI)" + (", locked to the disc's angles" if law.locked else "")
+    return f"{law.title}: {formulas} with {numbers} (SI)" + (", locked to the disc's angles" if law.locked else "")
 
 
 def systematic_text(systematic: Systematic) -> str:
@@ -104,7 +104,7 @@ def sentence(
     if law is not None:
         first = "".join(f"Missing in the model: {effect_text(f, diagnosis)}. " for f in diagnosis.found)
         described = f"{law_text(law, fit)} describes it and leaves {level}"
-        return f"{first}A moment is missing that the catalogue does not name: {described}.{ending}"
+        return f"{first}A law is missing that the catalogue does not name: {described}.{ending}"
     if diagnosis.verdict == "nothing missing":
         in_the_motion = " in the motion" if ending else ""
         return f"Nothing is missing{in_the_motion} at the level of {level}.{ending}"

@@ -1,0 +1,211 @@
+"""Laws that no catalogue names, as they are asked of a residual: moments and forces by position, rate, attitude, time.
+
+A family of terms shares what it means; each term sets components of the wrench by formulas in the names of
+records.KINEMATICS and gets a coefficient of its own. Numbers in braces are the shape of a law (where a gate stands, how
+fast something hums): a grid of them is looked over, and the best is fitted along with the coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calibration.arrays import Array
+
+Parts = Mapping[str, str]  # component of the wrench -> formula
+
+HIGHEST_HARMONIC = 4  # of the angles
+FASTEST_HUM = 150.0  # [Hz]
+MOMENTS = ("n", "m", "z")
+
+# Of the motion's own numbers: (words, formula).
+SCALARS = (
+    ("constant", "1.0"),
+    ("sign omega_z", "sign(omega_z, 0.1)"),
+    ("omega_z", "omega_z"),
+    ("omega_z |omega_z|", "omega_z * magnitude(omega_z)"),
+    ("omega_z^3", "omega_z * omega_z * omega_z"),
+    ("thetadot", "thetadot"),
+    ("thetadot |thetadot|", "thetadot * magnitude(thetadot)"),
+    ("psidot", "psidot"),
+    ("psidot |psidot|", "psidot * magnitude(psidot)"),
+    ("psidot^3", "psidot * psidot * psidot"),
+    ("phidot sin theta", "phidot * sin_theta"),
+    ("omega_3", "omega3"),
+    ("sin theta", "sin_theta"),
+    ("1 / sin theta", "1.0 / sin_theta"),
+    ("1 / sin^2 theta", "1.0 / (sin_theta * sin_theta)"),
+    ("time", "time"),
+)
+_SPEED = "sqrt(v_n * v_n + v_m * v_m + 1e-12)"
+_X, _Y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"  # the place along n0 and m0
+# the contact's place on the table: O minus (r cos theta - h sin theta) m0
+_ARM = "(radius * cos_theta - half_thickness * sin_theta)"
+_CONTACT_X, _CONTACT_Y = f"(x + {_ARM} * sin(psi))", f"(y - {_ARM} * cos(psi))"
+
+
+@dataclass(frozen=True)
+class Family:
+    """Terms that belong together."""
+
+    title: str
+    terms: tuple[Parts, ...]
+    shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces
+    kind: str = "moment"  # families of one kind are variations of one idea
+
+    @property
+    def n_numbers(self) -> int:
+        """Numbers that a fit would move."""
+        return len(self.terms) + len(self.shape)
+
+    def formulas(self) -> tuple[Parts, ...]:
+        """The terms with the shape's numbers in place."""
+        numbers = {k: f"({v!r})" for k, v in self.shape.items()}
+        return tuple({c: f.format(**numbers) for c, f in parts.items()} for parts in self.terms)
+
+
+def along_x(formula: str = "1.0") -> Parts:
+    """A force along i of the world."""
+    return {"X_n": f"({formula}) * cos(psi)", "X_m": f"-({formula}) * sin(psi)"}
+
+
+def along_y(formula: str = "1.0") -> Parts:
+    """A force along j of the world."""
+    return {"X_n": f"({formula}) * sin(psi)", "X_m": f"({formula}) * cos(psi)"}
+
+
+def families(q: Array, time: Array, frame_rate: float) -> Iterator[Family]:
+    """The library for a motion q (N, 6) at the instants (N,) [s]."""
+    for axis in MOMENTS:
+        for words, formula in SCALARS:
+            yield Family(f"a moment M_{axis} by {words}", ({f"M_{axis}": formula},))
+        yield from _angular(axis)
+    yield from _places()
+    yield from _magnets()
+    for words, formula in SCALARS[:13]:
+        yield Family(f"a force X_z by {words}", ({"X_z": formula},), kind="lift")
+    yield from _gates(q, time)
+    yield from _bumps()
+    yield from _hums(time, frame_rate)
+
+
+def _angular(axis: str) -> Iterator[Family]:
+    for angle in ("psi", "phi", "(psi + phi)"):
+        for n in range(1, HIGHEST_HARMONIC + 1 if angle != "(psi + phi)" else 2):
+            pair = tuple({f"M_{axis}": f"{f}({n}.0 * {angle})"} for f in ("cos", "sin"))
+            yield Family(f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}", pair, kind="angle")
+
+
+def _places() -> Iterator[Family]:
+    """Forces by the place and the velocity of the centre. A constant one is a tilt, and moves the point of rest."""
+    towards = {"X_n": f"-{_X}", "X_m": f"-{_Y}"}
+    constant = (along_x(), along_y())
+    yield Family("a force towards a point, in proportion to the distance", (towards, *constant), kind="place")
+    cubic = {c: f"{f} * (x * x + y * y)" for c, f in towards.items()}
+    yield Family("a force towards a point that grows as the distance cubed", (cubic, *constant), kind="place")
+    stiffness = (along_x("-x"), along_y("-y"), {c: f"{along_x('-y')[c]} + {along_y('-x')[c]}" for c in ("X_n", "X_m")})
+    yield Family("a force by a stiffness that differs with the direction", (*stiffness, *constant), kind="place")
+    distance = "sqrt(x * x + y * y + 1e-6)"
+    thread = {c: f"{f} / {distance}" for c, f in towards.items()}
+    yield Family("a force of constant size towards the origin", (thread, *constant), kind="place")
+    yield Family("a drag that grows as the speed squared", ({c: f"-v_{c[-1]} * {_SPEED}" for c in ("X_n", "X_m")},))
+    yield Family("a drag of constant size", ({c: f"-v_{c[-1]} / {_SPEED}" for c in ("X_n", "X_m")},), kind="drag")
+    lateral = {"X_n": "-v_m * omega_z", "X_m": "v_n * omega_z"}
+    yield Family("a force across the velocity, by omega_z", (lateral,), kind="drag")
+    across = {"X_n": "-v_m", "X_m": "v_n"}
+    yield Family("a force across the velocity", (across,), kind="drag")
+    for n in ("X_n", "X_m"):
+        for words, formula in SCALARS[:13]:
+            yield Family(f"a force {n} by {words}", ({n: formula},), kind="force")
+    body = ("cos(psi + phi)", "sin(psi + phi)")
+    turning = tuple(f(g) for f in (along_x, along_y) for g in body)
+    yield Family("a force that turns with the face", turning, kind="force")
+
+
+def _magnets() -> Iterator[Family]:
+    """A magnetic moment of the disc in a field of the room: m x B, with m in body axes and B in world axes."""
+    first = ("cos(phi)", "sin(phi) * cos_theta", "sin(phi) * sin_theta")  # body axis 1 along n0, m0, k
+    second = ("-sin(phi)", "cos(phi) * cos_theta", "cos(phi) * sin_theta")
+    third = ("0.0", "-sin_theta", "cos_theta")
+    along_i, along_j, along_k = ("cos(psi)", "-sin(psi)", "0.0"), ("sin(psi)", "cos(psi)", "0.0"), ("0.0", "0.0", "1.0")
+
+    def cross(a: Sequence[str], b: Sequence[str]) -> Parts:
+        pairs = ((1, 2), (2, 0), (0, 1))
+        product = [f"({a[i]}) * ({b[j]}) - ({a[j]}) * ({b[i]})" for i, j in pairs]
+        return {f"M_{axis}": p for axis, p in zip(MOMENTS, product, strict=True)}
+
+    in_plane = tuple(cross(a, b) for a in (first, second) for b in (along_i, along_j))
+    yield Family("a magnet in the face, in a horizontal field", in_plane, kind="magnet")
+    yield Family("a magnet in the face, in a vertical field", (cross(first, along_k), cross(second, along_k)),
+                 kind="magnet")  # fmt: skip
+    yield Family("a magnet along the axis, in a horizontal field", (cross(third, along_i), cross(third, along_j)),
+                 kind="magnet")  # fmt: skip
+    yield Family("a magnet along the axis, in a vertical field", (cross(third, along_k),), kind="magnet")
+
+
+def _gates(q: Array, time: Array) -> Iterator[Family]:
+    """What begins at a nutation, at an instant or at a place."""
+    s = np.sin(q[:, 4])
+    for share in np.linspace(0.05, 0.95, 13):
+        edge = float(np.quantile(s, share))
+        shape = {"edge": edge, "softness": 0.03 * edge}
+        step = "(0.5 - 0.5 * sign(sin_theta - {edge}, {softness}))"
+        for axis in MOMENTS:
+            for words, law in (("", "1.0"), (" over sin theta", "1.0 / sin_theta")):
+                title = f"a moment M_{axis}{words} that acts below a nutation"
+                yield Family(title, ({f"M_{axis}": f"{step} * {law}"},), shape, "below a nutation")
+    span = float(time[-1] - time[0])
+    for share in np.linspace(0.03, 0.97, 32):
+        at = float(time[0] + share * span)
+        after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
+        pulse = "exp(-0.5 * ((time - {instant}) / 0.01) ** 2)"
+        for axis in MOMENTS:
+            yield Family(
+                f"a moment M_{axis} from an instant on", ({f"M_{axis}": after},), {"instant": at}, "from then on"
+            )
+        for words, law, kind in (("from an instant on", after, "from then on"), ("during 20 ms", pulse, "pulse")):
+            push = (along_x(law), along_y(law), {"X_z": law})
+            yield Family(f"a force {words}", push, {"instant": at}, kind)
+        yield Family("a moment during 20 ms", tuple({f"M_{a}": pulse} for a in MOMENTS), {"instant": at}, "pulse")
+    contact = q[:, :2] + 0.036 * np.stack([np.sin(q[:, 3]), -np.cos(q[:, 3])], axis=1)
+    for angle in np.arange(0, 2 * np.pi, np.pi / 6):
+        along = contact @ np.array([np.cos(angle), np.sin(angle)])
+        place = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
+        for share in (0.2, 0.4, 0.6, 0.8):
+            edge = float(np.quantile(along, share))
+            step = f"(0.5 + 0.5 * sign({place} - {{edge}}, 1e-3))"
+            shape = {"direction": float(angle), "edge": edge}
+            for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
+                title = f"a moment M_{axis} on a part of the table"
+                yield Family(title, ({f"M_{axis}": f"{step} * {law}"},), shape, "part of the table")
+
+
+def _bumps() -> Iterator[Family]:
+    """Dents of the rim, once a turn of the disc, and of the table, once a precession: braking, or up and down again."""
+    for angle, words in (("phi", "a spot of the rim"), ("psi", "a direction of the table")):
+        for width in (0.08, 0.2, 0.5):
+            for at in np.arange(0, 2 * np.pi, max(width, 0.15)):
+                bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}}))"
+                shape = {"angle": float(at), "width": width}
+                for axis in ("m", "n"):
+                    title = f"a moment M_{axis} when {words} touches"
+                    yield Family(title, ({f"M_{axis}": bell},), shape, f"bump {angle}")
+                slope = f"sin({angle} - {{angle}}) / {{width}} * {bell}"
+                yield Family(
+                    f"a moment M_m up and down when {words} touches", ({"M_m": slope},), shape, f"bump {angle}"
+                )
+
+
+def _hums(time: Array, frame_rate: float) -> Iterator[Family]:
+    """What swings with a frequency of its own: a table that vibrates, a field that alternates."""
+    span = float(time[-1] - time[0])
+    fastest = min(FASTEST_HUM, 0.45 * frame_rate)
+    for f in np.arange(2.0 / span, fastest, 0.6 / span):
+        waves, shape = ("cos({rate} * time)", "sin({rate} * time)"), {"rate": float(2 * np.pi * f)}
+        for axis in MOMENTS:
+            yield Family(f"a moment M_{axis} that swings", tuple({f"M_{axis}": w} for w in waves), shape, "hum M")
+        level = tuple(along(w) for along in (along_x, along_y) for w in waves)
+        upright = tuple({"X_z": w} for w in waves)
+        yield Family("a force that swings", (*level, *upright), shape, "hum X")
