@@ -24,7 +24,7 @@ from disctrack.diagnosis.engine.fit import Fit, fit, prior_rows, triangle
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
 from disctrack.rolling import Model
-from disctrack.rolling.effects import Effect, Parameter, effect_from_formulas
+from disctrack.rolling.effects import Effect, EffectParameter, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
 from disctrack.rolling.responses import COMPONENTS, Responses, responses
 
@@ -176,7 +176,7 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> _Blocks
 
 
 @dataclass(frozen=True)
-class Proposal:
+class GainOfFamily:
     """What a family gains to first order."""
 
     family: Family
@@ -225,9 +225,9 @@ class _Scan:
             self._courses[formula] = np.broadcast_to(np.asarray(values, float), self.motion.time.shape)
         return self._courses[formula]
 
-    def proposals(self, library: Iterable[Family]) -> list[Proposal]:
+    def proposals(self, library: Iterable[Family]) -> list[GainOfFamily]:
         """The families with their gains."""
-        found: list[Proposal] = []
+        found: list[GainOfFamily] = []
         waiting = iter(library)
         while True:
             chunk, n = list[Family](), 0
@@ -238,7 +238,7 @@ class _Scan:
                 return found
             found += self._gains(chunk, n)
 
-    def _gains(self, chunk: Sequence[Family], n: int) -> list[Proposal]:
+    def _gains(self, chunk: Sequence[Family], n: int) -> list[GainOfFamily]:
         courses = np.zeros((len(self.motion.time), len(COMPONENTS), n))
         self._courses.clear()
         terms = [parts for family in chunk for parts in family.formulas()]
@@ -259,14 +259,14 @@ class _Scan:
         return found
 
 
-def _proposal(family: Family, gram: Array, before: Array, right: Array) -> Proposal:
+def _proposal(family: Family, gram: Array, before: Array, right: Array) -> GainOfFamily:
     """Gain and values from the normal equations of one family; directions that nothing shows count for nothing."""
     length = np.sqrt(np.maximum(before, 1e-300))
     eigenvalues, vectors = np.linalg.eigh(gram / np.outer(length, length))
     seen = eigenvalues > INVISIBLE
     along = vectors[:, seen].T @ (right / length)
     values = vectors[:, seen] @ (along / eigenvalues[seen]) / length
-    return Proposal(family, float(np.sum(along**2 / eigenvalues[seen])), values)
+    return GainOfFamily(family, float(np.sum(along**2 / eigenvalues[seen])), values)
 
 
 def learn(system: DiscSystem, base: Fit, noise: float) -> LearnedLaw | None:
@@ -310,15 +310,15 @@ def _numbers(law: LearnedLaw) -> int:
     return sum(family.n_numbers for family in law.families)
 
 
-def _various(proposals: Sequence[Proposal], chi_square: float, noise: float, price: float) -> list[Proposal]:
+def _various(proposals: Sequence[GainOfFamily], chi_square: float, noise: float, price: float) -> list[GainOfFamily]:
     """The best ones, not more than some of a kind: to first order many of a kind are alike."""
 
-    def rank(p: Proposal) -> tuple[float, float]:
+    def rank(p: GainOfFamily) -> tuple[float, float]:
         left = (chi_square - p.gain) / noise
         return price * p.family.n_numbers + max(left, EXACT * chi_square / noise), left
 
     ranked = sorted(proposals, key=rank)
-    found, kinds = list[Proposal](), list[str]()
+    found, kinds = list[GainOfFamily](), list[str]()
     for p in ranked:
         if kinds.count(p.family.kind) < OF_ONE_KIND:
             found.append(p)
@@ -329,7 +329,7 @@ def _various(proposals: Sequence[Proposal], chi_square: float, noise: float, pri
 
 
 def _refitted(
-    system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Proposal, name: str
+    system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: GainOfFamily, name: str
 ) -> tuple[LearnedLaw, Fit]:
     """The law enlarged by a family, fitted to the data."""
     before = law.families if law else ()
@@ -407,7 +407,7 @@ def _is_shape(q: Quantity) -> bool:
 def _law(chosen: Sequence[Family], values: Array, name: str) -> LearnedLaw:
     """The effect by formula of these families; values (k,): family by family, coefficients and then shapes."""
     formulas = dict[str, str]()
-    quantities, parameters = list[Quantity](), list[Parameter]()
+    quantities, parameters = list[Quantity](), list[EffectParameter]()
     start = iter(np.asarray(values, float).tolist())
     for i, family in enumerate(chosen):
         inside = {shape: f"{shape}_{i}" for shape in family.shape}
@@ -417,7 +417,7 @@ def _law(chosen: Sequence[Family], values: Array, name: str) -> LearnedLaw:
             quantities.append(
                 Quantity(f"{name}.{number}", "SI", 0.01 * abs(value) or 1e-9, meaning=f"{family.title}, term {j + 1}")
             )
-            parameters.append(Parameter(number, "SI", value, family.title))
+            parameters.append(EffectParameter(number, "SI", value, family.title))
             for component, formula in parts.items():
                 piece = f"{number} * ({formula.format(**inside)})"
                 formulas[component] = f"{formulas[component]} + {piece}" if component in formulas else piece
@@ -426,7 +426,7 @@ def _law(chosen: Sequence[Family], values: Array, name: str) -> LearnedLaw:
             value = float(np.clip(value, lower, upper))
             text = f"{shape} of {family.title}"
             quantities.append(Quantity(f"{name}.{own}", "SI", step, value, lower, upper, meaning=text))
-            parameters.append(Parameter(own, "SI", value, text, value, lower, upper, is_shape=True))
+            parameters.append(EffectParameter(own, "SI", value, text, value, lower, upper, is_shape=True))
     title = "; ".join(f"{k} = {v}" for k, v in formulas.items())
     source = "regression on the residual of this recording"
     effect = effect_from_formulas(name, formulas, tuple(parameters), title=title, source=source)

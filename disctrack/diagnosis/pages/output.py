@@ -14,7 +14,7 @@ from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Found, Tried
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.pages.words import shown
+from disctrack.diagnosis.pages.words import shown, together
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.trajectory_file import write_group
@@ -64,6 +64,7 @@ def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None]
         "title": c.title,
         "source": c.source,
         "parameters": _parameters(c.quantities, after),
+        "correlated": [vars(pair) for pair in together(found, after)],
         "class": [
             {
                 "name": r.candidate.name,

@@ -9,6 +9,7 @@ from disctrack.diagnosis.disc.learned_law import LearnedLaw
 from disctrack.diagnosis.disc.left_over import LEVEL, LeftOver
 from disctrack.diagnosis.disc.motion import SLIP
 from disctrack.diagnosis.disc.systematic import Systematic
+from disctrack.diagnosis.engine.correlated import Correlated, correlated
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Found
 from disctrack.diagnosis.engine.system import Quantity
@@ -49,10 +50,30 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
     # a free velocity at the first instant says nothing to people that the remark on slip does not
     amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities if not q.name.startswith("state.")]
     sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
-    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}"
+    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, fit)}"
     if found.cannot_be_told_from:
         rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)
         text += f"; this recording cannot tell it from {rivals}"
+    return text
+
+
+def together(found: Found, fit: Fit) -> tuple[Correlated, ...]:
+    """Numbers of the effect that move together with each other or with those of a declared law."""
+    laws = [q.name for q in fit.quantities if not q.linear and not q.name.startswith("state.")]
+    return correlated(fit, [q.name for q in found.candidate.quantities if q.name != SLIP], laws)
+
+
+def together_text(found: Found, fit: Fit) -> str:
+    """What their standard deviations alone do not say."""
+    units = {q.name: q.unit for q in fit.quantities}
+    text = ""
+    for pair in together(found, fit):
+        factor = f"{'+' if pair.factor >= 0 else '-'} {abs(pair.factor):.4g}"
+        known = quantity_text(pair.value, pair.sigma, units[pair.first])
+        text += (
+            f" ({pair.first} and {pair.second} move together, correlation {pair.correlation:.4f}; better known is "
+            f"{pair.first} {factor} {pair.second} = {known})"
+        )
     return text
 
 
