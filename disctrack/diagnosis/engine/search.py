@@ -26,7 +26,7 @@ CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not t
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
-FIRST_STEPS, PROMISING = 6, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
+FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 

@@ -1,0 +1,85 @@
+"""What no catalogue names, from the independent simulation: never noise, and described where a law can be had."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
+
+from disctrack.diagnosis import diagnose_trajectory
+from disctrack.scene.description import Scene
+from tests.oracles import newton_euler
+from tests.oracles.measured_disc import K_M, measured
+
+pytestmark = pytest.mark.slow
+
+DISC = Scene().declared_disc
+RATE = 500.0
+
+
+def spring(stiffness: float):
+    """A force towards a point of the table."""
+    return lambda disc, now: (
+        newton_euler.ZERO,
+        newton_euler.ZERO,
+        -stiffness * np.array([now.O[0], now.O[1], 0.0]),
+    )
+
+
+def contour_friction_below(mu: float, theta_deg: float):
+    """Dry contour friction that sets in at a nutation."""
+    edge = np.sin(np.radians(theta_deg))
+
+    def law(disc, now):
+        share = 0.5 * (1 - np.tanh((now.sine - edge) / (0.05 * edge)))
+        return newton_euler.ZERO, mu * disc.r * np.sign(now.phidot) / now.sine * share * now.m0, newton_euler.ZERO
+
+    return law
+
+
+def recording(law, theta_deg: float, omega3: float, duration: float, seed: int = 1):
+    """Dots of a motion by world vectors and quaternions, until 1.2 deg."""
+    laws = (newton_euler.precession_friction(K_M), law)
+    body = newton_euler.Disc(DISC.radius, DISC.half_thickness, DISC.mass, laws=laws)
+    theta = np.radians(theta_deg)
+    omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
+    start = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, omega3)
+
+    def low(t, s):
+        return newton_euler.Instant(body, s).sine - np.sin(np.radians(1.2))
+
+    low.terminal = True
+    times = np.arange(0.0, duration, 1 / 6000)
+    found = solve_ivp(
+        lambda t, s: newton_euler.rate(body, s, "rolling"), (0, times[-1]), start, "DOP853", times, rtol=1e-10,
+        atol=1e-11, max_step=2e-3, events=low,
+    )  # fmt: skip
+    q = newton_euler.coordinates(body, found.y)
+    moving = [newton_euler.Instant(body, s) for s in found.y.T]
+    speed = np.array([[*now.v, now.psidot, now.thetadot, now.phidot] for now in moving])
+    n = int((found.t[-1] - 0.01) * RATE)
+    return measured(seed=seed, n=n, declared_rate=RATE, motion=CubicHermiteSpline(found.t, q, speed))
+
+
+def test_a_spring_is_no_tilt_with_an_inertia():
+    result = diagnose_trajectory(recording(spring(0.8), 14.0, 1.0, 0.9), separate=False)
+    assert result.diagnosis.verdict == "unexplained"
+    assert result.learned is not None
+    assert {c[0] for c in result.learned.law.formulas} == {"X"}  # a force, no moment
+    assert result.after.reduced_chi_square < 1.05
+    fit = result.learned.fit
+    stiffness = [q.name for q in result.learned.law.candidate.quantities if abs(fit.values[q.name]) > 0.1]
+    for name in stiffness:
+        assert abs(fit.values[name] - 0.8) < 4 * fit.sigma(name) + 1e-3
+
+
+def test_a_law_below_a_nutation_is_told_with_the_nutation():
+    result = diagnose_trajectory(recording(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6), separate=False)
+    assert result.diagnosis.verdict == "unexplained"
+    assert result.regimes is not None
+    assert result.regimes.first is not None
+    # the friction sets in over 5 % of the nutation, and must grow beyond the noise
+    assert 2.2 < result.regimes.first.theta_deg < 2.8
+    assert any("holds until" in note for note in result.notes)
+    assert result.learned is not None
+    edges = [v for k, v in result.learned.fit.values.items() if ".edge_" in k]
+    assert min(abs(np.degrees(np.arcsin(edge)) - 2.5) for edge in edges) < 0.1
