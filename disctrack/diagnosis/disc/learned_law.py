@@ -374,9 +374,7 @@ def _stability(system: DiscSystem, law: LearnedLaw, fitted: Fit, noise: float) -
         drawn = rng.permutation(PARTS)[: PARTS // 2]
         R = triangle(np.vstack([*(parts[i] for i in drawn), prior]))
         for i, family in enumerate(law.families):
-            own = [
-                fitted.names.index(n) for n in law.candidate.names if n.rpartition("_")[2] == str(i) or f"_{i}_" in n
-            ]
+            own = [fitted.names.index(n) for n in law.candidate.names if _family_of(n) == i]
             others = [j for j in range(len(fitted.names)) if j not in own]
             left = [_left(R, columns) for columns in (others, [*others, *own])]
             counts[i] += (left[0] - left[1]) / noise > price * family.n_numbers
@@ -398,6 +396,11 @@ _SHAPES = {  # smallest and largest value, and a sensible step
     "direction": (-np.inf, np.inf, 0.01),
     "width": (0.02, 2.0, 0.01),
 }
+
+
+def _family_of(name: str) -> int:
+    """Which family a number of the law belongs to: "learned.c_0_1" and "learned.edge_0" to number 0."""
+    return int(name.partition(".")[2].split("_")[1])
 
 
 def _is_shape(q: Quantity) -> bool:
