@@ -82,4 +82,5 @@ def test_a_law_below_a_nutation_is_told_with_the_nutation():
     assert any("holds until" in note for note in result.notes)
     assert result.learned is not None
     edges = [v for k, v in result.learned.fit.values.items() if ".edge_" in k]
-    assert min(abs(np.degrees(np.arcsin(edge)) - 2.5) for edge in edges) < 0.1
+    # the true gate opens over 5 % of the nutation, as a hyperbolic tangent; the law has another shape
+    assert min(abs(np.degrees(np.arcsin(edge)) - 2.5) for edge in edges) < 0.15
