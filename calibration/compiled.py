@@ -26,7 +26,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba import cfunc
-from numba.core.caching import CacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 
 from calibration.sources import PACKAGES, sha256_with_imports
@@ -80,7 +80,7 @@ def _shipped(function: Callable[..., Any], sig: Any, stamp: str, codegen: Any) -
             if pickle.load(file) != made_for(stamp, sig):
                 return None
             name, bitcode, (*others, environments) = pickle.load(file)
-    except OSError:
+    except (OSError, EOFError, pickle.UnpicklingError):
         return None
     library = codegen.create_library(name)
     library._final_module = llvm.parse_bitcode(bitcode)
@@ -117,4 +117,5 @@ def _aware_of_sources(locator: Any) -> Any:
     return AwareOfSources
 
 
-CacheImpl._locator_classes = [*map(_aware_of_sources, CacheImpl._locator_classes), *CacheImpl._locator_classes]
+_theirs = CompileResultCacheImpl._locator_classes
+CompileResultCacheImpl._locator_classes = [*map(_aware_of_sources, _theirs), *_theirs]
