@@ -24,6 +24,8 @@ PREPARED = (
     (_kernels.track_frames, lambda: following.prepare(np.uint16)),
 )
 
+TYPES_IN_WORDS = 5  # of what numba keeps after the library
+
 
 class Depth(event.Listener):
     """How many functions are being compiled inside one another, and those that have no way in from Python."""
@@ -85,6 +87,7 @@ def ship(dispatcher, prepare):
     for sig in set(dispatcher.overloads) - before:
         result = dispatcher.overloads[sig]
         (name, _, _), *others = result._reduce()
+        others[TYPES_IN_WORDS] = ""  # it names the folders of the machine
         content = pickle.dumps(compiled.made_for(stamp, sig)) + compiled.dumps(
             (name, found[result.fndesc.llvm_func_name], others)
         )
