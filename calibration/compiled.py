@@ -37,15 +37,23 @@ AHEAD = Path(__file__).parent / "ahead"
 
 
 def njit(function: Any = None, *, cache: bool = False, **rules: Any) -> Any:
-    """`numba.njit`; with cache=True what is compiled is kept, or taken from what ships."""
+    """`numba.njit`; with cache=True what is compiled is kept, or taken from what ships.
+
+    In place of the function a signature, or a list of them, may stand: it is compiled for these, now, and no others.
+    """
+    signatures = None if function is None or inspect.isfunction(function) else function
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**rules)(function)
         if cache:
             dispatcher._cache = _ShippedOrKept(function)
+        if signatures is not None:
+            for signature in signatures if isinstance(signatures, list) else [signatures]:
+                dispatcher.compile(signature)
+            dispatcher.disable_compile()
         return dispatcher
 
-    return compiled if function is None else compiled(function)
+    return compiled(function) if inspect.isfunction(function) else compiled
 
 
 class _ShippedOrKept(FunctionCache):
