@@ -135,7 +135,7 @@ def measure(
     settings = settings or TrackingSettings()
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)
-    unreadable: list[Unreadable] = []
+    not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
     rate = recording.frame_rate
 
     stamps = usable_times(pairs.left, rate)
@@ -151,7 +151,7 @@ def measure(
 
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers, breaks=edges):
-            unreadable.extend(block.unreadable)
+            not_read.update({(image.frame, image.camera): image for image in block.unreadable})
             yield block
 
     tracking = track(
@@ -166,7 +166,7 @@ def measure(
         workers=workers,
         progress=progress,
     )
-    unreadable.sort(key=lambda image: (image.frame, image.camera))
+    unreadable = [not_read[place] for place in sorted(not_read)]
     seconds = time.perf_counter() - began
     findings = {
         **findings_of(tracking),

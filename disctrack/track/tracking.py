@@ -197,9 +197,10 @@ def _without_stuck_pixels(
     read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], pairs: range
 ) -> tuple[Callable[[int, int], Iterable[BlockOfPairs]], list[str]]:
     """Blocks in which pixels that do not see are replaced by their neighbours, and what is to be said of them."""
-    stop = min(pairs.start + STUCK_FRAMES, pairs.stop)
-    first = [(block.images[block.readable.all(axis=1)]).copy() for block in read_blocks(pairs.start, stop)]
-    images = np.concatenate(first) if first else np.zeros((0, 2, 1, 1), np.uint8)
+    # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
+    chosen = np.unique(np.linspace(pairs.start, pairs.stop - 1, STUCK_FRAMES).astype(int)) if len(pairs) else ()
+    found = [block.images[block.readable.all(1)].copy() for i in chosen for block in read_blocks(int(i), int(i) + 1)]
+    images = np.concatenate(found) if found else np.zeros((0, 2, 1, 1), np.uint8)
     stuck = [stuck_pixels(images[:, camera]) for camera in (0, 1)]
     if stuck[0] is None and stuck[1] is None:
         return read_blocks, []

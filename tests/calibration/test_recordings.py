@@ -49,10 +49,10 @@ def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     # the reference's own sigma of the baseline is 0.036 mm, and its corners are other ones
     assert abs(1e3 * found.rig.baseline - reference["converged_ba_win5"]["free_board"]["baseline_mm"]) < 0.1
     assert len(found.rejected_corners()) < 0.05 * len(found.refinement.kept)
-    # left08: over half of its corners lie 0.2-0.3 px to one side of where the other 25 images put them
-    assert set(found.rejected_views) <= {7}
-    used = [v for v in range(13) if v not in found.rejected_views]
-    assert np.isfinite(found.rms_per_view_px[used]).all()
+    # left08: over half of its corners lie 0.2-0.3 px to one side of where the other 25 images put them; right08 stays
+    assert not found.rejected_views
+    seen = np.isfinite(found.rms_per_view_px)
+    assert np.argwhere(~seen).tolist() == [[7, 0]]
 
 
 def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
