@@ -234,9 +234,10 @@ def assess(
     warnings = _warnings(refinement, share, tilt, spread, n_views, inflation, halves, chosen)
     if motion is not None and motion.is_seen:
         warnings = (
-            f"the pairs are not synchronised: between its two exposures the board moved by {motion.distance * 1e3:.2g} "
-            f"mm ({motion.pixels:.2g} px; corners scatter by {motion.scatter:.2g} px). Trigger both cameras at once, "
-            "or hold the board still; the sigmas of the pair allow for it",
+            "the pairs are not synchronised, or the lenses are not as modelled: the two images of a pair differ as if "
+            f"the board had moved by {motion.distance * 1e3:.2g} mm between them ({motion.pixels:.2g} px; corners "
+            f"scatter by {motion.scatter:.2g} px). Trigger both cameras at once, or hold the board still; the sigmas "
+            "of the pair allow for it",
             *warnings,
         )
     warnings = (*wide, *warnings)

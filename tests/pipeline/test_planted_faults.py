@@ -46,6 +46,7 @@ class Laboratory:
 
         A doubt about the whole run excuses none. Where a truth is known, by the whole of the sigma; and by the noise of
         the frame alone from what is found without the fault, where as many frames are left as tell the dots' places.
+        What all frames are shifted by alike (sizes are estimated from the frames left) is judged by the whole sigma.
         """
         rng = np.random.default_rng(seed)
         planted, rows = fault(self.images.copy(), self.places, rng)
@@ -54,15 +55,17 @@ class Laboratory:
         if self.truth is not None:
             wrong |= beyond(found, self.truth[rows], found.pose_covariance + found.calibration_covariance)
         if found.measured.sum() >= MIN_FRAMES:
-            wrong |= beyond(found, self.untouched.trajectory.q[rows], found.pose_covariance)
+            wrong |= beyond(found, self.untouched.trajectory.q[rows], found.pose_covariance, shared=True)
         return np.flatnonzero(wrong).tolist()
 
 
-def beyond(found, q, covariance):
-    """(n,) True for poses that are farther than MOST_SIGMAS from q in a component."""
+def beyond(found, q, covariance, shared=False):
+    """(n,) True for poses that are farther than MOST_SIGMAS from q in a component; `shared`: but for what all share."""
     R, R_true = (frames.rotation_from_euler(*angles.T) for angles in (found.q[:, 3:], q[:, 3:]))
     turn = frames.vector_from_rotation(R @ np.swapaxes(R_true, 1, 2))
     away = np.column_stack([found.q[:, :3] - q[:, :3], turn])
+    if shared:
+        away -= np.nanmedian(away, axis=0)
     with np.errstate(invalid="ignore"):
         return (np.abs(away) > MOST_SIGMAS * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).any(axis=1)
 
