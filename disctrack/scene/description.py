@@ -358,10 +358,12 @@ def _check(scene: Scene, where: str) -> None:
         "board.square_mm": board.square_mm,
         "gravity_m_s2": scene.gravity_m_s2,
         "faults.pattern_scale": scene.faults.pattern_scale,
+        "faults.left.focal_scale": scene.faults.left.focal_scale,
+        "faults.right.focal_scale": scene.faults.right.focal_scale,
     }
     for key, value in positive.items():
-        if not (math.isfinite(value) and value > 0):
-            raise SceneError(f"{where}: {key} = {value}; expected a positive number")
+        if not 1 / MOST <= value <= MOST:  # its reciprocal is a number, too
+            raise SceneError(f"{where}: {key} = {value}; expected a positive number, from {1 / MOST:g} to {MOST:g}")
     complaints = [
         (len(scene.markers.centres_mm) < 3, "markers.centres_mm", f"{len(scene.markers.centres_mm)} rows", "3 or more"),
         (reach_mm > disc.radius_mm, "markers.centres_mm", "a dot over the disc's rim", "dots on the face"),
