@@ -50,7 +50,14 @@ def start(root: Path, *words: str) -> subprocess.Popen:
     """`disctrack batch` in a process group of its own."""
     command = [sys.executable, "-m", "disctrack", "batch", str(root), "--no-report", "-j", "2", *words]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=REPOSITORY, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command, cwd=REPOSITORY, stdout=pipe, stderr=pipe, text=True, start_new_session=True, preexec_fn=heed_interrupts
+    )
+
+
+def heed_interrupts() -> None:
+    """As a terminal's processes do: a shell's background jobs, and so tests that are one, ignore them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_until(condition, process=None) -> None:
