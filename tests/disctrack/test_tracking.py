@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from calibration.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.render import render_disc
-from disctrack.track.tracking import TrackingSettings, track
+from disctrack.track.tracking import STUCK_FRAMES, TrackingSettings, _without_stuck_pixels, track
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 N = 60
@@ -257,3 +258,17 @@ def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rend
     result = track(pairs, range(5), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
     assert (result.trajectory.marker_status[::2] == MarkerStatus.MEASURED).all()
     assert np.abs(result.trajectory.q[::2, :3] - q[:, :3]).max() < 0.3e-6
+
+
+def test_what_hardly_moves_for_a_millisecond_is_no_stuck_pixel(rng):
+    """A speck of one pixel, 0.02 px a frame: it stands in the first images, and passes over the recording."""
+    n, size, y, x = 200, 40, 20, 8
+    images = np.full((n, 2, size, size), 200.0)
+    images[np.arange(n), :, y, x + np.arange(n) // 50] = 25
+    images = np.clip(np.rint(images + rng.normal(0, 1.5, images.shape)), 0, 254).astype(np.uint8)
+    assert stuck_pixels(images[:STUCK_FRAMES, 0])[y, x]  # the trap
+    assert _without_stuck_pixels(blocks_of(images), range(n))[1] == []
+    images[:, 1, 5, 5] = 255
+    read, told = _without_stuck_pixels(blocks_of(images), range(n))
+    assert told == ["right camera: 1 pixels show one value whatever passes; their neighbours stand in for them"]
+    assert all((block.images[:, 1, 5, 5] < 210).all() for block in read(0, n))
