@@ -21,7 +21,7 @@ FILE_NAME = RECORDING_FILE
 # Every key that a recording.toml may hold, in the order of the reference example.
 KEYS: dict[str, tuple[str, ...]] = {
     "": ("name", "case", "surface"),
-    "cameras": ("frame_rate_hz", "left", "right"),
+    "cameras": ("frame_rate_hz", "left", "right", "exposure_us"),
     "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm", "name"),
     "markers": ("diameter_mm", "centres_mm"),
     "calibration": (
@@ -57,6 +57,7 @@ TARGET_KEYS: dict[str, tuple[str, ...]] = {
 # Keys that have a default, or belong to another target than a chessboard; a calibration is either views or a rig.
 OPTIONAL = {
     ("air", "pressure_hPa"),
+    ("cameras", "exposure_us"),
     ("disc", "name"),
     ("calibration", "target"),
     *(("calibration", key) for keys in TARGET_KEYS.values() for key in keys if key not in TARGET_KEYS["chessboard"]),
@@ -95,6 +96,7 @@ class Recording:
     folder: Path
     name: str
     frame_rate: float  # [Hz]
+    exposure: float | None  # [s] of both cameras; None where it is not declared
     left: str  # file pattern, or one video file, relative to the folder
     right: str
     disc: Disc
@@ -139,6 +141,7 @@ def read_recording(path: str | Path) -> Recording:
         folder=file.parent,
         name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,
         frame_rate=cameras.get("frame_rate_hz", _positive),
+        exposure=_exposure(cameras) if "exposure_us" in cameras else None,
         left=cameras.get("left", _pattern),
         right=cameras.get("right", _pattern),
         disc=_disc(disc, markers),
@@ -299,6 +302,16 @@ def _centres(value: Any) -> list[list[float]]:
         return [[_number(x), _number(y)] for x, y in value]
     except _Unfit as error:
         raise _Unfit(expected) from error
+
+
+def _exposure(cameras: _Section) -> float:
+    exposure, interval = 1e-6 * cameras.get("exposure_us", _not_negative), 1 / cameras.get("frame_rate_hz", _positive)
+    if exposure > 1.001 * interval:
+        raise cameras.error(
+            f"exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 * interval:g} us at frame_rate_hz. "
+            "It is in microseconds: 0.2 ms is 200."
+        )
+    return float(exposure)
 
 
 def _disc(disc: _Section, markers: _Section) -> Disc:

@@ -15,6 +15,7 @@ from disctrack.disc import Disc
 from disctrack.track.as_printed import MIN_MARKER_SHIFT, AsBuilt, refine_as_built
 from disctrack.track.dots import NoiseModel, TemplateLimits
 from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
+from disctrack.track.exposure import shift_by_exposure
 from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.own_scatter import SharedFaults, split_scatter, without_shared_faults
@@ -40,6 +41,7 @@ class TrackingSettings:
     reject_outliers: bool = True
     table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
     search_always: bool = False  # at every frame where the disc is lost, whatever it costs: for single, unrelated poses
+    exposure: tuple[float, float] = (0.0, 0.0)  # [s] of the left and the right camera; 0 where it is not known
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (first_pass.py)
 
 
@@ -72,6 +74,22 @@ def assemble(
     pairs: range,
 ) -> Tracking:
     """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds."""
+    if any(settings.exposure):  # which frames to trust with the acceleration is known when all have been judged
+        once = {name: np.copy(table) for name, table in vars(tables).items()}
+        blurred = _assembled(followers, Tables(**once), settings, frame_rate, gravity, time, pairs)
+        tables.pixels -= shift_by_exposure(blurred.trajectory, settings.exposure)
+    return _assembled(followers, tables, settings, frame_rate, gravity, time, pairs)
+
+
+def _assembled(
+    followers: list[Follower],
+    tables: Tables,
+    settings: TrackingSettings,
+    frame_rate: float,
+    gravity: float,
+    time: Array,
+    pairs: range,
+) -> Tracking:
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
     alone = repeated & ~repeated.all(axis=1, keepdims=True)

@@ -135,6 +135,8 @@ def measure(
     settings = settings or TrackingSettings()
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)
+    exposure, exposure_source = _exposures(recording, pairs)
+    settings = dataclasses.replace(settings, exposure=exposure)
     not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
     rate = recording.frame_rate
 
@@ -170,7 +172,7 @@ def measure(
     seconds = time.perf_counter() - began
     findings = {
         **findings_of(tracking),
-        "notes": list(pairs.notes),
+        "notes": [*pairs.notes, *exposure_source],
         "warnings": list(dict.fromkeys([*pairs.warnings, *pairs.doubts, *tracking.doubts, *tracking.warnings])),
         "doubts": [*pairs.doubts, *tracking.doubts],
         "unreadable": [image.reason for image in unreadable],
@@ -210,6 +212,17 @@ def findings_of(tracking: Tracking) -> dict[str, Any]:
         "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
     }
+
+
+def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """Of both cameras [s], 0 where nothing tells it; and where it is from, to be told."""
+    if recording.exposure is not None:
+        return (recording.exposure, recording.exposure), ()
+    headers = [header_of(reader) for reader in (pairs.left, pairs.right)]
+    left, right = (header.exposure or 0.0 if header is not None else 0.0 for header in headers)
+    if not (left or right):
+        return (0.0, 0.0), ()
+    return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} us (left, right) as the cameras' headers say",)
 
 
 def _workers(pairs: ImagePairs, stretches: int, threads: int | None) -> int:
