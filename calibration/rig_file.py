@@ -185,17 +185,29 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
         "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
     )
     group["covariance"].attrs["parameters"] = ", ".join(RIG_PARAMETERS)
+    for name, (values, units, told, attributes) in beyond_model(rig).items():
+        _put(group, name, values, units, told)
+        group[name].attrs.update(attributes)
+
+
+def beyond_model(rig: StereoRig) -> dict[str, tuple[Any, str, str, dict[str, str]]]:
+    """What a rig may have beside cameras and places: by name of the dataset its values, units, meaning, attributes.
+
+    `read_beyond_model` reads it from any group.
+    """
+    found: dict[str, tuple[Any, str, str, dict[str, str]]] = {}
     if rig.allowances:
         told = "parts of the covariance that no image tells, one row for one standard deviation of each cause"
-        _put(group, "allowances", np.stack([a.shift for a in rig.allowances]), "px, 1, rad, m", told)
-        group["allowances"].attrs["causes"] = json.dumps([a.cause for a in rig.allowances])
-        group["allowances"].attrs["assumed"] = json.dumps([a.assumed for a in rig.allowances])
+        marks = {"causes": [a.cause for a in rig.allowances], "assumed": [a.assumed for a in rig.allowances]}
+        shifts = np.stack([a.shift for a in rig.allowances])
+        found["allowances"] = shifts, "px, 1, rad, m", told, {name: json.dumps(mark) for name, mark in marks.items()}
     if rig.lens_field is not None:
         told = (
             "coefficients of cubic B-splines (camera, axis, y, x): displacement of image points beyond the polynomial"
         )
-        _put(group, "lens_field", rig.lens_field.coefficients, "px", told)
-        _put(group, "lens_field_spacing", rig.lens_field.spacing, "px", "of the splines' grid")
+        found["lens_field"] = rig.lens_field.coefficients, "px", told, {}
+        found["lens_field_spacing"] = rig.lens_field.spacing, "px", "of the splines' grid", {}
+    return found
 
 
 def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
@@ -313,9 +325,16 @@ def read_rig_group(group: h5py.Group) -> StereoRig:
         t_left_world=_get(group, "t_left_world", (3,)),
         covariance=covariance,
         world_is_table=bool(group.attrs.get("world_is_table", 0)),
-        lens_field=_lens_field(group) if "lens_field" in group else None,
-        allowances=_allowances(group) if "allowances" in group else (),
+        **read_beyond_model(group),
     )
+
+
+def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
+    """`lens_field` and `allowances` of a rig, as `beyond_model` names them. Raises RigFileError."""
+    return {
+        "lens_field": _lens_field(group) if "lens_field" in group else None,
+        "allowances": _allowances(group) if "allowances" in group else (),
+    }
 
 
 def _allowances(group: h5py.Group) -> tuple[Allowance, ...]:

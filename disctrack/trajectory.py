@@ -152,11 +152,6 @@ class Trajectory(Brief):
         """(n, 6) standard deviation of q that frames share [m, rad]: from the rig, and systematic."""
         return coordinate_sigma(self.q, self.calibration_covariance)
 
-    @property
-    def systematic_sigma(self) -> Array:
-        """(n, 6) standard deviation of q from `systematic_covariance` alone [m, rad]."""
-        return coordinate_sigma(self.q, self.systematic_covariance)
-
 
 def part(trajectory: Trajectory, rows: slice) -> Trajectory:
     """The trajectory of these frames only."""

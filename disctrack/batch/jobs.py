@@ -41,17 +41,6 @@ class JobQueue:
         left = (self._ready, self._later, self._alone, self._running)
         return not any(left) and not any(self._waiting.values())
 
-    @property
-    def only_elsewhere(self) -> bool:
-        """All that is left is being done by another batch."""
-        return bool(self._later) and not self._ready and not self._running
-
-    @property
-    def unfinished(self) -> list[Job]:
-        """Jobs without a result yet."""
-        waiting = [job for jobs in self._waiting.values() for job in jobs]
-        return [*self._running, *self._ready, *waiting, *(job for _, job in self._later), *self._alone]
-
     def next(self) -> Job | None:
         """A job to begin now, None if there is none at present."""
         now = time.monotonic()

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
+from calibration.rig_file import beyond_model, read_beyond_model
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
@@ -187,10 +188,7 @@ def read_setup(path: Path) -> FilmedSetup:
         return FilmedSetup(
             time=read_variables(file, names=("time",))["time"],
             disc=_read_disc(file["disc"]),
-            rig=_rig(
-                read_variables(file["calibration"], names=_RIG_VARIABLES),
-                bool(file["calibration"].attrs["world_is_table"]),
-            ),
+            rig=_rig(file["calibration"], read_variables(file["calibration"], names=_RIG_VARIABLES)),
             gravity=float(file.attrs["gravity_m_s2"]),
             fingerprint=str(file.attrs["fingerprint"]),
         )
@@ -410,6 +408,11 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
             ),
         },
     )
+    axes = {"allowances": ("allowance", "rig_parameter"), "lens_field": ("camera", "axis", "spline_y", "spline_x")}
+    for name, (values, units, told, attributes) in beyond_model(rig).items():
+        dims = axes.get(name, ())
+        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(values), strict=True)}
+        write_variables(group, {name: Variable(values, dims, units, told, attributes)}, scales)
     group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
     group.attrs["baseline_m"] = rig.baseline
 
@@ -480,7 +483,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         markers_residual_px=markers["residual_px"],
         marker_status=markers["status"],
         disc=_read_disc(file["disc"]),
-        rig=_rig(calibration, bool(file["calibration"].attrs["world_is_table"])),
+        rig=_rig(file["calibration"], calibration),
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
     )
@@ -513,7 +516,7 @@ _RIG_VARIABLES = (
 )
 
 
-def _rig(values: Mapping[str, NDArray], world_is_table: bool) -> StereoRig:
+def _rig(group: h5py.Group, values: Mapping[str, NDArray]) -> StereoRig:
     cameras = [
         Camera(
             float(K[0, 0]),
@@ -536,7 +539,8 @@ def _rig(values: Mapping[str, NDArray], world_is_table: bool) -> StereoRig:
         R_left_world=values["R_left_world"],
         t_left_world=values["t_left_world"],
         covariance=values["covariance"],
-        world_is_table=world_is_table,
+        world_is_table=bool(group.attrs["world_is_table"]),
+        **read_beyond_model(group),
     )
 
 

@@ -35,14 +35,6 @@ class State:
         """From the first 8, 10 or 12 of records.STATE_COMPONENTS."""
         return cls(*(float(v) for v in values))
 
-    @classmethod
-    def from_rates(cls, q: Array, qdot: Array) -> State:
-        """Rolling state with the angles and angular rates of q, qdot (6,); their velocities and z are not used."""
-        psidot, thetadot, phidot = (float(v) for v in qdot[3:])
-        x, y, _, psi, theta, phi = (float(v) for v in q)
-        omega2, omega3 = psidot * np.sin(theta), psidot * np.cos(theta) + phidot
-        return cls(x, y, psi, theta, phi, thetadot, omega2, omega3)
-
     @property
     def array(self) -> Array:
         """Components that are given: (8,), (10,) or (12,)."""

@@ -133,8 +133,7 @@ def _assembled(
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
     shared = _shared_sigma(fits, systematic, rig)
-    # what the dots have been corrected by, and what has gone into the covariance
-    as_built = replace(as_built, rig=replace(rig, lens_field=None, allowances=()))
+    as_built = replace(as_built, rig=rig)
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     warnings = warnings_of(first, factor, faults, scatter, table, trajectory)
     return Tracking(

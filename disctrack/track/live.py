@@ -6,7 +6,7 @@ printed, their scatter) is not known yet, so the disc should be one that was mea
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,10 +156,6 @@ class Tracker:
             self.frame, np.full(6, nan), np.full((3, 3), nan), np.full((6, 6), nan), status,
             np.full((2, m, 2), nan), np.full((2, m, 2), nan), nan,
         )  # fmt: skip
-
-    def with_disc(self, disc: Disc) -> Tracker:
-        """A new tracker for the disc as a recording has refined it."""
-        return Tracker(self.rig, replace(self.disc, marker_centres_body=disc.marker_centres_body), self._settings)
 
 
 def _refined(

@@ -15,7 +15,6 @@ from calibration import (
     find_corners,
     triangulate,
 )
-from calibration.images import calibrate_files, find_pairs
 from calibration.rig_file import read_rig_group
 
 
@@ -66,8 +65,9 @@ def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
 def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
         truth = read_rig_group(file["rig"])
-    pairs = find_pairs("left/*.png", "right/*.png", sample_clip / "calibration")
-    found = calibrate_files(pairs, Board((9, 6), 6e-3), CalibrationSettings(board="flat"), 0, 3e-3)
+    files = (sorted((sample_clip / "calibration" / side).glob("*.png")) for side in ("left", "right"))
+    views = ([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in side] for side in files)
+    found = calibrate_stereo(*views, Board((9, 6), 6e-3), CalibrationSettings(board="flat"), 0, 3e-3)
     rig = found.rig
     error = np.concatenate(
         [

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -19,7 +18,6 @@ from calibration import (
     calibrate_stereo,
 )
 from calibration.camera import rotation_from_vector, triangulate
-from calibration.images import calibrate_files, find_pairs
 from calibration.pairs import readmitted
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.table_frame import table_pose
@@ -291,29 +289,11 @@ def test_unknown_settings_are_refused():
         Board((9, 6), 0.0)
 
 
-def test_files_are_paired_by_name_and_faults_are_named(drawn, tmp_path):
+def test_progress_is_told_view_by_view(drawn):
     _, (left, right) = drawn
-    for i, (a, b) in enumerate(zip(left, right, strict=True)):
-        cv2.imwrite(str(tmp_path / f"left{i:02d}.png"), a)
-        cv2.imwrite(str(tmp_path / f"right{i:02d}.png"), b)
-    pairs = find_pairs("left*.png", "right*.png", tmp_path)
-    assert [p[1].name for p in pairs] == [f"right{i:02d}.png" for i in range(8)]
     stages = []
-    found = calibrate_files(pairs, BOARD, FLAT, progress=lambda *state: stages.append(state))
-    assert found.view_names[3][0].endswith("left03.png")
+    calibrate_stereo(left, right, BOARD, FLAT, progress=lambda *state: stages.append(state))
     assert ("corners", 16, 16) in stages
-    with pytest.raises(CalibrationError, match=r"no left calibration view matches"):
-        find_pairs("links*.png", "right*.png", tmp_path)
-    (tmp_path / "right07.png").unlink()
-    with pytest.raises(CalibrationError, match=r"8 left views match .* but 7"):
-        find_pairs("left*.png", "right*.png", tmp_path)
-    data = (tmp_path / "left02.png").read_bytes()
-    (tmp_path / "left02.png").write_bytes(data[: len(data) // 30])
-    with pytest.raises(CalibrationError, match=r"left02\.png"):
-        calibrate_files(pairs[:5], BOARD, FLAT)
-    (tmp_path / "left02.png").write_bytes(b"")
-    with pytest.raises(CalibrationError, match=r"left02\.png: not an image"):
-        calibrate_files(pairs[:5], BOARD, FLAT)
 
 
 def test_board_not_found_is_told_from_a_view():

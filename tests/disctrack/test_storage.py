@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.camera import N_RIG, Camera, StereoRig
+from calibration.camera import N_RIG, Allowance, Camera, StereoRig
+from calibration.splines import LensField
 from disctrack.disc import MA_2014
 from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
 from disctrack.files import trajectory_file as storage
@@ -80,6 +81,8 @@ def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
             np.array([0.01, 0.02, 0.7]),
             rig_part @ rig_part.T,
             True,
+            LensField(rng.normal(0, 0.02, (2, 2, 5, 6)), 128.0),
+            (Allowance("the board's size", rig_part[0], True), Allowance("its thickness", rig_part[1])),
         ),
         frame_rate=1000.0,
         gravity=9.81,
@@ -104,6 +107,9 @@ def assert_equal(a, b, name=""):
         assert type(a) is type(b)
         for field in dataclasses.fields(a):
             assert_equal(getattr(a, field.name), getattr(b, field.name), f"{name}.{field.name}")
+    elif isinstance(a, tuple):
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{name}[{i}]")
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype, name
         assert_array_equal(a, b, err_msg=name)
