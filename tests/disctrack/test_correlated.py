@@ -39,10 +39,8 @@ def test_the_combination_that_is_known_is_known_as_well_as_stated():
     assert np.sqrt(np.mean((np.array(errors) / sigmas) ** 2)) == pytest.approx(1.0, abs=4 / np.sqrt(120))
 
 
-def test_quantities_at_a_bound_or_without_each_other_are_no_pair():
+def test_quantities_without_each_other_are_no_pair():
     system = TwoNearlyEqualSlopes(1)
     free = fit(system, system.base, {})
     assert correlated(free, ["a"], ["a", "unknown"]) == ()
-    bounded = (system.base[0], Quantity("b", "1", 0.1, upper=-500.0), system.base[2])
-    assert correlated(fit(system, bounded, {}), ["a"], ["b"]) == ()
     assert correlated(free, ["a"], ["b"], strong=1.1) == ()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 from scipy.optimize import lsq_linear
 
 from calibration.arrays import Array
@@ -14,6 +15,7 @@ from disctrack.diagnosis.engine.system import Quantity, System, Values
 
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less
+NEAR = 1e-3  # sigmas from a bound, within which a quantity stands at it
 _HALVINGS = 8
 
 
@@ -23,7 +25,7 @@ class Fit:
 
     quantities: tuple[Quantity, ...]
     values: dict[str, float]  # of all quantities fitted, and of those that were held
-    covariance: Array  # (k, k) of the fitted ones; zero rows for those at a bound
+    covariance: Array  # (k, k) of the fitted ones; zero rows for those that the data do not show
     chi_square: float  # of the data alone
     penalty: float  # of the priors
     n_data: int
@@ -51,7 +53,7 @@ class Fit:
         return self.chi_square / max(self.degrees_of_freedom, 1)
 
     def sigma(self, name: str) -> float:
-        """Standard deviation of one fitted quantity; 0 where it stands at a bound."""
+        """Standard deviation of one fitted quantity; at a bound, how far inside it the truth may lie (rms)."""
         i = self.names.index(name)
         return float(np.sqrt(max(self.covariance[i, i], 0.0)))
 
@@ -102,8 +104,11 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
         return x
     with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
         bounds = (lower / scale, upper / scale)
-        found = np.asarray(lsq_linear(scaled, right, bounds, tol=1e-12).x * scale, float)
-    return found if np.isfinite(found).all() else np.clip(x, lower, upper)
+        inside = lsq_linear(scaled, right, bounds, tol=1e-12)
+        found = np.asarray(inside.x * scale, float)
+    if not np.isfinite(found).all():
+        return np.clip(x, lower, upper)
+    return np.where(inside.active_mask < 0, lower, np.where(inside.active_mask > 0, upper, found))
 
 
 def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
@@ -124,7 +129,7 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
     prior, prior_matrix = prior_rows(moved, values)
     cost = _cost(residual, prior, derivative, common)
     converged, iteration = False, 0
-    matrix = np.zeros((0, len(names)))
+    matrix, right = np.zeros((0, len(names))), np.zeros(0)
     while np.isfinite(cost) and iteration < max_iterations:
         iteration += 1
         right, matrix = compress(residual, derivative, common)
@@ -149,7 +154,7 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             break
         values, residual, derivative, prior, cost = trial, new_residual, new_derivative, new_prior, new_cost
     n_data = int(np.sum(system.weights))
-    covariance = _covariance(matrix, np.array([values[n] for n in names]), lower, upper)
+    covariance = covariance_within(matrix, right, np.array([values[n] for n in names]), lower, upper)
     chi_square, penalty = float(cost), 0.0
     if np.isfinite(cost):
         penalty = float(prior @ prior)
@@ -187,18 +192,53 @@ def _cost(residual: Array, prior: Array, derivative: Array, common: Projection) 
     return cost if usable else np.inf
 
 
-def _covariance(matrix: Array, x: Array, lower: Array, upper: Array) -> Array:
-    """Inverse of the normal matrix over the quantities that are free."""
+def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper: Array) -> Array:
+    """Covariance of quantities about x, some of which stand at a bound; zero rows for those that nothing shows.
+
+    A quantity at a bound is not known to lie there: the data allow what a normal distribution leaves inside the bound
+    (its second moment about the bound), and whatever moves together with it is uncertain by that much more.
+    """
     k = len(x)
     covariance = np.zeros((k, k))
-    free = np.flatnonzero((x > lower) & (x < upper))
-    if len(matrix) == 0 or free.size == 0:
+    if len(matrix) == 0 or k == 0:
         return covariance
-    columns = matrix[:, free]
-    length = np.linalg.norm(columns, axis=0)
+    free = _inverse(matrix)
+    sigma = np.sqrt(np.maximum(np.diag(free), 0.0))
+    outwards = np.where(x - lower <= NEAR * sigma, -1.0, np.where(upper - x <= NEAR * sigma, 1.0, 0.0))
+    held = np.flatnonzero(outwards)
+    if held.size == 0:
+        return free
+    others = np.flatnonzero(outwards == 0)
+    covariance[np.ix_(others, others)] = _inverse(matrix[:, others])
+    held = held[sigma[held] > 0]
+    if held.size == 0:
+        return covariance
+    beyond = outwards[held] * (free @ (matrix.T @ right))[held] / sigma[held]
+    share = np.array([_within_bound(float(t)) for t in beyond])
+    across = np.zeros((k, held.size))
+    correlation = free[np.ix_(held, held)] / np.outer(sigma[held], sigma[held])
+    across[others] = free[np.ix_(others, held)] / sigma[held] @ np.linalg.pinv(correlation, rcond=1e-10) / sigma[held]
+    across[held, np.arange(held.size)] = 1.0
+    inside = correlation * np.outer(share * sigma[held], share * sigma[held])
+    return np.asarray(covariance + across @ inside @ across.T, float)
+
+
+def _within_bound(beyond: float) -> float:
+    """Rms distance from a bound, of a normal number with mean `beyond` sigmas outside of it and known to lie inside."""
+    t = max(beyond, 0.0)
+    if t > 8.0:  # the exponential tail
+        return float(np.sqrt(2.0) / t)
+    hazard = np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi) / special.ndtr(-t)
+    return float(np.sqrt(max(1.0 + t * t - t * hazard, 0.0)))
+
+
+def _inverse(matrix: Array) -> Array:
+    """Inverse of the normal matrix; directions that are not determined get no variance."""
+    length = np.linalg.norm(matrix, axis=0)
     length = np.where(length > 0, length, 1.0)
-    _, singular, V = np.linalg.svd(columns / length, full_matrices=False)
-    floor = 1e-12 * max(float(singular[0]), 1e-100)  # directions below it are not determined: no variance is invented
+    if matrix.shape[1] == 0:
+        return np.zeros((0, 0))
+    _, singular, V = np.linalg.svd(matrix / length, full_matrices=False)
+    floor = 1e-12 * max(float(singular[0]), 1e-100)
     weight = np.where(singular > floor, 1.0 / np.maximum(singular, floor) ** 2, 0.0)
-    covariance[np.ix_(free, free)] = (V.T * weight) @ V / np.outer(length, length)
-    return covariance
+    return np.asarray((V.T * weight) @ V / np.outer(length, length), float)

@@ -20,8 +20,10 @@ from disctrack.diagnosis.engine.score import Linearisation, score
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System
 
-MAX_TRIALS = 12  # values of a shape at which the rest is refitted
-ENOUGH = 0.1  # of chi-square: a third of a sigma, beyond which a shape is not pursued
+MAX_TRIALS = 24  # values of a shape at which the rest is refitted
+ENOUGH = 0.01  # of chi-square: a tenth of a sigma, beyond which a shape is not pursued
+STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour says nothing of the valley's floor
+NARROW = 1e-6  # of a shape's size: as close as two values need to be
 DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
 
 
@@ -93,8 +95,13 @@ def profiled(system: System, fitted: Fit, q: Quantity, step: float) -> Fit:
         costs = np.array([points[v].cost for v in values])
         best = int(np.argmin(costs))
         if 0 < best < len(values) - 1:
-            target, gain = _vertex(values[best - 1 : best + 2], costs[best - 1 : best + 2])
-            if gain < ENOUGH:
+            x, y = values[best - 1 : best + 2], costs[best - 1 : best + 2]
+            target, gain = _vertex(x, y)
+            side = 0 if y[0] > y[2] else 2
+            if y[side] - y[1] > STEEP and (target - x[1]) * (x[side] - x[1]) <= 0:
+                # where another number comes to stand at its bound the profile has a kink: no parabola fits its sides
+                target, gain = 0.5 * float(x[1] + x[side]), np.inf
+            if gain < ENOUGH or x[2] - x[0] < NARROW * _size(q, float(x[1])):
                 break
             at(target)
         else:
