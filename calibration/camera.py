@@ -58,15 +58,14 @@ class Camera:
 
 def project(points_camera: Array, camera: Camera) -> Array:
     """Pixels (..., 2) of points (..., 3) given in the camera's own axes; NaN behind the camera."""
-    return project_with_jacobians(points_camera, camera)[0]
+    a, b, _ = _on_unit_depth(points_camera)
+    xd, yd, *_ = _distorted(a, b, camera)
+    return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
 
 
 def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array, Array, Array]:
     """Pixels (..., 2), d pixel / d point (..., 2, 3) and d pixel / d intrinsics (..., 2, 9); NaN behind the camera."""
-    X, Y, Z = np.moveaxis(np.asarray(points_camera, float), -1, 0)
-    Z = np.where(Z > 0, Z, np.nan)
-    iz = 1.0 / Z
-    a, b = X * iz, Y * iz
+    a, b, iz = _on_unit_depth(points_camera)
     r2 = a * a + b * b
     xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
     yd_a = xd_b
@@ -91,6 +90,13 @@ def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array,
     d_intrinsics[..., 0, 7] = camera.fx * (r2 + 2 * a * a)
     d_intrinsics[..., 1, 7] = camera.fy * 2 * a * b
     return pixels, d_point, d_intrinsics
+
+
+def _on_unit_depth(points_camera: Array) -> tuple[Array, Array, Array]:
+    """X / Z, Y / Z and 1 / Z of points (..., 3); NaN behind the camera."""
+    X, Y, Z = np.moveaxis(np.asarray(points_camera, float), -1, 0)
+    inverse = 1.0 / np.where(Z > 0, Z, np.nan)
+    return X * inverse, Y * inverse, inverse
 
 
 def _distorted(a: Array, b: Array, camera: Camera) -> tuple[Array, Array, Array, Array, Array]:
@@ -236,13 +242,17 @@ class StereoRig(Brief):
 
 
 def rotation_from_vector(v: Array) -> Array:
-    """Rodrigues' formula: rotation vector (3,) [rad] -> (3, 3)."""
+    """Rodrigues' formula: rotation vectors (..., 3) [rad] -> (..., 3, 3)."""
     v = np.asarray(v, float)
-    angle = float(np.linalg.norm(v))
-    S = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    if angle < 1e-6:
-        return np.eye(3) + S + 0.5 * S @ S
-    return np.eye(3) + np.sin(angle) / angle * S + (1 - np.cos(angle)) / angle**2 * S @ S
+    square = np.sum(v * v, axis=-1)
+    small = square < 1e-12  # of which the series is exact
+    angle = np.sqrt(np.where(small, 1.0, square))
+    first = np.where(small, 1.0, np.sin(angle) / angle)[..., None, None]
+    second = np.where(small, 0.5, (1 - np.cos(angle)) / angle**2)[..., None, None]
+    S = np.zeros((*v.shape, 3))
+    S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    S = S - np.swapaxes(S, -1, -2)
+    return np.asarray(np.eye(3) + first * S + second * S @ S, np.float64)
 
 
 def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:

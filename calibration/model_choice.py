@@ -18,7 +18,7 @@ from calibration.stereo_model import (
     Observations,
     StereoModel,
     Terms,
-    predict,
+    predict_pixels,
 )
 
 HOPELESS = 1.5  # times the noise of the best model, left in the views it was fitted to: not worth views left out
@@ -56,17 +56,25 @@ def held_out(
     chi2, square = np.full(n_views, np.nan), np.full(n_views, np.nan)
     count, good_count = np.zeros(n_views, int), np.zeros(n_views, int)
     views = np.unique(used.view)
+    whole = replace(refinement.problem, observations=used, weights=inverse_covariance(used.covariance, sigma**2))
+    at_minimum = whole.linearise(refinement.model)
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
-        train = used[~np.isin(used.view, left_out)]
-        problem = replace(
-            refinement.problem, observations=train, weights=inverse_covariance(train.covariance, sigma**2)
-        )
-        model = minimise(problem, refinement.model, iterations=8, tolerance=NEGLIGIBLE, damping=1e-7).model
+        train = ~np.isin(used.view, left_out)
+        problem = replace(whole, observations=used[train], weights=whole.weights[train])
+        model = minimise(
+            problem,
+            refinement.model,
+            iterations=8,
+            tolerance=NEGLIGIBLE,
+            damping=1e-7,
+            normal=at_minimum.of_views(np.setdiff1d(views, left_out)),
+            rough=True,
+        ).model
         tested = np.isin(everything.view, left_out)
         test = everything[tested]
         model = fit_poses(test, model, sigma)
-        residuals = test.pixels - predict(model, test)[0]
+        residuals = test.pixels - predict_pixels(model, test)
         distance = np.einsum("mi,mij,mj->m", residuals, inverse_covariance(test.covariance, sigma**2), residuals)
         for v in left_out:
             of_view = test.view == v
@@ -86,7 +94,7 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
         len(model.R_left_board),
         huber=3.0,
     )
-    return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7).model
+    return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
 
 
 def candidate(refinement: Refinement, sigma: float, good: Mask) -> TermsTried:
@@ -137,6 +145,7 @@ def choose_terms(
     board = boards[0]
     fits = {(richest, board): refine_stereo(observations, start, nominal, Terms(richest, board, equal_aspect))}
     table: list[TermsTried] = []
+    judged: dict[tuple[tuple[str, str], Terms], TermsTried] = {}  # by the model, and by the one that gave the noise
 
     def compare(keys: list[tuple[str, str]], begin: Refinement) -> tuple[str, str]:
         for key in keys:
@@ -149,7 +158,11 @@ def choose_terms(
         keys = [key for key in keys if fits[key].unexplained_sigma <= worst]
         if len(keys) == 1:
             return keys[0]
-        rows = [candidate(fits[key], quietest.unexplained_sigma, quietest.kept) for key in keys]
+        noise = quietest.terms
+        for key in keys:
+            if (key, noise) not in judged:
+                judged[key, noise] = candidate(fits[key], quietest.unexplained_sigma, quietest.kept)
+        rows = [judged[key, noise] for key in keys]
         table.extend(rows)
         return keys[best(rows)]
 

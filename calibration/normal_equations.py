@@ -6,13 +6,14 @@ through the Schur complement of the views' 6 x 6 blocks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.errors import CalibrationError
-from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved, predict
+from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved, predict_poses
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,32 @@ class Normal:
     cross: Array  # (n_views, s, 6)
     pose: Array  # (n_views, 6, 6)
     pose_gradient: Array  # (n_views, 6)
-    cost: float  # chi-square, or Huber's sum when robust
-    residuals: Array  # (m, 2) observed - predicted [px]
+    costs: Array  # (n_views,) chi-square, or Huber's sum when robust
+
+    @property
+    def cost(self) -> float:
+        """Of all views; inf where a prediction failed."""
+        return float(self.costs.sum())
+
+    def of_views(self, kept: NDArray[np.intp]) -> Normal:
+        """The normal equations of some of the views alone."""
+        use = np.zeros(len(self.costs), bool)
+        use[kept] = True
+
+        def part(values: Array) -> Array:
+            return np.where(use.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
+
+        return replace(
+            self,
+            stereo=part(self.stereo),
+            stereo_point=part(self.stereo_point),
+            point=part(self.point),
+            gradient=part(self.gradient),
+            cross=part(self.cross),
+            pose=np.where(use[:, None, None], self.pose, np.eye(6)),
+            pose_gradient=part(self.pose_gradient),
+            costs=part(self.costs),
+        )
 
     def _assembled(self, stereo: Array, stereo_point: Array, point: Array) -> Array:
         """(s, s) of all shared parameters, from one view's parts or from their sums."""
@@ -110,46 +135,54 @@ class Problem:
     def linearise(self, model: StereoModel) -> Normal:
         """Normal equations at the model."""
         o = self.observations
-        pixels, d_stereo, d_pose, d_point = predict(model, o)
+        pixels, d_stereo, d_pose, R = predict_poses(model, o)
         residuals = o.pixels - pixels
         m, s1, s2 = len(o), self.stereo_basis.shape[1], self.shape_basis.shape[-1]
         n = len(self.shape_basis)
-        block = np.empty((m, 2, s1 + 10))  # derivatives by stereo parameters, pose and point, then the residual
-        block[..., :s1] = (d_stereo.reshape(2 * m, N_STEREO) @ self.stereo_basis).reshape(m, 2, s1)
-        block[..., s1 : s1 + 6] = d_pose
-        block[..., s1 + 6 : s1 + 9] = d_point
-        block[..., s1 + 9] = residuals
+        block = np.empty((m, 2, s1 + 7))  # derivatives by stereo parameters and pose, then the residual
+        if s1:
+            block[..., :s1] = (d_stereo.reshape(2 * m, N_STEREO) @ self.stereo_basis).reshape(m, 2, s1)
+        block[..., s1:-1] = d_pose
+        block[..., -1] = residuals
         mahalanobis = np.sqrt(quadratic(self.weights, residuals))
         cost, factor = _huber(mahalanobis, self.huber)
-        block = _whitened(block, self.weights * factor[:, None, None])
+        costs = np.bincount(o.view, cost, self.n_views)
+        weights = self.weights * factor[:, None, None]
+        block = _whitened(block, weights)
         V = self.n_views
-        squares = np.zeros((V, s1 + 10, s1 + 10))
+        squares = np.zeros((V, s1 + 7, s1 + 7))
         bounds = np.searchsorted(o.view, np.arange(V + 1))
         for v in range(V):
-            rows = block[bounds[v] : bounds[v + 1]].reshape(-1, s1 + 10)
+            rows = block[bounds[v] : bounds[v + 1]].reshape(-1, s1 + 7)
             squares[v] = rows.T @ rows
-        pose = squares[:, s1 : s1 + 6, s1 : s1 + 6]
+        pose = squares[:, s1:-1, s1:-1]
         pose[bounds[1:] == bounds[:-1]] = np.eye(6)
-        per_point = np.zeros((V, n if s2 else 0, 3, s1 + 10))  # a view sees a point twice at most, once per camera
+        stereo_point, point = np.zeros((V, s1, 0)), np.zeros((V, 0, 3, 3))
+        shape, of_shape = np.zeros((0, 0)), np.zeros((V, 0, 7))
         if s2:
-            products = np.swapaxes(block[..., s1 + 6 : s1 + 9], 1, 2) @ block
+            d_point = _whitened(d_pose[..., 3:] @ R, weights)
+            of_point = np.zeros((V, n, 3, s1 + 7))  # a view sees a point twice at most, once per camera
+            point = np.zeros((V, n, 3, 3))
+            turned = np.swapaxes(d_point, 1, 2)
+            by_others, by_itself = turned @ block, turned @ d_point
             for camera in (0, 1):
                 seen = o.camera == camera
-                per_point[o.view[seen], o.point[seen]] += products[seen]
-        shape = self.shape_basis.reshape(3 * n, s2)[: 3 * n if s2 else 0]
-        flat = per_point.reshape(V, -1, s1 + 10)
-        of_shape = shape.T @ flat  # (V, s2, s1 + 10)
+                of_point[o.view[seen], o.point[seen]] += by_others[seen]
+                point[o.view[seen], o.point[seen]] += by_itself[seen]
+            flat = of_point.reshape(V, 3 * n, s1 + 7)
+            stereo_point = np.swapaxes(flat[..., :s1], 1, 2)
+            shape = self.shape_basis.reshape(3 * n, s2)
+            of_shape = shape.T @ flat[..., s1:]  # (V, s2, 7)
         return Normal(
             stereo=squares[:, :s1, :s1],
-            stereo_point=np.swapaxes(flat[..., :s1], 1, 2),
-            point=per_point[..., s1 + 6 : s1 + 9],
+            stereo_point=stereo_point,
+            point=point,
             shape=shape,
-            gradient=np.concatenate([squares[:, :s1, s1 + 9], of_shape[..., s1 + 9]], axis=1),
-            cross=np.concatenate([squares[:, :s1, s1 : s1 + 6], of_shape[..., s1 : s1 + 6]], axis=1),
+            gradient=np.concatenate([squares[:, :s1, -1], of_shape[..., -1]], axis=1),
+            cross=np.concatenate([squares[:, :s1, s1:-1], of_shape[..., :-1]], axis=1),
             pose=pose,
-            pose_gradient=squares[:, s1 : s1 + 6, s1 + 9],
-            cost=cost,
-            residuals=residuals,
+            pose_gradient=squares[:, s1:-1, -1],
+            costs=costs,
         )
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
@@ -163,7 +196,9 @@ def _whitened(block: Array, weights: Array) -> Array:
     a = np.sqrt(weights[:, 0, 0])
     b = weights[:, 0, 1] / np.where(a > 0, a, 1.0)
     c = np.sqrt(np.maximum(weights[:, 1, 1] - b * b, 0.0))
-    return np.stack([a[:, None] * block[:, 0] + b[:, None] * block[:, 1], c[:, None] * block[:, 1]], axis=1)
+    white = block * np.stack([a, c], axis=-1)[..., None]
+    white[:, 0] += b[:, None] * block[:, 1]
+    return white
 
 
 def quadratic(matrix: Array, vector: Array) -> Array:
@@ -181,17 +216,14 @@ def inverse_covariance(covariance: Array, extra: float) -> Array:
     return result
 
 
-def _huber(mahalanobis: Array, limit: float) -> tuple[float, Array]:
-    """Huber's sum (chi-square below the limit) and the factor on each weight; inf where a prediction failed."""
+def _huber(mahalanobis: Array, limit: float) -> tuple[Array, Array]:
+    """Huber's terms (squares below the limit) and the factor on each weight; inf and 0 where a prediction failed."""
     if not np.isfinite(mahalanobis).all():
-        return np.inf, np.zeros_like(mahalanobis)
-    beyond = mahalanobis > limit
-    if not beyond.any():
-        return float(np.sum(mahalanobis**2)), np.ones_like(mahalanobis)
-    cost = np.where(
-        beyond, 2 * np.where(beyond, limit, 0) * mahalanobis - np.where(beyond, limit, 0) ** 2, mahalanobis**2
-    )
-    return float(np.sum(cost)), np.where(beyond, limit / np.maximum(mahalanobis, 1e-300), 1.0)
+        return np.full_like(mahalanobis, np.inf), np.zeros_like(mahalanobis)
+    if not (mahalanobis > limit).any():
+        return mahalanobis**2, np.ones_like(mahalanobis)
+    within = np.minimum(mahalanobis, limit)
+    return within * (2 * mahalanobis - within), within / np.maximum(mahalanobis, 1e-300)
 
 
 @dataclass(frozen=True)
@@ -205,13 +237,23 @@ class Minimum:
 
 
 def minimise(
-    problem: Problem, start: StereoModel, iterations: int = 60, tolerance: float = 1e-10, damping: float = 1e-3
+    problem: Problem,
+    start: StereoModel,
+    iterations: int = 60,
+    tolerance: float = 1e-10,
+    damping: float = 1e-3,
+    normal: Normal | None = None,
+    rough: bool = False,
 ) -> Minimum:
     """Levenberg-Marquardt; converged when the cost to be gained by a full step is below tolerance x cost.
 
     The predicted gain g^T H^-1 g is free of the parameters' units, and a vanishing gradient is what it says.
+
+    normal : the problem's normal equations at the start, where they are known
+    rough : a step that gains less than the tolerance is taken unseen, and `normal` is the one before it: for those who
+        want the model alone
     """
-    model, normal = start, problem.linearise(start)
+    model, normal = start, problem.linearise(start) if normal is None else normal
     if not np.isfinite(normal.cost):
         raise CalibrationError(
             "the start of the refinement puts the board behind a camera: check the order of the views"
@@ -220,13 +262,16 @@ def minimise(
         shared, poses = normal.solve(damping)
         gain = float(shared @ normal.gradient.sum(0) + np.sum(poses * normal.pose_gradient))
         trial = problem.stepped(model, shared, poses)
+        small = gain <= tolerance * max(normal.cost, 1.0)
+        if rough and small and damping < 1e-4:
+            return Minimum(trial, normal, iteration, True)
         trial_normal = problem.linearise(trial)
         if trial_normal.cost <= normal.cost * (1 + 1e-14):
             model, normal, damping = trial, trial_normal, max(damping * 0.1, 1e-12)
-            if damping < 1e-4 and gain <= tolerance * max(normal.cost, 1.0):
+            if damping < 1e-4 and small:
                 return Minimum(model, normal, iteration, True)
         else:
-            if gain <= tolerance * max(normal.cost, 1.0):
+            if small:
                 return Minimum(model, normal, iteration, damping < 1e-2)
             damping *= 10.0
             if damping > 1e10:

@@ -10,7 +10,7 @@ from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.model_choice import fit_poses
 from calibration.refinement import Refinement, refine_stereo
-from calibration.stereo_model import Observations, StereoModel, Terms, predict
+from calibration.stereo_model import Observations, StereoModel, Terms, predict, predict_pixels
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
 ROUGH = Terms("k1 k2", "flat")
@@ -18,7 +18,7 @@ ROUGH = Terms("k1 k2", "flat")
 
 def view_rms(observations: Observations, model: StereoModel) -> Array:
     """Root mean square misfit of each view (n_views,) [px]; NaN where nothing was seen."""
-    residuals = observations.pixels - predict(model, observations)[0]
+    residuals = observations.pixels - predict_pixels(model, observations)
     square = np.nan_to_num(np.sum(residuals**2, axis=-1), nan=np.inf)
     n = len(model.R_left_board)
     count = np.bincount(observations.view, minlength=n)

@@ -12,7 +12,7 @@ import numpy as np
 from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
-from calibration.stereo_model import Observations, StereoModel, Terms, board_basis, predict, restricted
+from calibration.stereo_model import Observations, StereoModel, Terms, board_basis, predict_pixels, restricted
 
 FREE_ROUNDS = 6  # of rejection, in which a point may come back; then it may not, so that the rounds come to an end
 MAX_ROUNDS = 12
@@ -87,9 +87,9 @@ def refine_stereo(
                 f"{len(used)} points in {len(np.unique(used.view))} views are fewer than the parameters to be found: "
                 "take more views, or fewer free terms"
             )
-        minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6)
+        minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
         model, total = minimum.model, total + minimum.iterations
-        residuals = observations.pixels - predict(model, observations)[0]
+        residuals = observations.pixels - predict_pixels(model, observations)
         new_extra = _extra_variance(residuals[kept], used.covariance, dof)
         new_kept = _mahalanobis2(residuals, observations.covariance, new_extra) < reject_beyond**2
         if turn >= FREE_ROUNDS:
@@ -105,7 +105,7 @@ def refine_stereo(
         problem = replace(problem, weights=inverse_covariance(used.covariance, extra))
         minimum = minimise(problem, model, tolerance=1e-14, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
-        residuals = observations.pixels - predict(model, observations)[0]
+        residuals = observations.pixels - predict_pixels(model, observations)
         final, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
     own = _mahalanobis2(residuals[kept], observations.covariance[kept], 0.0)
     return Refinement(
@@ -131,12 +131,12 @@ def _robust_start(
     extra = 0.0
     for basis in (flat, shape_basis) if shape_basis.shape[-1] else (flat,):
         for _ in range(2):
-            residuals = observations.pixels - predict(model, observations)[0]
+            residuals = observations.pixels - predict_pixels(model, observations)
             extra = _median_variance(residuals)
             weights = inverse_covariance(observations.covariance, extra)
             problem = Problem(observations, weights, stereo_basis, basis, n_views, huber=2.0)
-            model = minimise(problem, model, iterations=30, tolerance=1e-5).model
-    residuals = observations.pixels - predict(model, observations)[0]
+            model = minimise(problem, model, iterations=30, tolerance=1e-5, rough=True).model
+    residuals = observations.pixels - predict_pixels(model, observations)
     return model, _median_variance(residuals)
 
 
@@ -151,9 +151,11 @@ def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
 
 def _extra_variance(residuals: Array, covariance: Array, dof: int) -> float:
     """Variance per axis [px^2] which, added to the points' own, makes chi-square equal to the degrees of freedom."""
+    own, axes = np.linalg.eigh(covariance)  # of each point: along its axes what is added is a plain sum
+    squares = np.einsum("mij,mi->mj", axes, residuals) ** 2
 
     def excess(extra: float) -> float:
-        return float(_mahalanobis2(residuals, covariance, extra).sum()) - dof
+        return float(np.sum(squares / (own + extra))) - dof
 
     if excess(0.0) <= 0:
         return 0.0

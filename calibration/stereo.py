@@ -27,7 +27,7 @@ from calibration.model_choice import TermsTried, choose_terms, fit_poses
 from calibration.pairs import motion_between_exposures, readmitted
 from calibration.refinement import Refinement
 from calibration.start import MIN_POINTS, MIN_VIEWS, common_pair, start_camera, start_stereo
-from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations, predict
+from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations, predict_pixels
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
 from calibration.wide_lens import too_wide
@@ -460,7 +460,7 @@ def _odd_images(refinement: Refinement, views: Sequence[int]) -> dict[int, int]:
             image = o[(o.view == v) & (o.camera == camera)]
             if len(image) >= MIN_POINTS:
                 model = fit_poses(image, refinement.model, max(refinement.unexplained_sigma, 1e-3))
-                square = np.sum((image.pixels - predict(model, image)[0]) ** 2, axis=-1)
+                square = np.sum((image.pixels - predict_pixels(model, image)) ** 2, axis=-1)
                 alone.append((float(np.sqrt(np.mean(square))), camera))
         if len(alone) == 2 and min(alone)[0] < limit:
             odd[v] = 1 - min(alone)[1]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.camera import N_INTRINSIC, Camera, project_with_jacobians, rotation_from_vector
+from calibration.camera import N_INTRINSIC, Camera, project, project_with_jacobians, rotation_from_vector
 from calibration.errors import CalibrationError
 
 DISTORTION_MODELS: dict[str, tuple[str, ...]] = {
@@ -127,14 +127,33 @@ def board_basis(nominal: Array, board: str) -> Array:
 
 def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
     """Pixels (m, 2) and derivatives: d/d stereo (m, 2, 24), d/d view pose (m, 2, 6), d/d target point (m, 2, 3)."""
-    m = len(observations)
-    R, t = model.R_left_board[observations.view], model.t_left_board[observations.view]
-    arm = np.einsum("mij,mj->mi", R, model.points[observations.point])
-    points_left = arm + t
-    pixels, d_left = np.empty((m, 2)), np.empty((m, 2, 3))
-    d_stereo = np.zeros((m, 2, N_STEREO))
+    pixels, d_stereo, d_pose, R = predict_poses(model, observations)
+    return pixels, d_stereo, d_pose, d_pose[..., 3:] @ R
+
+
+def predict_pixels(model: StereoModel, observations: Observations) -> Array:
+    """Pixels (m, 2) alone."""
+    _, arm, t = _arms(model, observations)
+    pixels = np.empty((len(observations), 2))
     for index, camera in enumerate(model.cameras):
         seen = observations.camera == index
+        points = arm[seen] + t[seen]
+        if index == 1:
+            points = points @ model.R_right_left.T + model.t_right_left
+        pixels[seen] = project(points, camera)
+    return pixels
+
+
+def predict_poses(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
+    """As `predict`, but the board's rotation (m, 3, 3) for the derivatives by its points, which few fits ask for."""
+    m = len(observations)
+    R, arm, t = _arms(model, observations)
+    points_left = arm + t
+    pixels, d_pose = np.empty((m, 2)), np.empty((m, 2, 6))
+    d_left = d_pose[..., 3:]
+    d_stereo = np.zeros((m, 2, N_STEREO))
+    for index, camera in enumerate(model.cameras):
+        seen = np.flatnonzero(observations.camera == index)
         if index == 0:
             pixels[seen], d_left[seen], d_stereo[seen, :, :N_INTRINSIC] = project_with_jacobians(
                 points_left[seen], camera
@@ -143,16 +162,28 @@ def predict(model: StereoModel, observations: Observations) -> tuple[Array, Arra
         turned = points_left[seen] @ model.R_right_left.T
         pixels[seen], d_right, d_k = project_with_jacobians(turned + model.t_right_left, camera)
         d_stereo[seen, :, N_INTRINSIC : 2 * N_INTRINSIC] = d_k
-        d_stereo[seen, :, 2 * N_INTRINSIC : 2 * N_INTRINSIC + 3] = np.cross(turned[:, None], d_right)
+        d_stereo[seen, :, 2 * N_INTRINSIC : 2 * N_INTRINSIC + 3] = _crossed(turned, d_right)
         d_stereo[seen, :, 2 * N_INTRINSIC + 3 :] = d_right
         d_left[seen] = d_right @ model.R_right_left
-    d_pose = np.concatenate([np.cross(arm[:, None], d_left), d_left], axis=-1)
-    return pixels, d_stereo, d_pose, d_left @ R
+    d_pose[..., :3] = _crossed(arm, d_left)
+    return pixels, d_stereo, d_pose, R
+
+
+def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:
+    """Rotation (m, 3, 3) of the board, its point turned by it (m, 3), and the board's place (m, 3)."""
+    R, t = model.R_left_board[observations.view], model.t_left_board[observations.view]
+    return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
+
+
+def _crossed(arm: Array, d: Array) -> Array:
+    """Cross products of (m, 3) with each row of (m, 2, 3)."""
+    (x, y, z), (a, b, c) = np.moveaxis(arm, -1, 0)[..., None], np.moveaxis(d, -1, 0)
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
 def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
     """The model after a step: stereo (24,), poses (n_views, 6) rotation vectors and shifts, displacement (n, 3)."""
-    turns = np.stack([rotation_from_vector(v) for v in poses[:, :3]])
+    turns = rotation_from_vector(poses[:, :3])
     return StereoModel(
         cameras=(
             Camera.from_parameters(model.cameras[0].parameters + stereo[:9], model.cameras[0].image_size),
