@@ -146,7 +146,7 @@ class Problem:
         block[..., -1] = residuals
         mahalanobis = np.sqrt(quadratic(self.weights, residuals))
         cost, factor = _huber(mahalanobis, self.huber)
-        costs = np.bincount(o.view, cost, self.n_views)
+        costs = np.bincount(o.view, cost, self.n_views).astype(np.float64)
         weights = self.weights * factor[:, None, None]
         block = _whitened(block, weights)
         V = self.n_views

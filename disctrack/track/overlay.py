@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.grey_levels import full_scale
+from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import CAMERAS, rotation_from_quaternion
@@ -26,6 +27,7 @@ OUTLINE_POINTS = 120
 CAPTION_LINE = 18  # height of a line [px]
 CAPTION_WIDTH = 950  # of the whole caption on one line [px]
 _SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
+_SUBPIXEL = 1 << _SUBPIXEL_BITS
 
 _TEXT = (230, 230, 230)
 # Blue, green, red as OpenCV orders them.
@@ -123,10 +125,7 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     disc, rig = trajectory.disc, trajectory.rig
     R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
     h = disc.half_thickness
-    centres = disc.marker_centres_body
-    circles = [_circle(np.zeros(3), disc.radius, -h), _circle(np.zeros(3), disc.radius, h)]
-    circles += [_circle(centre, disc.marker_diameter / 2, centre[2]) for centre in centres]
-    outlines = np.stack(circles) @ R.T + t
+    outlines = _outlines(disc) @ R.T + t
     lower = outlines[0]
     psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
     e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
@@ -134,30 +133,37 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     for picture, seen, (R_cw, t_cw) in zip(
         pictures, rig.project(np.vstack([outlines.reshape(-1, 3), contact])), rig.camera_poses(), strict=True
     ):
-        pixels, *others = seen[:-1].reshape(len(circles), OUTLINE_POINTS, 2)
+        pixels = seen[:-1].reshape(len(outlines), OUTLINE_POINTS, 2)
         # the wall is seen where its outward normal faces the camera; the other half lies behind the disc
         facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
         start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
         visible = np.roll(facing, -start)
-        _polyline(picture, np.roll(pixels, -start, axis=0)[visible], _LOWER, closed=bool(facing.all()))
-        for outline, colour in zip(others, (_RIM, *(_DOT for _ in centres)), strict=True):
-            _polyline(picture, outline, colour)
+        _polylines(picture, [np.roll(pixels[0], -start, axis=0)[visible]], _LOWER, closed=bool(facing.all()))
+        _polylines(picture, pixels[1:2], _RIM)
+        _polylines(picture, pixels[2:], _DOT)
         if np.isfinite(seen[-1]).all():
             _cross(picture, seen[-1], _CONTACT, cv2.MARKER_DIAMOND, 9)
 
 
-def _circle(centre: Array, radius: float, height: float) -> Array:
+def _outlines(disc: Disc) -> Array:
+    """(2 + n, points, 3) in body axes: lower rim, upper rim, dots."""
+    h, centres = disc.half_thickness, disc.marker_centres_body
     angle = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
-    return np.column_stack(
-        [centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), np.full(angle.size, height)]
-    )
+    middle = np.concatenate([[[0.0, 0.0, -h], [0.0, 0.0, h]], centres])
+    radius = np.r_[disc.radius, disc.radius, np.full(len(centres), disc.marker_diameter / 2)]
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(OUTLINE_POINTS)], axis=-1)
+    return np.asarray(middle[:, None] + radius[:, None, None] * circle, np.float64)
 
 
-def _polyline(picture: ColourImage, pixels: Array, colour: tuple[int, int, int], closed: bool = True) -> None:
-    pixels = pixels[np.isfinite(pixels).all(axis=1)]
-    if len(pixels) > 1:
-        fixed = np.clip(np.rint(pixels * (1 << _SUBPIXEL_BITS)), -(2**24), 2**24).astype(np.int32)
-        cv2.polylines(picture, [fixed[:, None]], closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+def _polylines(
+    picture: ColourImage, lines: Sequence[Array] | Array, colour: tuple[int, int, int], closed: bool = True
+) -> None:
+    if not np.isfinite(lines).all():  # behind a camera, or out of the lens's reach
+        lines = [line[np.isfinite(line).all(axis=1)] for line in lines]
+    fixed = [np.clip(np.rint(np.multiply(line, _SUBPIXEL)), -(2**24), 2**24).astype(np.int32) for line in lines]
+    fixed = [line[:, None] for line in fixed if len(line) > 1]
+    if fixed:
+        cv2.polylines(picture, fixed, closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _draw_centres(picture: ColourImage, pixels: Array, status: NDArray[np.uint8]) -> None:
@@ -181,7 +187,8 @@ def _encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImag
             yield write
         return
     with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=round(PLAYBACK_HZ), options={"preset": "veryfast", "crf": "20"})
+        stream = container.add_stream("libx264", rate=round(PLAYBACK_HZ), options={"preset": "superfast", "crf": "23"})
+        stream.thread_count = 1  # more of them take a fifth more of a processor, and reading goes on beside
         stream.height, stream.width, stream.pix_fmt = size[0], size[1], "yuv420p"
 
         def write(picture: ColourImage) -> None:
