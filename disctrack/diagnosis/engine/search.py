@@ -493,7 +493,8 @@ class _Search:
             return "its refit does not converge"
         if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
             return "the free run over held-out data does not improve"
-        return f"gains {gain:.4g}, less than what was chosen"
+        than_chosen = "less than what was chosen" if found else "and leaves what is no noise: it may be chance"
+        return f"gains {gain:.4g}, {than_chosen}"
 
 
 def _refusal(base: Fit, settings: Settings) -> Diagnosis:

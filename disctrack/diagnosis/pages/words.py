@@ -50,7 +50,7 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
     # a free velocity at the first instant says nothing to people that the remark on slip does not
     amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities if not q.name.startswith("state.")]
     sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
-    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, fit)}"
+    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, diagnosis)}"
     if found.cannot_be_told_from:
         rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)
         text += f"; this recording cannot tell it from {rivals}"
@@ -63,17 +63,19 @@ def together(found: Found, fit: Fit) -> tuple[Correlated, ...]:
     return correlated(fit, [q.name for q in found.candidate.quantities if q.name != SLIP], laws)
 
 
-def together_text(found: Found, fit: Fit) -> str:
-    """What their standard deviations alone do not say."""
+def together_text(found: Found, diagnosis: Diagnosis) -> str:
+    """What their standard deviations alone do not say; a pair that an earlier effect's text has named is left out."""
+    fit = diagnosis.after
     units = {q.name: q.unit for q in fit.quantities}
+    earlier = diagnosis.found[: diagnosis.found.index(found)] if found in diagnosis.found else ()
+    named = {frozenset((pair.first, pair.second)) for effect in earlier for pair in together(effect, fit)}
     text = ""
     for pair in together(found, fit):
+        if frozenset((pair.first, pair.second)) in named:
+            continue
         factor = f"{'+' if pair.factor >= 0 else '-'} {abs(pair.factor):.4g}"
         known = quantity_text(pair.value, pair.sigma, units[pair.first])
-        text += (
-            f" ({pair.first} and {pair.second} move together, correlation {pair.correlation:.4f}; better known is "
-            f"{pair.first} {factor} {pair.second} = {known})"
-        )
+        text += f" (correlation {pair.correlation:.4f}: better known is {pair.first} {factor} {pair.second} = {known})"
     return text
 
 
