@@ -31,7 +31,7 @@ def quantity_text(value: float, sigma: float, unit: str) -> str:
     if not sigma > 0:
         return f"{value:.4g}{unit}"
     digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    if digits > 9 or abs(value) >= 1e6:
+    if digits > 7 or abs(value) >= 1e6:
         return f"({value:.5g} +- {sigma:.2g}){unit}"
     return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
 

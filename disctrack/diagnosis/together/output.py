@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from disctrack.diagnosis.engine.search import Diagnosis
+from disctrack.diagnosis.engine.search import Diagnosis, Found
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.pages import planned
@@ -21,6 +22,8 @@ from disctrack.pages.html import bullets, details, page, paragraph, section, tab
 from disctrack.pages.palette import AMBER, BLUE, MUTED
 
 SHOWN = 12  # effects whose standard deviations are tabled by number of recordings; all are in the JSON
+NAMED = 8  # recordings that are named on an axis; more are counted
+UNSEEN = 1e3  # times its typical size: an effect whose standard deviation is larger is not seen at all
 AIR = "air"
 
 
@@ -35,7 +38,7 @@ def sentence(answer: TogetherDiagnosis) -> str:
     if d.verdict == "nothing missing":
         text = f"{of_all}: nothing is missing; {left}."
     else:
-        effects = "; and ".join(effect_text(f, d) for f in d.found).replace("this recording", "these recordings")
+        effects = "; and ".join(_effect_text(f, d) for f in d.found)
         falls = (
             f"chi-square per degree of freedom {d.before.reduced_chi_square:.4g} -> {d.after.reduced_chi_square:.4g}"
         )
@@ -49,6 +52,10 @@ def sentence(answer: TogetherDiagnosis) -> str:
     if apart:
         text += f" {_listed(apart)} {'does' if len(apart) == 1 else 'do'} not fit the others."
     return text
+
+
+def _effect_text(found: Found, d: Diagnosis) -> str:
+    return effect_text(found, d).replace("this recording", "these recordings")
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -198,7 +205,7 @@ def whole_page(answer: TogetherDiagnosis, pictures: str) -> str:
 def _effects(answer: TogetherDiagnosis) -> list[str]:
     d = answer.diagnosis
     return [
-        f"{effect_text(f, d)}. Without it chi-square rises by {f.gain:.5g}, "
+        f"{_effect_text(f, d)}. Without it chi-square rises by {f.gain:.5g}, "
         f"{as_sigmas(f.gain, len(f.candidate.quantities)):.4g} sigmas (noise alone: {f.threshold:.3g}); on recordings "
         f"that were held out it gains {f.held_out_gain:.4g}."
         for f in d.found
@@ -278,7 +285,11 @@ def _of_interest(answer: TogetherDiagnosis) -> list[Bound]:
         share = sigma / q.typical if np.isfinite(q.typical) and np.isfinite(sigma) else 0.0
         return (0 if b.candidate.name in found else 1 if AIR in q.belongs_to else 2, -share)
 
-    usable = [b for b in answer.bounds if np.isfinite(b.by_number[max(b.by_number)][0])]
+    def seen(b: Bound) -> bool:
+        sigma, typical = b.by_number[max(b.by_number)][0], b.candidate.quantities[0].typical
+        return bool(np.isfinite(sigma)) and sigma <= UNSEEN * typical
+
+    usable = [b for b in answer.bounds if seen(b)]
     return sorted(usable, key=rank)[:SHOWN]
 
 
@@ -305,6 +316,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
     """Every shared law: what each recording says alone, and what all say together."""
     sharing, after = answer.system.sharing, answer.diagnosis.after
     alone = [r.alone for r in answer.recordings if not r.reason]
+    names = [r.name for r in answer.recordings if not r.reason]
     drawn = []
     for number, q in enumerate(_free(answer.diagnosis)[:SHOWN], start=1):
         points = []
@@ -323,8 +335,12 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
         axes.axhspan(value - 2 * sigma, value + 2 * sigma, color=AMBER, alpha=0.35, lw=0)
         axes.axhline(value, color=AMBER, lw=1)
         axes.errorbar(x, y, s, fmt="o", ms=3, lw=1, color=BLUE, ecolor=MUTED)
-        axes.set_xlabel("recording")
+        if len(names) <= NAMED:
+            axes.set_xticks(range(len(names)), names)
+        else:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.set_xlabel("recording, from 0")
         axes.set_ylabel(f"{q.name.partition('.')[2]} [{q.unit}]" if q.unit != "1" else q.name.partition(".")[2])
-        caption = f"{q.name}: each recording alone with its standard deviation; the band is two of all together."
+        caption = "Each recording alone with its standard deviation; the band is two of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
     return tuple(drawn)
