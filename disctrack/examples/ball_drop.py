@@ -3,37 +3,129 @@
     python -m disctrack.examples.ball_drop FOLDER [-o DIR]
 
 FOLDER holds `ball_drops.csv` (ball, drop, t_s, height_m) and `balls.txt` (weights in ounces, circumferences in cm).
-Every ball was dropped twice: laws are fitted to drop 1 and judged on drop 2. All balls together, and each alone, are
-given to the engine of `disctrack.diagnosis`; what two drops of one ball do not have in common is noise with a memory.
+Every ball was dropped twice: laws are fitted to drop 1 and to the first 1.2 s of drop 2, and judged on the rest. All
+balls together, and each alone; what two drops of one ball do not have in common is noise with a memory.
+Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from disctrack.diagnosis import Diagnosis, Settings, diagnose
+from calibration.arrays import Array
+from disctrack.diagnosis import Settings
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out
-from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
+from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, SmoothNoise, estimate
 from disctrack.diagnosis.engine.search import CLASS_GAIN
-from disctrack.diagnosis.engine.system import Quantity, Subset
-from disctrack.diagnosis.pages.general import document, fit_errors
+from disctrack.diagnosis.engine.system import Subset
+from disctrack.diagnosis.equations import Answer, Equations, Parameter, Run, Term, diagnose
+from disctrack.diagnosis.equations.system import EquationSystem
+from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
-from disctrack.examples.ball_system import GRAVITY, BallDrops, Drop, height_noise, read_drops
 from disctrack.pages.figures import dress
-from disctrack.pages.palette import AMBER, BLUE, GREEN, MUTED, RED
+from disctrack.pages.palette import BLUE, RED
 
+GRAVITY = 9.81  # [m/s^2] as declared
+AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
+OUNCE = 0.028349523125  # [kg]
+ACCELERATION_DEGREE = 4  # of the polynomial in time that all drops of a ball share: any drag, to 1 mm
 SEEN = 1.2  # [s] of a second drop from which the rest is foretold, as in the published comparison
-FORMS = ("constant_drag", "linear_drag", "quadratic_drag")
-CAMERA = "perspective"
-_WHITE = SmoothNoise(0.05, 1e-6, 1.0)  # least squares, for comparison with what others did
+FALL = Equations(
+    {"h": "v", "v": "-g"}, constants={"g": GRAVITY, "per_cd": 0.0}, units={"h": "m", "v": "m/s"},
+    name=f"free fall, g = {GRAVITY} m/s^2",
+)  # fmt: skip
+
+
+def _drag(name: str, force: str, unit: str, typical: float, title: str) -> Term:
+    """A law with a number of its own for every ball."""
+    number = Parameter(0.0, unit, lower=0.0, typical=typical, per="ball")
+    return Term(name, {"v": f"k*({force})"}, parameters={"k": number}, title=title, source="de Silva et al. 2020")
+
+
+DRAG = (  # the constant one takes its sign from a fall
+    _drag("constant_drag", "1", "m/s^2", 1.0, "deceleration that does not depend on speed"),
+    _drag("linear_drag", "-v", "1/s", 0.1, "drag in proportion to the speed"),
+    _drag("quadratic_drag", "-v*abs(v)", "1/m", 0.01, "drag in proportion to the square of the speed"),
+)
+CAMERA = Term("perspective", observed={"h": "bend*(h - 30)**2"}, title="scale of the heights changes with height",
+              parameters={"bend": Parameter(0.0, "1/m", typical=1e-3)})  # fmt: skip
+OTHERS = (
+    Term("gravity", {"v": "-change"}, parameters={"change": Parameter(0.0, "m/s^2", typical=0.01)}),
+    Term("height_scale", observed={"h": "change*(h - 30)"}, parameters={"change": Parameter(0.0, typical=0.02)}),
+    Term("frame_rate", clock="-t*change/(1 + change)", parameters={"change": Parameter(0.0, typical=1e-3)}),
+    CAMERA,
+)
+# one number for all of known size and mass: what a law of nature would be
+SPHERE = Term("sphere_drag", {"v": "-Cd*per_cd*v*abs(v)"}, title="quadratic drag, one coefficient for all balls",
+              parameters={"Cd": Parameter(0.0, lower=0.0, typical=0.5)})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Drop:
+    """Height of one ball over time."""
+
+    ball: str
+    number: int
+    time: Array  # (n,) [s]
+    height: Array  # (n,) [m]
+    per_cd: float = 0.0  # rho A / (2 m) [1/m]: deceleration over v^2 for a drag coefficient of one; 0: not known
+
+
+def read_drops(folder: Path) -> tuple[Drop, ...]:
+    """All drops of `ball_drops.csv`, with mass and radius from `balls.txt`. Raises AnalysisError."""
+    path, sizes = Path(folder) / "ball_drops.csv", Path(folder) / "balls.txt"
+    for file in (path, sizes):
+        if not file.is_file():
+            raise AnalysisError(f"{file}: not there. Name the folder that holds ball_drops.csv and balls.txt.")
+    per_cd = {}
+    for words in (line.split() for line in sizes.read_text().splitlines()[1:] if line.strip()):
+        try:
+            mass, radius = OUNCE * float(words[1]), 0.01 * float(words[2]) / (2 * np.pi)
+        except ValueError:
+            continue  # nobody measured it
+        per_cd[_key(words[0])] = AIR_DENSITY * np.pi * radius**2 / (2 * mass)
+    rows: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    with path.open(newline="") as stream:
+        for line, row in enumerate(csv.DictReader(stream), start=2):
+            try:
+                key = (row["ball"], int(row["drop"]))
+                sample = (float(row["t_s"]), float(row["height_m"]))
+            except (KeyError, TypeError, ValueError) as error:
+                raise AnalysisError(f"{path}, line {line}: expected ball,drop,t_s,height_m; found {row}.") from error
+            rows.setdefault(key, []).append(sample)
+    return tuple(Drop(*key, *np.array(rows[key], float).T, per_cd.get(_key(key[0]), 0.0)) for key in rows)
+
+
+def _key(name: str) -> str:
+    plain = name.lower().replace(" ", "").replace("whiffle", "wiffle")
+    return plain.replace("ball", "").replace("basket", "basketball")
+
+
+def height_noise(drops: Sequence[Drop]) -> SmoothNoise:
+    """Noise of a height [m] and [s], from what drops of one ball do not have in common.
+
+    All drops of a ball share an acceleration that is a polynomial in time; start and velocity are each drop's own. What
+    is left (grain of the pixels, a hand that throws, wind, a scale that differs from take to take) is no law of the
+    ball. One drop alone shows less of it.
+    """
+    stretches = []
+    for ball in dict.fromkeys(d.ball for d in drops):
+        takes = [d for d in drops if d.ball == ball]
+        time = np.concatenate([d.time - d.time[0] for d in takes])
+        part = np.repeat(np.arange(len(takes)), [len(d.time) for d in takes])
+        own = (part[:, None] == np.arange(len(takes))).astype(float)
+        u = time[:, None] / time.max()
+        basis = np.concatenate([own, own * u, *(u**k for k in range(2, ACCELERATION_DEGREE + 3))], axis=1)
+        stretches.append(SampleStretch(time, np.concatenate([d.height for d in takes])[:, None], basis, part))
+    return estimate(stretches, SmoothNoise(0.05, 0.15, 0.5))
 
 
 @dataclass(frozen=True)
@@ -58,11 +150,9 @@ class Errors:
 class BallAnswer:
     """Everything asked of a set of drops."""
 
-    drops: tuple[Drop, ...]
     noise: SmoothNoise
-    together: Diagnosis
-    system: BallDrops
-    alone: Mapping[str, Diagnosis]
+    together: Answer
+    alone: Mapping[str, Answer]
     forms: tuple[Form, ...]  # best first
     errors: Mapping[str, Errors]  # by form, and "gravity alone"
 
@@ -80,73 +170,57 @@ class BallAnswer:
 def analyse_drops(drops: Sequence[Drop]) -> BallAnswer:
     """Diagnose all balls together and each alone, compare the forms of the law, measure errors on the second drops."""
     noise = height_noise(drops)
-    system = BallDrops(drops, noise)
-    together = diagnose(system, system.start(), settings_for(system), system.training_rows(SEEN))
-    alone = {}
-    for ball in system.balls:
-        one = BallDrops([d for d in drops if d.ball.name == ball.name], noise)
-        alone[ball.name] = diagnose(one, one.start(), settings_for(one), one.training_rows(SEEN))
-    forms = [_form(system, together.before, e) for form in FORMS for e in ((form,), (form, CAMERA))]
-    forms.sort(key=lambda f: f.criterion)
-    errors = {"gravity alone": errors_of(drops, None)} | {form: errors_of(drops, form) for form in FORMS}
-    return BallAnswer(tuple(drops), noise, together, system, alone, tuple(forms), errors)
+    known = len({d.ball for d in drops}) > 1 and any(d.per_cd for d in drops)
+    together = ask(drops, noise, (*DRAG, *OTHERS, SPHERE) if known else (*DRAG, *OTHERS))
+    balls = dict.fromkeys(d.ball for d in drops)
+    alone = {ball: ask([d for d in drops if d.ball == ball], noise, (*DRAG, *OTHERS)) for ball in balls}
+    camera = ((), (CAMERA.name,))
+    forms = [_form(together, (term.name, *more)) for term in DRAG for more in camera]
+    errors = {name: errors_of(together, name) for name in ("gravity alone", *(term.name for term in DRAG))}
+    return BallAnswer(noise, together, alone, tuple(sorted(forms, key=lambda f: f.criterion)), errors)
 
 
-def settings_for(system: BallDrops) -> Settings:
-    """The covariance of the noise is that of the data already; it is that of all balls, and takes of one may differ."""
-    at_noise = 1 + 3 * np.sqrt(2 / np.sum(system.weights))  # three sigmas of a reduced chi-square
-    return Settings(noise=1.0, unexplained_share=0.2, at_noise=float(at_noise))
+def ask(drops: Sequence[Drop], noise: SmoothNoise, terms: Sequence[Term]) -> Answer:
+    """What a free fall lacks for these drops. The noise is that of all balls, and takes of one may differ."""
+    runs = [
+        Run(d.time, {"h": d.height}, noise=noise, name=f"{d.ball},{d.number}", groups={"ball": d.ball},
+            constants={"per_cd": d.per_cd}, fit_until=np.inf if d.number == 1 else SEEN - d.time[0])
+        for d in drops
+    ]  # fmt: skip
+    at_noise = 1 + 3 * np.sqrt(2 / sum(len(d.time) for d in drops))  # three sigmas of a reduced chi-square
+    settings = Settings(noise=1.0, unexplained_share=0.2, at_noise=float(at_noise))
+    return diagnose(FALL, runs, terms, settings=settings)
 
 
-def _quantities(system: BallDrops, effects: Sequence[str]) -> tuple[Quantity, ...]:
-    return tuple(q for c in system.candidates if c.name in effects for q in c.quantities)
-
-
-def _form(system: BallDrops, base: Fit, effects: tuple[str, ...]) -> Form:
-    new = _quantities(system, effects)
+def _form(answer: Answer, effects: tuple[str, ...]) -> Form:
+    system, base = answer.system, answer.diagnosis.before
+    new = tuple(q for c in system.candidates if c.name in effects for q in c.quantities)
     fitted = fit(system, (*system.base, *new), base.values)
-    held = held_out(system, fitted.quantities, fitted.values, system.training_rows(SEEN))
+    held = held_out(system, fitted.quantities, fitted.values, system.training)
     criterion = fitted.cost + len(new) * np.log(np.sum(system.weights))
     return Form(effects, fitted, float(criterion), held.log_density)
 
 
-def errors_of(drops: Sequence[Drop], form: str | None) -> Errors:
+def errors_of(answer: Answer, form: str) -> Errors:
     """Least squares without a model of the noise: a law fitted to drops 1, errors on drops 2 of the same balls."""
-    numbers: dict[str, list[int]] = {}
-    for drop in drops:
-        numbers.setdefault(drop.ball.name, []).append(drop.number)
-    pairs = [d for d in drops if sorted(numbers[d.ball.name]) == [1, 2]]
-    if not pairs:
-        return Errors({}, {})
-    system = BallDrops(pairs, _WHITE)
-    law = _quantities(system, [form] if form else [])
-    starts = {k: tuple(q for i, d in enumerate(pairs) if d.number == k for q in system.own(i)) for k in (1, 2)}
-    values = fit(Subset(system, system.number == 1), (*starts[1], *law), system.start()).values
-    second = system.number == 2
-    whole = fit(Subset(system, second), starts[2], values).values
-    begun = fit(Subset(system, second & (system.time <= SEEN)), starts[2], values).values
-    answers = []
-    for fitted, since in ((whole, -np.inf), (begun, SEEN)):
-        predicted = system.predicted(fitted)
-        left = {
-            d.ball.name: (d.height - h)[d.time > since] for d, h in zip(pairs, predicted, strict=True) if d.number == 2
-        }
-        answers.append({name: float(np.sqrt(np.mean(x**2))) for name, x in left.items()})
-    return Errors(*answers)
+    plain = [replace(s, noise=None) for s in answer.system.stretches]
+    drops = {k: [s for s in plain if s.run.endswith(f",{k}")] for k in (1, 2)}
+    balls = [{s.groups["ball"] for s in drops[k]} for k in (1, 2)]
+    first, second = (
+        answer.system.with_(stretches=[s for s in drops[k] if s.groups["ball"] in balls[0] & balls[1]]) for k in (1, 2)
+    )
+    law = tuple(q for c in first.candidates if c.name == form for q in c.quantities)
+    values = fit(first, (*first.base, *law), answer.diagnosis.before.values).values
+    whole = fit(second, second.base, values).values
+    begun = fit(Subset(second, second.training), second.base, values).values
+    return Errors(_rms(second, whole, -np.inf), _rms(second, begun, SEEN))
 
 
-def _median(errors: Mapping[str, float]) -> float:
-    return float(np.median(list(errors.values()))) if errors else float("nan")
-
-
-def drag_coefficients(answer: BallAnswer, form: Form) -> dict[str, tuple[float, float]]:
-    """Cd and its sigma of every ball of known size and mass, from a fit with quadratic drag."""
+def _rms(system: EquationSystem, values: Mapping[str, float], since: float) -> dict[str, float]:
     found = {}
-    for ball in answer.system.balls:
-        name = f"quadratic_drag.k[{ball.name}]"
-        if np.isfinite(ball.mass) and name in form.fit.values:
-            per_cd = ball.quadratic_per_cd
-            found[ball.name] = (form.fit.values[name] / per_cd, form.fit.sigma(name) / per_cd)
+    for s, seen in zip(system.stretches, system.predictions(values), strict=True):
+        late = s.time > since
+        found[s.groups["ball"]] = float(np.sqrt(np.mean((s.data - seen.seen)[late] ** 2))) if seen else np.nan
     return found
 
 
@@ -157,154 +231,66 @@ def _words(effects: Sequence[str]) -> str:
 def sentence(answer: BallAnswer) -> str:
     """The answer in plain words."""
     if not answer.together.found:
-        return f"Nothing is claimed to be missing beside gravity: {answer.together.reason}."
-    null = [name for name, d in answer.alone.items() if d.verdict == "nothing missing"]
-    text = "Drag is missing"
-    if null:
-        text += f" (not seen, for these drops, on {', '.join(null)})"
+        return f"Nothing is claimed to be missing beside gravity: {answer.together.diagnosis.reason}."
+    null = [name for name, a in answer.alone.items() if a.verdict == "nothing missing"]
+    text = f"Drag is missing (not seen, for these drops, on {', '.join(null) or 'none'})"
     if answer.identifiable:
         return f"{text}; its form is that of {_words(answer.forms[0].effects)}."
     rivals = " and ".join(_words(f.effects) for f in answer.undecided)
     return f"{text}, but its form is not identifiable: {rivals} describe the drops equally well."
 
 
-def as_document(answer: BallAnswer) -> dict[str, Any]:
-    """Keys of diagnosis.json; besides, `forms`, `identifiable`, `errors_m` and every ball's own diagnosis."""
-    d = answer.together
-    before, after = ("gravity alone", d.found[0].candidate.name if d.found else "gravity alone")
-    errors = {
-        name: {"whole_drop": e.whole, "forecast": e.forecast, "median": {k: _median(getattr(e, k)) for k in vars(e)}}
-        for name, e in answer.errors.items()
-    }
-    own = {
-        key: fit_errors(f, h) | {"rms_m": errors.get(name, {}).get("median")}
-        for key, f, h, name in (
-            ("before", d.before, d.held_out_before, before),
-            ("after", d.after, d.held_out_after, after),
-        )
-    }
-    best = answer.forms[0]
-    forms = [
-        {
-            "effects": list(f.effects),
-            "criterion_over_best": f.criterion - best.criterion,
-            "reduced_chi_square": f.fit.reduced_chi_square,
-            "held_out_log_density": f.log_density,
-            "drag_coefficient": drag_coefficients(answer, f),
-        }
-        for f in answer.forms
-    ]
-    alone = {name: document(x, f"g = {GRAVITY}", "", fit_errors(x.before, x.held_out_before),
-                            fit_errors(x.after, x.held_out_after)) for name, x in answer.alone.items()}  # fmt: skip
-    whole = document(d, f"free fall, g = {GRAVITY} m/s^2", sentence(answer), own["before"], own["after"])
-    for effect in whole["effects"]:
-        known = next((f for f in answer.forms if f.effects == (effect["candidate"],)), best)
-        effect["class"] += [
-            {"name": " + ".join(f.effects), "delta_chi_square": f.criterion - known.criterion}
-            for f in answer.undecided
-            if f is not known
-        ]
-    return whole | {
-        "noise": vars(answer.noise),
-        "identifiable": answer.identifiable,
-        "forms": forms,
-        "errors_m": errors,
-        "balls": alone,
-    }
-
-
-def table(answer: BallAnswer) -> str:
+def report(answer: BallAnswer) -> str:
     """Before and after, for people."""
     n = answer.noise
-    lines = [
-        sentence(answer),
-        f"Noise of a height: {n.white:.3f} m white and {n.smooth:.3f} m with a memory of {n.memory:.2f} s.",
-        "",
-        f"{'rms on the second drop [m], median of the balls':<52}{'whole':>8}{f'after {SEEN} s':>13}",
-    ]
-    lines += [
-        f"  {_words([name]):<50}{_median(e.whole):8.2f}{_median(e.forecast):13.2f}" for name, e in answer.errors.items()
-    ]
+    lines = [sentence(answer),
+             f"Noise of a height: {n.white:.3f} m white and {n.smooth:.3f} m with a memory of {n.memory:.2f} s.", "",
+             f"{'rms on the second drop [m], median of the balls':<52}{'whole':>8}{f'after {SEEN} s':>13}"]  # fmt: skip
+    for name, e in answer.errors.items():
+        whole, forecast = (float(np.median(list(x.values()))) if x else np.nan for x in (e.whole, e.forecast))
+        lines.append(f"  {_words([name]):<50}{whole:8.2f}{forecast:13.2f}")
     lines += ["", f"{'all balls together':<36}{'chi-square':>11}{'criterion':>11}{'held-out 2 ln p':>17}"]
+    lines.append(f"  {'gravity alone':<34}{answer.together.diagnosis.before.reduced_chi_square:11.2f}")
     best = answer.forms[0]
-    chi = answer.together.before
-    lines.append(f"  {'gravity alone':<34}{chi.reduced_chi_square:11.2f}")
-    lines += [
-        f"  {_words(f.effects):<34}{f.fit.reduced_chi_square:11.2f}{f.criterion - best.criterion:+11.1f}"
-        f"{2 * (f.log_density - best.log_density):+17.1f}"
-        for f in answer.forms
-    ]
-    lines += [
-        "",
-        f"{'each ball alone':<22}{'verdict':<17}{'chi-square':<16}{'rms on drop 2 [m]':<20}best, and its class",
-    ]
-    for name, d in answer.alone.items():
-        chi_text = f"{d.before.reduced_chi_square:.1f} -> {d.after.reduced_chi_square:.1f}"
-        form = next((f.candidate.name for f in d.found if f.candidate.name in answer.errors), None)
-        pair = [answer.errors[key].whole.get(name) for key in ("gravity alone", form) if key]
-        rms = " -> ".join(f"{x:.2f}" for x in pair if x is not None)
-        effects = "; ".join(
-            f"{f.candidate.name} ({', '.join(r.candidate.name for r in f.cannot_be_told_from) or 'alone'})"
-            for f in d.found
-        )
-        lines.append(f"  {name:<20}{d.verdict:<17}{chi_text:<16}{rms:<20}{effects}")
-    for fitted in answer.forms:
-        cd = drag_coefficients(answer, fitted)
-        if cd:
-            values = ", ".join(f"{name} {v:.2f}({100 * s:.0f})" for name, (v, s) in cd.items())
-            lines += ["", f"Cd from {_words(fitted.effects)}: {values}"]
-    return "\n".join(lines)
+    for f in answer.forms:
+        over = f.criterion - best.criterion, 2 * (f.log_density - best.log_density)
+        lines.append(f"  {_words(f.effects):<34}{f.fit.reduced_chi_square:11.2f}{over[0]:+11.1f}{over[1]:+17.1f}")
+    lines += ["", "each ball alone"]
+    return "\n".join(
+        [*lines, *(f"  {name:<20}{a.verdict:<17}{', '.join(a.found)}" for name, a in answer.alone.items())]
+    )
 
 
 def figure(answer: BallAnswer) -> Figure:
-    """Forecast of the second drops, errors by law, and what the forms leave."""
-    picture = Figure(figsize=(11, 7.5), layout="constrained")
-    (fall, bars), (left, forms) = picture.subplots(2, 2)
-    for axes in (fall, bars, left, forms):
-        dress(axes)
-    whole = answer.errors["gravity alone"].whole
-    shown = max(whole, key=lambda k: whole[k]) if whole else answer.drops[-1].ball.name
-    by_form = {f.effects: f.fit.values for f in answer.forms}
-    curves = [("gravity alone", answer.together.before.values, RED, "--")]
-    curves += [
-        (_words(e), by_form[e], c, "-") for e, c in zip(((x,) for x in FORMS), (AMBER, BLUE, GREEN), strict=True)
-    ]
-    for i, drop in enumerate(answer.drops):
-        if drop.ball.name != shown:
-            continue
-        first = drop.number == 1
-        fall.plot(drop.time, drop.height, "o" if first else "s", ms=3, color=MUTED, label=f"drop {drop.number}")
-        for label, values, colour, style in curves:
-            h = answer.system.predicted(values)[i]
-            fall.plot(drop.time, h, style, lw=1.1, color=colour, label=label if first else None)
-            if label != "gravity alone":
-                left.plot(drop.time, drop.height - h, style, lw=1.0, color=colour, marker="o" if first else "s", ms=2.5,
-                          label=label if first else None)  # fmt: skip
-    fall.set(title=shown, xlabel="time [s]", ylabel="height [m]")
-    left.set(title=f"{shown}: measured minus fitted, both drops", xlabel="time [s]", ylabel="residual [m]")
-    for axes in (fall, left):
-        axes.legend(frameon=False, fontsize=8)
-    names = list(whole)
-    colours = dict(zip(answer.errors, (RED, AMBER, BLUE, GREEN), strict=True))
-    for shift, (form, e) in enumerate(answer.errors.items()):
-        y = np.arange(len(names)) + 0.2 * (shift - 1.5)
-        bars.barh(y, [e.forecast[k] for k in names], 0.2, color=colours[form], label=_words([form]))
-    bars.set_yticks(range(len(names)), names)
-    bars.invert_yaxis()
-    bars.set(xscale="log", xlabel=f"rms of the forecast of drop 2 after {SEEN} s [m]", title="law fitted to drop 1")
-    bars.legend(frameon=False, fontsize=8)
-    best = answer.forms[0].criterion
-    forms.barh([_words(f.effects) for f in answer.forms], [f.criterion - best + 1 for f in answer.forms], color=BLUE)
-    forms.axvline(CLASS_GAIN + 1, color=RED, lw=1, ls="--")
-    forms.invert_yaxis()
-    forms.set(xscale="log", xlabel="1 + criterion above the best (dashed: not told apart)", title="all balls together")
+    """What gravity alone and the best law leave of every drop."""
+    picture = Figure(figsize=(9, 4), layout="constrained")
+    axes = picture.subplots()
+    dress(axes)
+    sides = ((answer.together.diagnosis.before, RED, "gravity alone"),
+             (answer.forms[0].fit, BLUE, _words(answer.forms[0].effects)))  # fmt: skip
+    for fitted, colour, label in sides:
+        for i, (s, seen) in enumerate(answer.together.predicted(fitted)):
+            axes.plot(s.time, (s.data - seen)[:, 0], lw=0.8, color=colour, label=None if i else label)
+    axes.set(title="measured minus fitted, all drops", xlabel="time [s]", ylabel="height [m]")
+    axes.legend(frameon=False)
     return picture
 
 
 def example(folder: Path) -> Outcome:
     """What does gravity alone lack for falling balls, and is its law identifiable?"""
     answer = analyse_drops(read_drops(folder))
-    return Outcome(table(answer), as_document(answer), figure(answer))
+    forms = [{"effects": f.effects, "criterion": f.criterion, "held_out_log_density": f.log_density,
+              "reduced_chi_square": f.fit.reduced_chi_square} for f in answer.forms]  # fmt: skip
+    found = answer.together.document() | {
+        "sentence": sentence(answer),
+        "noise": vars(answer.noise),
+        "identifiable": answer.identifiable,
+        "cannot_be_told_apart": [f.effects for f in answer.undecided],
+        "forms": forms,
+        "errors_m": {name: vars(e) for name, e in answer.errors.items()},
+        "balls": {name: a.document() for name, a in answer.alone.items()},
+    }
+    return Outcome(report(answer), found, figure(answer))
 
 
 def main(words: Sequence[str] | None = None) -> int:

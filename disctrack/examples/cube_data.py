@@ -19,7 +19,6 @@ from disctrack.errors import AnalysisError
 
 HALF_WIDTH = 0.0524  # [m] as declared
 FRAME_RATE = 148.0  # [Hz]
-MASS = 0.37  # [kg]
 CLEARANCE = 0.12  # [half widths] of the lowest corner, from which on nothing touches: several times what contacts show
 SHORTEST = 9  # samples of a flight
 GLITCH = 6.0  # times the median roughness, beyond which a flight is not one: a hand, or a tag mistaken
@@ -37,8 +36,6 @@ class Toss:
     number: int
     position: Array  # (n, 3) [m]
     rotation: Array  # (n, 3, 3) body to world
-    velocity: Array  # (n, 3) [m/s] as published; only checked, never fitted
-    rate: Array  # (n, 3) angular velocity as published [rad/s], likewise
 
     @property
     def reach(self) -> Array:
@@ -51,7 +48,6 @@ class Flight:
     """A stretch of a toss in free flight, with the smooth motion about which effects are reckoned."""
 
     number: int  # of the toss
-    first: int  # sample of the toss
     time: Array  # (n,) from the middle [s]
     position: Array  # (n, 3) [m]
     rotation: Array  # (n, 3, 3)
@@ -62,11 +58,6 @@ class Flight:
     turn: Array  # (n, 3) from there to the measured attitude, rotation vector in axes of the body [rad]
     along: Array  # (3,) horizontal direction of the flight
     across: Array  # (3,) horizontal, to its left
-
-    @property
-    def speed(self) -> float:
-        """Mean speed [m/s]."""
-        return float(np.linalg.norm(self.velocity, axis=1).mean())
 
 
 def read_tosses(folder: Path) -> tuple[Toss, ...]:
@@ -82,8 +73,7 @@ def read_tosses(folder: Path) -> tuple[Toss, ...]:
         raise AnalysisError(f"{path}: state is {state.shape}, offset ends at {offset[-1]}; expected finite rows of 13.")
     rotation = Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
     return tuple(
-        Toss(i, HALF_WIDTH * state[a:b, :3], rotation[a:b], HALF_WIDTH * state[a:b, 7:10], state[a:b, 10:])
-        for i, (a, b) in enumerate(pairwise(offset.tolist()))
+        Toss(i, HALF_WIDTH * state[a:b, :3], rotation[a:b]) for i, (a, b) in enumerate(pairwise(offset.tolist()))
     )
 
 
@@ -154,20 +144,8 @@ def smooth_flight(toss: Toss, first: int, end: int) -> Flight:
     path = powers @ parabola
     along = np.array([parabola[1, 0], parabola[1, 1], 0.0]) / np.hypot(*parabola[1, :2])
     across = np.cross([0.0, 0.0, 1.0], along)
-    return Flight(
-        toss.number,
-        first,
-        time,
-        position,
-        rotation,
-        path,
-        velocity,
-        omega,
-        np.asarray(turning.as_matrix(), float),
-        turn,
-        along,
-        across,
-    )
+    smooth = np.asarray(turning.as_matrix(), float)
+    return Flight(toss.number, time, position, rotation, path, velocity, omega, smooth, turn, along, across)
 
 
 @dataclass(frozen=True)

@@ -15,26 +15,8 @@ UP = np.array([0.0, 0.0, 1.0])
 _AXES = ("along", "across", "up")
 _FACES = tuple((a, b) for a in range(3) for b in range(3))
 
-
-def twice_integrated(flight: Flight, acceleration: Array) -> Array:
-    """Displacement (n, 3) by an acceleration (n, 3), from rest at the first sample; trapezoids."""
-    return once_integrated(flight, once_integrated(flight, acceleration))
-
-
-def once_integrated(flight: Flight, rate: Array) -> Array:
-    """Integral (n, 3) from the first sample."""
-    dt = float(flight.time[1] - flight.time[0])
-    steps = 0.5 * dt * (rate[1:] + rate[:-1])
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-
-
-def turned(flight: Flight, torque_world: Array) -> Array:
-    """Turn (n, 3) in axes of the body by an angular acceleration (n, 3) in axes of the world.
-
-    R = R_smooth exp(eta): eta' = R_smooth^T (change of the angular velocity).
-    """
-    change = once_integrated(flight, torque_world)
-    return once_integrated(flight, np.einsum("nji,nj->ni", flight.turning, change))
+_Moved = tuple[Array | None, Array | None]  # (n, 3) change of the position [m] and turn in axes of the body [rad]
+_Move = Callable[[Flight, str], _Moved]
 
 
 def columns(flight: Flight, names: Sequence[str]) -> Array:
@@ -42,7 +24,7 @@ def columns(flight: Flight, names: Sequence[str]) -> Array:
     found = np.zeros((len(flight.time), 6, len(names)))
     for i, name in enumerate(names):
         effect, _, part = name.partition(".")
-        position, turn = _EFFECTS[effect](flight, part)
+        position, turn = _MOVES[effect](flight, part)
         if position is not None:
             found[:, :3, i] = position
         if turn is not None:
@@ -73,76 +55,33 @@ def resting_columns(cubes: Sequence[Resting], names: Sequence[str]) -> Array:
     return found
 
 
-_Moved = tuple[Array | None, Array | None]
+def _integrated(flight: Flight, rate: Array) -> Array:
+    """Integral (n, 3) from the first sample; trapezoids."""
+    dt = float(flight.time[1] - flight.time[0])
+    steps = 0.5 * dt * (rate[1:] + rate[:-1])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
-def _gravity(f: Flight, part: str) -> _Moved:
-    return -UP * (f.time**2 / 2)[:, None], None
+def _pushed(flight: Flight, acceleration: Array) -> _Moved:
+    return _integrated(flight, _integrated(flight, acceleration)), None
 
 
-def _frame_rate(f: Flight, part: str) -> _Moved:
-    return UP * (GRAVITY * f.time**2)[:, None], None  # true time is shorter if the true rate is higher
+def _twisted(flight: Flight, acceleration: Array) -> _Moved:
+    """By an angular acceleration in axes of the world. R = R_smooth exp(eta): eta' = R_smooth^T (change of omega)."""
+    change = _integrated(flight, np.broadcast_to(acceleration, flight.position.shape))
+    return None, _integrated(flight, _in_body(flight, change))
 
 
-def _length_scale(f: Flight, part: str) -> _Moved:
-    return -UP * (GRAVITY * f.time**2 / 2)[:, None], None
+def _in_body(flight: Flight, vectors: Array) -> Array:
+    return np.einsum("nji,nj->ni", flight.turning, np.broadcast_to(vectors, flight.position.shape))
 
 
-def _tilt(f: Flight, part: str) -> _Moved:
-    return np.eye(3)["xy".index(part[-1])] * (GRAVITY * f.time**2 / 2)[:, None], None
+def _fallen(flight: Flight, direction: Array) -> _Moved:
+    return direction * (GRAVITY * flight.time**2 / 2)[:, None], None
 
 
-def _toss_tilt(f: Flight, part: str) -> _Moved:
-    return _axes(f)[_AXES.index(part)] * (GRAVITY * f.time**2 / 2)[:, None], None
-
-
-def _axes(f: Flight) -> Array:
-    return np.stack([f.along, f.across, UP])
-
-
-def _linear_drag(f: Flight, part: str) -> _Moved:
-    return twice_integrated(f, -f.velocity), None
-
-
-def _quadratic_drag(f: Flight, part: str) -> _Moved:
-    return twice_integrated(f, -f.velocity * np.linalg.norm(f.velocity, axis=1)[:, None]), None
-
-
-def _side_force(f: Flight, part: str) -> _Moved:
-    return twice_integrated(f, np.cross(UP, f.velocity)), None
-
-
-def _magnus(f: Flight, part: str) -> _Moved:
-    return twice_integrated(f, np.cross(f.omega, f.velocity)), None
-
-
-def _frame_rotation(f: Flight, part: str) -> _Moved:
-    # the room turns about the vertical by Omega t: place and attitude turn along, and so does the angular velocity
-    place = np.cross(UP, f.path) * f.time[:, None]
-    return place, np.einsum("nji,nj->ni", f.turning, UP * f.time[:, None])
-
-
-def _centre_of_mass(f: Flight, part: str) -> _Moved:
-    # the tags' centre is seen, which stands off by minus the offset of the centre of mass
-    return -f.rotation[:, :, int(part[-1]) - 1], None
-
-
-def _face_bias(f: Flight, part: str) -> _Moved:
-    a, b = _FACES[int(part)]
-    return _axes(f)[a] * np.abs(f.rotation[:, 2, b])[:, None], None
-
-
-def _perspective(f: Flight, part: str) -> _Moved:
-    return f.path * (f.path @ _axes(f)[_AXES.index(part)])[:, None], None
-
-
-def _twist(f: Flight, part: str) -> _Moved:
-    height = f.path[:, 2:]
-    return np.cross(UP, f.path) * height, np.einsum("nji,nj->ni", f.turning, UP * height)
-
-
-def _rotational_drag(f: Flight, part: str) -> _Moved:
-    return None, turned(f, np.broadcast_to(-f.omega, f.position.shape))
+def _axes(f: Flight) -> dict[str, Array]:
+    return dict(zip(_AXES, (f.along, f.across, UP), strict=True))
 
 
 def _inertia(f: Flight, part: str) -> _Moved:
@@ -150,114 +89,88 @@ def _inertia(f: Flight, part: str) -> _Moved:
     a, b = int(part[-2]) - 1, int(part[-1]) - 1
     E = np.zeros((3, 3))
     E[a, b] = E[b, a] = 1.0
-    omega = np.einsum("nji,j->ni", f.turning, f.omega)
-    torque = -np.cross(omega, omega @ E)
-    return None, turned(f, np.einsum("nij,nj->ni", f.turning, torque))
+    omega = _in_body(f, f.omega)
+    return _twisted(f, np.einsum("nij,nj->ni", f.turning, -np.cross(omega, omega @ E)))
 
 
-def _side_torque(f: Flight, part: str) -> _Moved:
-    return None, turned(f, np.broadcast_to(np.cross(UP, f.omega), f.position.shape))
-
-
-def _clock_offset(f: Flight, part: str) -> _Moved:
-    return f.velocity, None  # positions later than attitudes
-
-
-def _smoothing(f: Flight, part: str) -> _Moved:
-    return np.broadcast_to(-UP * GRAVITY / 24, f.position.shape), None
+def _face_bias(f: Flight, part: str) -> _Moved:
+    a, b = _FACES[int(part)]
+    return _axes(f)[_AXES[a]] * np.abs(f.rotation[:, 2, b])[:, None], None
 
 
 def _nothing(f: Flight, part: str) -> _Moved:
     return None, None
 
 
-_EFFECTS: dict[str, Callable[[Flight, str], _Moved]] = {
-    "gravity": _gravity,
-    "frame_rate": _frame_rate,
-    "length_scale": _length_scale,
-    "tilt": _tilt,
-    "toss_tilt": _toss_tilt,
-    "linear_drag": _linear_drag,
-    "quadratic_drag": _quadratic_drag,
-    "side_force": _side_force,
-    "magnus": _magnus,
-    "frame_rotation": _frame_rotation,
-    "centre_of_mass": _centre_of_mass,
-    "face_bias": _face_bias,
-    "perspective": _perspective,
-    "twist": _twist,
-    "rotational_drag": _rotational_drag,
-    "principal_moments": _inertia,
-    "products_of_inertia": _inertia,
-    "side_torque": _side_torque,
-    "clock_offset": _clock_offset,
-    "smoothing": _smoothing,
-    "table_height": _nothing,
-    "half_width": _nothing,
-    "table_tilt": _nothing,
-    "tag_axes": _nothing,
-}
+def _effect(
+    name: str, kind: str, title: str, unit: str, scale: float, typical: float, parts: dict[str, str],
+    moved: _Move = _nothing, lower: float = -np.inf,
+) -> tuple[Candidate, _Move]:  # fmt: skip
+    """An effect; parts : meaning of each of its quantities by the name's last part."""
+    own = tuple(
+        Quantity(f"{name}.{part}", unit, scale, typical=typical, meaning=meaning, lower=lower)
+        for part, meaning in parts.items()
+    )
+    return Candidate(name, name, kind, title, "", own), moved
 
 
-def _q(name: str, unit: str, scale: float, typical: float, meaning: str, lower: float = -np.inf) -> Quantity:
-    return Quantity(name, unit, scale, typical=typical, meaning=meaning, lower=lower)
-
-
-def _candidates() -> tuple[Candidate, ...]:
-    m, s = "motion", "measurement"
-    return (
-        Candidate("gravity", "gravity", m, "another gravity", "",
-                  (_q("gravity.change", "m/s^2", 0.01, 0.01, "added to the declared one"),)),
-        Candidate("frame_rate", "frame_rate", s, "frame rate wrong", "",
-                  (_q("frame_rate.change", "1", 1e-3, 1e-3, "true over declared, minus 1"),)),
-        Candidate("length_scale", "length_scale", s, "scale of the lengths wrong", "",
-                  (_q("length_scale.change", "1", 1e-3, 0.02, "measured over true, minus 1"),)),
-        Candidate("tilt", "tilt", s, "vertical wrong, the same way in the axes of the file for all tosses", "",
-                  tuple(_q(f"tilt.beta_{a}", "rad", 1e-3, 0.01, f"gravity leans towards {a}") for a in "xy")),
-        Candidate("toss_tilt", "toss_tilt", s, "vertical wrong, the same way in the axes of every toss", "",
-                  tuple(_q(f"toss_tilt.{a}", "rad", 1e-3, 0.01, f"gravity leans {a} the flight")
-                        for a in _AXES[:2])),
-        Candidate("linear_drag", "linear_drag", m, "drag in proportion to the speed", "",
-                  (_q("linear_drag.k", "1/s", 1e-2, 0.03, "deceleration over speed", 0.0),)),
-        Candidate("quadratic_drag", "quadratic_drag", m, "drag in proportion to the square of the speed", "",
-                  (_q("quadratic_drag.k", "1/m", 1e-2, 0.02, "deceleration over speed squared", 0.0),)),
-        Candidate("side_force", "side_force", m, "force across the horizontal velocity, to its left", "",
-                  (_q("side_force.c", "1/s", 1e-2, 0.01, "acceleration over speed"),)),
-        Candidate("magnus", "magnus", m, "lift of the spinning cube (Magnus)", "",
-                  (_q("magnus.c", "1", 1e-3, 0.004, "acceleration over omega x v"),)),
-        Candidate("frame_rotation", "frame_rotation", s, "world axes turn about the vertical", "",
-                  (_q("frame_rotation.rate", "rad/s", 1e-3, 1e-3, "of what is measured"),)),
-        Candidate("centre_of_mass", "centre_of_mass", m, "centre of mass not in the centre of the tags", "",
-                  tuple(_q(f"centre_of_mass.c_{i}", "m", 1e-3, 2e-3, f"along body axis {i}") for i in (1, 2, 3))),
-        Candidate("principal_moments", "principal_moments", m, "moments of inertia not those of a uniform cube", "",
-                  tuple(_q(f"principal_moments.e_{i}{i}", "1", 1e-2, 0.05, f"J_{i} over J_3, minus 1")
-                        for i in (1, 2))),
-        Candidate("products_of_inertia", "products_of_inertia", m, "products of inertia", "",
-                  tuple(_q(f"products_of_inertia.e_{ij}", "1", 1e-2, 0.05, f"J_{ij} over J") for ij in (12, 13, 23))),
-        Candidate("rotational_drag", "rotational_drag", m, "drag of the rotation", "",
-                  (_q("rotational_drag.k", "1/s", 1e-2, 0.01, "deceleration over angular velocity", 0.0),)),
-        Candidate("side_torque", "side_torque", m, "torque that turns the angular velocity about the vertical", "",
-                  (_q("side_torque.c", "1/s", 1e-2, 0.01, "rate of turning"),)),
-        Candidate("twist", "twist", s, "measured place and attitude turn about the vertical with height", "",
-                  (_q("twist.a", "rad/m", 1e-2, 0.01, "angle over height"),)),
-        Candidate("perspective", "perspective", s, "scale of the lengths changes with place", "",
-                  tuple(_q(f"perspective.{a}", "1/m", 1e-3, 5e-3, f"of the scale, {a}") for a in _AXES)),
-        Candidate("face_bias", "face_bias", s, "error of place that depends on which faces look up", "",
-                  tuple(_q(f"face_bias.{i}", "m", 1e-4, 5e-4, f"of {_AXES[a]} by body axis {b + 1}")
-                        for i, (a, b) in enumerate(_FACES))),
-        Candidate("clock_offset", "clock_offset", s, "positions later than attitudes", "",
-                  (_q("clock_offset.delay", "s", 1e-4, 1e-3, "of the positions"),)),
-        Candidate("smoothing", "smoothing", s, "exposure, or smoothing of the positions", "",
-                  (_q("smoothing.T2", "s^2", 1e-6, 1e-5, "square of its duration"),)),
-        Candidate("table_height", "table_height", s, "table not at height zero", "",
-                  (_q("table_height.z", "m", 1e-4, 1e-3, "height of the table"),)),
-        Candidate("half_width", "half_width", s, "half width of the cube wrong", "",
-                  (_q("half_width.change", "m", 1e-4, 5e-4, "true minus declared"),)),
-        Candidate("tag_axes", "tag_axes", s, "axes of the tags turned against those of the cube", "",
-                  tuple(_q(f"tag_axes.turn_{i}", "rad", 1e-4, 5e-3, f"about body axis {i}") for i in (1, 2, 3))),
-        Candidate("table_tilt", "table_tilt", s, "table leans against the vertical", "",
-                  tuple(_q(f"table_tilt.{a}", "rad", 1e-4, 1e-2, f"rises {a} the flight") for a in _AXES[:2])),
-    )  # fmt: skip
-
-
-CANDIDATES = _candidates()
+_M, _S = "motion", "measurement"
+_EFFECTS = (
+    _effect("gravity", _M, "another gravity", "m/s^2", 0.01, 0.01, {"change": "added to the declared one"},
+            lambda f, part: _fallen(f, -UP / GRAVITY)),
+    _effect("frame_rate", _S, "frame rate wrong", "1", 1e-3, 1e-3, {"change": "true over declared, minus 1"},
+            lambda f, part: _fallen(f, 2 * UP)),  # true time is shorter if the true rate is higher
+    _effect("length_scale", _S, "scale of the lengths wrong", "1", 1e-3, 0.02,
+            {"change": "measured over true, minus 1"}, lambda f, part: _fallen(f, -UP)),
+    _effect("tilt", _S, "vertical wrong, the same way in the axes of the file for all tosses", "rad", 1e-3, 0.01,
+            {f"beta_{a}": f"gravity leans towards {a}" for a in "xy"},
+            lambda f, part: _fallen(f, np.eye(3)["xy".index(part[-1])])),
+    _effect("toss_tilt", _S, "vertical wrong, the same way in the axes of every toss", "rad", 1e-3, 0.01,
+            {a: f"gravity leans {a} the flight" for a in _AXES[:2]}, lambda f, part: _fallen(f, _axes(f)[part])),
+    _effect("linear_drag", _M, "drag in proportion to the speed", "1/s", 1e-2, 0.03, {"k": "deceleration over speed"},
+            lambda f, part: _pushed(f, -f.velocity), 0.0),
+    _effect("quadratic_drag", _M, "drag in proportion to the square of the speed", "1/m", 1e-2, 0.02,
+            {"k": "deceleration over speed squared"},
+            lambda f, part: _pushed(f, -f.velocity * np.linalg.norm(f.velocity, axis=1)[:, None]), 0.0),
+    _effect("side_force", _M, "force across the horizontal velocity, to its left", "1/s", 1e-2, 0.01,
+            {"c": "acceleration over speed"}, lambda f, part: _pushed(f, np.cross(UP, f.velocity))),
+    _effect("magnus", _M, "lift of the spinning cube (Magnus)", "1", 1e-3, 0.004, {"c": "acceleration over omega x v"},
+            lambda f, part: _pushed(f, np.cross(f.omega, f.velocity))),
+    # the room turns about the vertical by Omega t: place and attitude turn along, and so does the angular velocity
+    _effect("frame_rotation", _S, "world axes turn about the vertical", "rad/s", 1e-3, 1e-3,
+            {"rate": "of what is measured"},
+            lambda f, part: (np.cross(UP, f.path) * f.time[:, None], _in_body(f, UP * f.time[:, None]))),
+    # the tags' centre is seen, which stands off by minus the offset of the centre of mass
+    _effect("centre_of_mass", _M, "centre of mass not in the centre of the tags", "m", 1e-3, 2e-3,
+            {f"c_{i}": f"along body axis {i}" for i in (1, 2, 3)},
+            lambda f, part: (-f.rotation[:, :, int(part[-1]) - 1], None)),
+    _effect("principal_moments", _M, "moments of inertia not those of a uniform cube", "1", 1e-2, 0.05,
+            {f"e_{i}{i}": f"J_{i} over J_3, minus 1" for i in (1, 2)}, _inertia),
+    _effect("products_of_inertia", _M, "products of inertia", "1", 1e-2, 0.05,
+            {f"e_{ij}": f"J_{ij} over J" for ij in (12, 13, 23)}, _inertia),
+    _effect("rotational_drag", _M, "drag of the rotation", "1/s", 1e-2, 0.01,
+            {"k": "deceleration over angular velocity"}, lambda f, part: _twisted(f, -f.omega), 0.0),
+    _effect("side_torque", _M, "torque that turns the angular velocity about the vertical", "1/s", 1e-2, 0.01,
+            {"c": "rate of turning"}, lambda f, part: _twisted(f, np.cross(UP, f.omega))),
+    _effect("twist", _S, "measured place and attitude turn about the vertical with height", "rad/m", 1e-2, 0.01,
+            {"a": "angle over height"},
+            lambda f, part: (np.cross(UP, f.path) * f.path[:, 2:], _in_body(f, UP * f.path[:, 2:]))),
+    _effect("perspective", _S, "scale of the lengths changes with place", "1/m", 1e-3, 5e-3,
+            {a: f"of the scale, {a}" for a in _AXES},
+            lambda f, part: (f.path * (f.path @ _axes(f)[part])[:, None], None)),
+    _effect("face_bias", _S, "error of place that depends on which faces look up", "m", 1e-4, 5e-4,
+            {f"{i}": f"of {_AXES[a]} by body axis {b + 1}" for i, (a, b) in enumerate(_FACES)}, _face_bias),
+    _effect("clock_offset", _S, "positions later than attitudes", "s", 1e-4, 1e-3, {"delay": "of the positions"},
+            lambda f, part: (f.velocity, None)),
+    _effect("smoothing", _S, "exposure, or smoothing of the positions", "s^2", 1e-6, 1e-5,
+            {"T2": "square of its duration"},
+            lambda f, part: (np.broadcast_to(-UP * GRAVITY / 24, f.position.shape), None)),
+    _effect("table_height", _S, "table not at height zero", "m", 1e-4, 1e-3, {"z": "height of the table"}),
+    _effect("half_width", _S, "half width of the cube wrong", "m", 1e-4, 5e-4, {"change": "true minus declared"}),
+    _effect("tag_axes", _S, "axes of the tags turned against those of the cube", "rad", 1e-4, 5e-3,
+            {f"turn_{i}": f"about body axis {i}" for i in (1, 2, 3)}),
+    _effect("table_tilt", _S, "table leans against the vertical", "rad", 1e-4, 1e-2,
+            {a: f"rises {a} the flight" for a in _AXES[:2]}),
+)  # fmt: skip
+CANDIDATES = tuple(candidate for candidate, _ in _EFFECTS)
+_MOVES = {candidate.name: moved for candidate, moved in _EFFECTS}  # of a flight, by a unit of one of its quantities

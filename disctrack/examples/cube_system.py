@@ -60,7 +60,7 @@ class CubeTosses:
             blocks += [part, np.zeros((1, *part.shape[1:]))]  # a row without data between two flights
             toss += [np.full(len(part) + 1, flight.number)]
             present += [np.full(len(part), 6.0), np.zeros(1)]
-        still, self.resting_sigma = _resting_rows(self.cubes, self.names)
+        still = _resting_rows(self.cubes, self.names)
         everything = np.concatenate([*blocks, still])
         self._columns, self._left = everything[..., :-1], everything[..., -1]
         self._index = {name: i for i, name in enumerate(self.names)}
@@ -98,17 +98,16 @@ class CubeTosses:
         return found
 
 
-def _resting_rows(cubes: Sequence[Resting], names: Sequence[str]) -> tuple[Array, Array]:
-    """Whitened (m, 6, k + 1), four of the six used; standard deviations (4,) of height [m], normal, spin [rad/s].
+def _resting_rows(cubes: Sequence[Resting], names: Sequence[str]) -> Array:
+    """Whitened (m, 6, k + 1), four of the six used: height, normal (two), spin.
 
     How much resting cubes differ once all candidates have taken their share is the noise.
     """
     if len(cubes) < 4 * HELD_OUT:
-        return np.zeros((0, 6, len(names) + 1)), np.full(4, np.nan)
+        return np.zeros((0, 6, len(names) + 1))
     effects = resting_columns(cubes, names)
     left = np.array([[c.height - HALF_WIDTH, *c.normal, c.spin] for c in cubes])
     found = np.zeros((len(cubes), 6, len(names) + 1))
-    sigma = np.full(4, np.nan)
     for i in range(4):
         known = np.isfinite(left[:, i])
         A = effects[known, i][:, np.any(effects[:, i] != 0, axis=0)]
@@ -116,10 +115,10 @@ def _resting_rows(cubes: Sequence[Resting], names: Sequence[str]) -> tuple[Array
         if freedom < 4:
             continue
         rest = left[known, i] - A @ np.linalg.lstsq(A, left[known, i], rcond=1e-10)[0]
-        sigma[i] = np.sqrt(np.sum(rest**2) / freedom)
-        if sigma[i] > 0:
-            found[known, i, :-1], found[known, i, -1] = effects[known, i] / sigma[i], left[known, i] / sigma[i]
-    return found, sigma
+        sigma = np.sqrt(np.sum(rest**2) / freedom)
+        if sigma > 0:
+            found[known, i, :-1], found[known, i, -1] = effects[known, i] / sigma, left[known, i] / sigma
+    return found
 
 
 def _rows(flight: Flight, names: Sequence[str]) -> _Rows:
@@ -203,14 +202,3 @@ def _by_length(rows: Sequence[_Rows], left: Sequence[Array], channels: Sequence[
     return [
         SampleStretch(lines[n].flight.time, np.concatenate(v, axis=1), _line(lines[n].flight)) for n, v in found.items()
     ]
-
-
-def white_chi_square(system: CubeTosses, values: Values) -> dict[str, float]:
-    """Mean square of what is left over the white part of the noise alone, per group: 1 if nothing else were there."""
-    left = system.residuals(values)
-    freedom = sum(len(x) - 2 for x in left)
-    found = {}
-    for name, channels in GROUPS.items():
-        total = sum(float(np.sum(x[:, list(channels)] ** 2)) for x in left)
-        found[name] = total / (freedom * len(channels)) / system.noise[name].white ** 2
-    return found

@@ -6,6 +6,7 @@ Motions come from SciPy's `solve_ivp` with right-hand sides written here a secon
 import json
 import re
 import time as clock
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import disctrack
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
 from disctrack.diagnosis.equations import Equations, Parameter, Run, Term, diagnose, terms
 from disctrack.diagnosis.equations.declared import checked
 from disctrack.diagnosis.equations.formulas import formulas
@@ -56,9 +58,36 @@ def with_friction():
     return diagnose(OSCILLATOR, Run(TIME, {"x": swinging(hidden_friction) + noise}, sigma=SIGMA), FIVE)
 
 
+def test_noise_of_known_memory_and_numbers_of_a_group_of_runs(rng):
+    """Chi-square is that of the covariance; runs of one spring share its stiffness, another spring has its own."""
+    time, noise = np.linspace(0, 3, 40), SmoothNoise(0.01, 0.03, 0.4)
+    equations = Equations({"x": "v", "v": "-k*x"}, {"k": Parameter(4.0, per="spring")})
+    root = np.linalg.cholesky(noise.covariance(time))
+    stiffness = {"a": ("soft", 4.0), "b": ("soft", 4.0), "c": ("stiff", 9.0)}
+    runs = [
+        Run(time, {"x": np.cos(np.sqrt(k) * time) + root @ rng.standard_normal(40)}, name=name, noise=noise,
+            groups={"spring": spring}, fit_until=1.0 if name == "a" else np.inf)
+        for name, (spring, k) in stiffness.items()
+    ]  # fmt: skip
+    answer = diagnose(equations, runs, [terms.coulomb("v")])
+    assert {n for n in answer.values if n.startswith("k")} == {"k[soft]", "k[stiff]"}
+    for spring, k in stiffness.values():
+        assert abs(answer.values[f"k[{spring}]"] - k) < 4 * answer.sigmas[f"k[{spring}]"]
+    assert answer.system.training.sum() == 14 + 40 + 40  # of run a the first second
+    residual, _ = answer.system.linearise(answer.values, [])
+    left = [
+        run.data["x"] - seen[:, 0]
+        for run, (_, seen) in zip(runs, answer.predicted(answer.diagnosis.after), strict=True)
+    ]
+    expected = sum(x @ np.linalg.solve(noise.covariance(time), x) for x in left)
+    assert_allclose(np.sum(residual**2), expected, rtol=1e-6)
+    with pytest.raises(AnalysisError, match="run a needs groups"):
+        diagnose(equations, replace(runs[0], groups={}), [terms.coulomb("v")])
+
+
 def test_sensitivities_are_those_of_another_integrator(rng):
     equations = Equations(
-        {"x": "v", "v": "-k*x - c*v*abs(v) + g*push"}, {"k": 9.0, "c": 0.1, "g": Parameter(2.0, per_run=True)},
+        {"x": "v", "v": "-k*x - c*v*abs(v) + g*push"}, {"k": 9.0, "c": 0.1, "g": Parameter(2.0, per="run")},
         inputs=["push"], observed={"seen": "s*x + 0.1*v"}, constants={"s": 1.5},
     )  # fmt: skip
     offered = [

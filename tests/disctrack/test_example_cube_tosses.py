@@ -119,26 +119,6 @@ def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of
         assert answer.after.forecast_end[group] < 0.5 * answer.before.forecast_end[group]
 
 
-def test_resting_cubes_part_the_scale_from_gravity_alone_but_not_from_gravity_and_size_together(answer):
-    others = {(a.effect, a.instead): a for a in answer.alternatives}
-    assert others["length_scale", ("gravity",)].criterion > 500
-    assert others["length_scale", ("gravity", "half_width")].criterion < 60
-    assert others["toss_tilt", ("frame_rotation",)].criterion > 100
-    assert others["toss_tilt", ("tilt",)].criterion > 500
-
-
-def test_other_columns_and_contacts_of_the_published_tosses_agree(answer):
-    checks = {key.partition(",")[0].partition(" [")[0]: value for key, value in answer.checks.items()}
-    delay, _ = checks["delay of the published velocities"]
-    assert delay == pytest.approx(0.484, abs=0.02)  # differences with the sample before would be half a frame late
-    body, _ = checks["misfit of the published angular velocities if in axes of the body"]
-    world, _ = checks["the same if in axes of the world"]
-    assert body < 0.1 < 1 < world
-    friction, sigma = checks["friction coefficient"]
-    assert friction == pytest.approx(0.211, abs=0.01)
-    assert (friction - 0.18) / sigma > 5  # declared as 0.18
-
-
 def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
     system = answer.system
     all_candidates = system.candidates
@@ -174,7 +154,7 @@ def test_command_writes_diagnosis_and_figure_of_the_tosses(rng, tmp_path, capsys
     assert found["verdict"] == "found"
     assert found["effects"][0]["name"] == "length_scale"
     assert found["after"]["reduced_chi_square"] < 1.15
-    assert found["before"]["held_out"]["rms"]["vertical_um"] > found["after"]["held_out"]["rms"]["vertical_um"]
+    assert found["before"]["rms"]["vertical_um"] > found["after"]["rms"]["vertical_um"]
     assert (tmp_path / "out" / "cube_tosses.png").stat().st_size > 10_000
     assert main([str(tmp_path / "out")]) == 1
     assert "cube_tosses.npz" in capsys.readouterr().err

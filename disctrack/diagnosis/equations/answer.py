@@ -18,7 +18,7 @@ from disctrack.diagnosis.engine.system import System
 from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term
 from disctrack.diagnosis.equations.loop import Answered, ask
-from disctrack.diagnosis.equations.system import EquationSystem
+from disctrack.diagnosis.equations.system import EquationSystem, fitted_rows
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def diagnose(
 ) -> Answer:  # fmt: skip
     """Fit the equations to the runs and look for what they lack.
 
-    runs : they share all parameters, but for those that are declared `per_run`; initial states are each one's own
+    runs : they share all parameters, but for those declared `per` run or group; initial states are each one's own
     terms : what may be missing; the usual terms (`terms.usual`), if none are given
     settings : how hard to look, and how sure to be
     stretch : [s] after which a run begins anew with a state of its own; if not given, as far as the model follows it
@@ -113,7 +113,8 @@ class Answer:
 
         (samples,) = checked(self.equations, [run])
         if not run.name:
-            samples = replace(samples, run=self.system.runs[0])
+            first = self.system.stretches[0]
+            samples = replace(samples, run=first.run, groups=first.groups)
         fit = self.diagnosis.before if before else self.diagnosis.after
         (found,) = self.system.with_(stretches=[samples]).predictions(fit.values)
         shape = (len(samples.time), len(self.system.formulas.channels))
@@ -128,8 +129,7 @@ class Answer:
         if held is not None:
             free = []
             for s, seen in self.predicted(held.train):
-                tested = s.time - s.time[0] > 0.65 * (s.time[-1] - s.time[0])
-                free.append((s.data - seen)[tested])
+                free.append((s.data - seen)[~fitted_rows(s)])
             ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
         noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
         both = zip(names, rms, ahead, noise, strict=True)
@@ -164,37 +164,23 @@ class Answer:
 
     def __str__(self) -> str:
         """The answer, before and after, and remarks."""
-        d = self.diagnosis
+        from disctrack.diagnosis.pages.general import table
+
         lines = [self.sentence, *(f"Note: {note}." for note in self.notes), ""]
         lines.append(f"{'':<30}{'before':>12}{'after':>12}{'noise':>12}")
         for c in self.system.formulas.channels:
             b, a = self.before[c], self.after[c]
             lines.append(f"{f'rms of {c} [{self._unit(c)}]':<30}{b.rms:12.4g}{a.rms:12.4g}{a.noise:12.4g}")
             lines.append(f"{'  free run, held out':<30}{b.held_out:12.4g}{a.held_out:12.4g}")
-        chi = [f.reduced_chi_square / d.noise for f in (d.before, d.after)]
-        lines.append(f"{'chi-square per degree':<30}{chi[0]:12.4g}{chi[1]:12.4g}{1:12}")
-        lines += ["", f"{'fitted':<30}{'value':>14}{'sigma':>12}"]
-        for name in d.after.names:
-            if not name.startswith("state."):
-                lines.append(f"{name:<30}{d.after.values[name]:14.6g}{d.after.sigma(name):12.2g}")
-        lines += ["", f"{'tried':<30}{'gain':>12}  outcome"]
-        for t in d.tried:
-            lines.append(f"{t.candidate.name:<30}{t.score if t.gain is None else t.gain:12.4g}  {t.reason}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *table(self.diagnosis)])
 
     def document(self) -> dict[str, Any]:
         """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
-        from disctrack.diagnosis.pages.general import document, fit_errors
+        from disctrack.diagnosis.pages.general import document
         from disctrack.files.json_text import plain
 
-        d = self.diagnosis
-        sides = []
-        for fit, held, errors in (
-            (d.before, d.held_out_before, self.before),
-            (d.after, d.held_out_after, self.after),
-        ):
-            sides.append(fit_errors(fit, held, d.noise) | {"channels": {c: vars(e) for c, e in errors.items()}})
-        found = document(d, self.equations.name, self.sentence, sides[0], sides[1])
+        sides = [{"channels": {c: vars(e) for c, e in errors.items()}} for errors in (self.before, self.after)]
+        found = document(self.diagnosis, self.equations.name, self.sentence, *sides)
         found |= {
             "notes": list(self.notes),
             "equations": {k: str(v) for k, v in self.equations.rates.items()},

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.arrays import Array
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
 from disctrack.diagnosis.equations.expressions import Formula, checked_name, unknown_name
 from disctrack.errors import AnalysisError
 
@@ -23,7 +24,7 @@ class Parameter:
     sigma: float = np.inf  # standard deviation to which it is known beforehand; infinite: not at all
     lower: float = -np.inf
     upper: float = np.inf
-    per_run: bool = False  # each run has one of its own
+    per: str = ""  # "run": each run has one of its own; a key of the runs' `groups`: each group has
     typical: float | None = None  # of a term: size that would surprise nobody; None: a tenth of the motion's own forces
     shape: bool = False  # of a term's law (an exponent, a scale): held at `value` until the term is found
     meaning: str = ""
@@ -122,6 +123,9 @@ class Run:
     start : states at the first sample from which the fit begins, where the guess from the data is not wanted
     known : states at the first sample that are known: value, or (value, sigma)
     hold : how inputs go on between samples: "smooth" (cubic), "linear", or "hold" (a step at each sample)
+    groups : what the run belongs to, by kind of group: {"ball": "golf"}; a `Parameter(per="ball")` is one of each ball
+    noise : noise that remembers, of every channel, in place of sigma
+    fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run)
     """
 
     time: ArrayLike
@@ -133,6 +137,9 @@ class Run:
     known: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     name: str = ""
     hold: str = "smooth"
+    groups: Mapping[str, str] = field(default_factory=dict)
+    noise: SmoothNoise | None = None
+    fit_until: float | None = None
 
 
 @dataclass(frozen=True)
@@ -150,6 +157,9 @@ class Samples:
     constants: Mapping[str, float]
     start: Mapping[str, float]
     known: Mapping[str, tuple[float, float]]
+    groups: Mapping[str, str]  # by kind, "run" among them
+    noise: SmoothNoise | None = None
+    fit_until: float | None = None
 
     @property
     def name(self) -> str:
@@ -205,6 +215,8 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
     if np.isfinite(data).any(axis=1).sum() < 8:
         raise AnalysisError(f"run {name}: fewer than 8 samples have data.")
     given: Any = {} if run.sigma is None else run.sigma
+    if run.noise is not None:
+        given = float(np.hypot(run.noise.white, run.noise.smooth))
     if not isinstance(given, Mapping):
         given = dict.fromkeys(channels, given)
     for key in given:
@@ -227,7 +239,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
     knots, pieces = _inputs(equations, run, name, time - time[0])
     return Samples(
         name, 0, time - time[0], data, sigma, knots, pieces, run.hold != "smooth", dict(run.constants),
-        dict(run.start), known_states,
+        dict(run.start), known_states, {**run.groups, "run": name}, run.noise, run.fit_until,
     )  # fmt: skip
 
 

@@ -8,11 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Parameter, Samples, Term
 from disctrack.diagnosis.equations.formulas import Formulas
+from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
 MAX_STEPS = 400_000
@@ -56,10 +57,10 @@ class EquationSystem:
             elapsed = s.time - s.time[0]
             self.time[rows], self.time[rows.stop] = elapsed, elapsed[-1]
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
-            self.training[rows] = elapsed <= FIRST_SHARE * elapsed[-1]
+            self.training[rows] = fitted_rows(s)
         self._w = w
         self._defaults = formulas.defaults() | self.widths
-        self.runs = tuple(dict.fromkeys(s.run for s in self.stretches))
+        self._per = {name: p.per for name, (_, p) in formulas.fitted.items() if p.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
 
@@ -91,8 +92,17 @@ class EquationSystem:
     def _quantities(self, name: str, p: Parameter) -> list[Quantity]:
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
         typical = p.typical or self.typical.get(name, np.inf)
-        names = [f"{name}[{run}]" for run in self.runs] if p.per_run else [name]
+        names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
         return [Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical) for n in names]
+
+    def _name(self, name: str, s: Samples) -> str:
+        """Of the quantity that a number is in a stretch. Raises AnalysisError where its run is in no such group."""
+        if name not in self._per:
+            return name
+        kind = self._per[name]
+        if kind not in s.groups:
+            raise AnalysisError(f"run {s.run} needs groups={{{kind!r}: ...}}: {name} is declared for each {kind}.")
+        return f"{name}[{s.groups[kind]}]"
 
     def _candidate(self, term: Term) -> Candidate:
         own = {n: p for n, (_, p) in self.formulas.fitted.items() if n.startswith(f"{term.name}.")}
@@ -114,10 +124,17 @@ class EquationSystem:
             found = self._predict(values, s, [own for _, own in mine])
             if found is None:
                 return np.full_like(residual, np.nan), np.full_like(derivative, np.nan)
+            columns = [i for i, _ in mine]
             present = np.isfinite(s.data)
+            if s.noise is not None:
+                for c in range(self._w):
+                    here = np.flatnonzero(present[:, c])
+                    W, at = s.noise.whitening(s.time[here]), rows.start + here
+                    residual[at, c] = W @ (s.data - found.seen)[here, c]
+                    derivative[at[:, None], c, columns] = W @ found.derivative[here, c]
+                continue
             residual[rows] = np.where(present, (s.data - found.seen) / s.sigma, 0.0)
             weight = np.where(present, 1.0 / s.sigma, 0.0)[..., None]
-            columns = [i for i, _ in mine]
             derivative[rows.start : rows.stop, :, columns] = found.derivative * weight
         return residual, derivative
 
@@ -133,14 +150,14 @@ class EquationSystem:
             if where != s.name:
                 return None
             return -1 - self.formulas.equations.states.index(stem.removeprefix("state."))
-        if bracket and where != s.run:
+        if bracket and self._name(stem, s) != name:
             return None
         return self.formulas.names.index(stem)
 
     def numbers(self, values: Values, s: Samples) -> Array:
         """(n_p,) all numbers of a stretch."""
         known = self._defaults | dict(s.constants)
-        return np.array([values.get(f"{n}[{s.run}]", values.get(n, v)) for n, v in known.items()], float)
+        return np.array([values.get(self._name(n, s), values.get(n, v)) for n, v in known.items()], float)
 
     def start_of(self, values: Values, s: Samples) -> Array:
         """(n,) states at the first sample."""
@@ -226,6 +243,13 @@ class EquationSystem:
         rates, by_number = np.zeros(states.shape), np.zeros((*states.shape, len(p)))
         kernel.rates_all(self.formulas.rhs, times, np.ascontiguousarray(states), p, s.knots, s.pieces, rates, by_number)
         return rates, by_number
+
+
+def fitted_rows(s: Samples) -> Mask:
+    """(n,) True for the samples to which a fit is made that the others judge."""
+    if s.fit_until is not None:
+        return np.asarray(s.time <= s.fit_until, bool)
+    return np.asarray(s.time - s.time[0] <= FIRST_SHARE * (s.time[-1] - s.time[0]), bool)
 
 
 def cut(samples: Sequence[Samples], duration: float) -> list[Samples]:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
-from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.diagnosis.engine.search import Diagnosis
-from disctrack.diagnosis.engine.system import System
 from disctrack.diagnosis.pages.output import effect_json, tried_json
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, Any]:
@@ -33,44 +33,39 @@ def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, 
 
 
 def document(
-    diagnosis: Diagnosis, model: str, sentence: str, before: Mapping[str, Any], after: Mapping[str, Any]
+    d: Diagnosis,
+    model: str,
+    sentence: str,
+    before: Mapping[str, Any] | None = None,
+    after: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """All of a diagnosis in JSON's types; the keys are those that `disctrack diagnose` writes."""
+    """All of a diagnosis in JSON's types; the keys are those that `disctrack diagnose` writes.
+
+    before, after : errors in the system's own units, if it has such
+    """
     return {
-        "verdict": diagnosis.verdict,
+        "verdict": d.verdict,
         "sentence": sentence,
-        "reason": diagnosis.reason,
+        "reason": d.reason,
         "model": model,
-        "effects": [effect_json(f, diagnosis.after) for f in diagnosis.found],
-        "before": dict(before),
-        "after": dict(after),
-        "noise_variance_over_stated": diagnosis.noise,
-        "tried": [tried_json(t) for t in diagnosis.tried],
-        "settings": vars(diagnosis.settings),
+        "effects": [effect_json(f, d.after) for f in d.found],
+        "before": fit_errors(d.before, d.held_out_before, d.noise) | dict(before),
+        "after": fit_errors(d.after, d.held_out_after, d.noise) | dict(after),
+        "noise_variance_over_stated": d.noise,
+        "tried": [tried_json(t) for t in d.tried],
+        "settings": vars(d.settings),
     }
 
 
-def memory(system: System, fit: Fit, lags: int = 5) -> Array:
-    """Autocorrelation (lags, w) of the whitened residual at lags of 1, 2, ... samples, over samples without a gap.
-
-    Without a gap: where rows have as many data as the fullest ones.
-    """
-    residual, full = _full_rows(system, fit)
-    power = np.mean(residual[full] ** 2, axis=0)
-    found = []
-    for lag in range(1, lags + 1):
-        gapless = sliding_window_view(full, lag + 1).all(axis=1)
-        found.append(np.mean((residual[lag:] * residual[:-lag])[gapless], axis=0) / np.where(power > 0, power, 1.0))
-    return np.array(found)
-
-
-def portmanteau(system: System, fit: Fit, lags: int = 5) -> Array:
-    """Box and Pierce's statistic (w,) over all stretches without a gap: chi-square of `lags` degrees without memory."""
-    _, full = _full_rows(system, fit)
-    pairs = np.array([sliding_window_view(full, lag + 1).all(axis=1).sum() for lag in range(1, lags + 1)])
-    return np.asarray(pairs @ memory(system, fit, lags) ** 2, float)
-
-
-def _full_rows(system: System, fit: Fit) -> tuple[Array, Mask]:
-    residual, _ = system.linearise(fit.values, [])
-    return residual, np.asarray(system.weights == system.weights.max(), bool)
+def table(d: Diagnosis) -> list[str]:
+    """Chi-square before and after, fitted numbers, and what was tried, for people."""
+    chi = [f.reduced_chi_square / d.noise for f in (d.before, d.after)]
+    lines = [f"{'chi-square per degree':<30}{chi[0]:12.4g}{chi[1]:12.4g}{1:12}"]
+    lines += ["", f"{'fitted':<30}{'value':>14}{'sigma':>12}"]
+    for name in d.after.names:
+        if not name.startswith("state."):
+            lines.append(f"{name:<30}{d.after.values[name]:14.6g}{d.after.sigma(name):12.2g}")
+    lines += ["", f"{'tried':<30}{'gain':>12}  outcome"]
+    for t in d.tried:
+        lines.append(f"{t.candidate.name:<30}{t.score if t.gain is None else t.gain:12.4g}  {t.reason}")
+    return lines
