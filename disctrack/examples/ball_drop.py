@@ -101,7 +101,11 @@ def read_drops(folder: Path) -> tuple[Drop, ...]:
             except (KeyError, TypeError, ValueError) as error:
                 raise AnalysisError(f"{path}, line {line}: expected ball,drop,t_s,height_m; found {row}.") from error
             rows.setdefault(key, []).append(sample)
-    return tuple(Drop(*key, *np.array(rows[key], float).T, per_cd.get(_key(key[0]), 0.0)) for key in rows)
+    found = []
+    for (ball, number), samples in rows.items():
+        time, height = np.array(samples, float).T
+        found.append(Drop(ball, number, time, height, per_cd.get(_key(ball), 0.0)))
+    return tuple(found)
 
 
 def _key(name: str) -> str:

@@ -32,7 +32,6 @@ SPIN_SIGMA = 2.0  # [rad/s]: the centre then runs on a circle of 1 mm
 K_M = {"steel": 0.381e-7, "glass": 0.28e-7}  # [m s^2] section 5c
 LONGEST = {"steel": 0.5, "glass": 0.3}  # [s] section 4a: time left where the fits of tables 2 and 3 begin
 LAST_STAGE = 1.5  # [s] simulated in section 5c
-STATED_T_F = 0.2e-3  # [s] accuracy that the paper states for t_f
 BRAKING = 0.02  # [s] in which the disc comes to rest on its paper, figure 10
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
 _SHARED = ("air", "body")  # modules of effects that do not depend on the surface
@@ -83,29 +82,22 @@ def published_series() -> tuple[Series, ...]:
     return tuple(series_of(setup_of(s), published_table(s).exponents[:, ORDER]) for s in SURFACES)
 
 
-# What the reading may do wrong: attribute of `Reading` and quantity, by the name of the effect.
-_READING: dict[str, tuple[str, Quantity]] = {
-    "t_f": ("t_f_bias", Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2)),
-    "cut": ("cut_shift", Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02)),
-    "theta_zero": ("theta_zero", Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05))),
-    "height_zero": ("height_zero", Quantity("height_zero.shift", "m", 1e-6, typical=2e-5)),
+# What the reading may do wrong: attribute of `Reading`, quantity, title and source, by the name of the effect.
+_READING = {
+    "t_f": ("t_f_bias", Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2),
+            "the instant called t_f is not that of collapse", "section 4a"),
+    "cut": ("cut_shift", Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02),
+            "the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),
+    "theta_zero": ("theta_zero", Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05)),
+                   "zero of the nutation (plane of the table)", "section 3b: accuracy 0.05 deg"),
+    "height_zero": ("height_zero", Quantity("height_zero.shift", "m", 1e-6, typical=2e-5),
+                    "zero of the height (plane of the table)", "section 3b: accuracy 5 um"),
     "attitude_noise": (
-        "attitude_variance",
-        Quantity("attitude_noise.variance", "rad^2", 1e-8, lower=0.0, typical=np.radians(0.05) ** 2),
-    ),
-    "smoothing": (
-        "smoothing_square",
-        Quantity("smoothing.square", "s^2", 1e-6, lower=0.0, upper=0.06**2, typical=0.01**2),
-    ),
-}
-_TITLES = {
-    "t_f": ("the instant called t_f is not that of collapse", "section 4a"),
-    "cut": ("the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),
-    "theta_zero": ("zero of the nutation (plane of the table)", "section 3b: accuracy 0.05 deg"),
-    "height_zero": ("zero of the height (plane of the table)", "section 3b: accuracy 5 um"),
-    "attitude_noise": ("noise of the attitude, which central differences turn into bias", "section 3b"),
-    "smoothing": ("moving average over the record", "section 3b: 'a differential method'"),
-}
+        "attitude_variance", Quantity("attitude_noise.variance", "rad^2", 1e-8, 0.0, 0.0, typical=np.radians(0.05)**2),
+        "noise of the attitude, which central differences turn into bias", "section 3b"),
+    "smoothing": ("smoothing_square", Quantity("smoothing.square", "s^2", 1e-6, 0.0, 0.0, 0.06**2, typical=0.01**2),
+                  "moving average over the record", "section 3b: 'a differential method'"),
+}  # fmt: skip
 
 
 def at(name: str, surface: str) -> str:
@@ -124,12 +116,10 @@ def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = N
         shared = CATALOGUE[c.effect].__module__.rpartition(".")[2] in _SHARED and not c.threshold
         quantities = c.quantities if shared else tuple(q for own in c.quantities for q in _per_surface(own, surfaces))
         found.append(replace(c, quantities=quantities))
-    for name, (_, quantity) in _READING.items():
-        title, source = _TITLES[name]
+    for name, (_, quantity, title, source) in _READING.items():
         found.append(Candidate(name, name, "measurement", title, source, (quantity,)))
         if len(surfaces) > 1:
-            each = _per_surface(quantity, surfaces)
-            title = f"{title}, each surface its own"
+            each, title = _per_surface(quantity, surfaces), f"{title}, each surface its own"
             found.append(Candidate(f"{name}_each", name, "measurement", title, source, each))
     return tuple(c for c in found if names is None or c.name in names)
 
@@ -141,7 +131,7 @@ class ExponentSystem:
         """Candidates : names of those to look at; all if not given."""
         self.series = tuple(series)
         self.surfaces = tuple(dict.fromkeys(s.setup.surface for s in series))
-        self._candidates = exponent_candidates(self.surfaces, candidates)
+        self.candidates = exponent_candidates(self.surfaces, candidates)  # what the model or the reading may lack
         self._stages: dict[tuple[object, ...], LastStage] = {}
         owner, trial, number = [], [], []
         for i, s in enumerate(self.series):
@@ -159,28 +149,19 @@ class ExponentSystem:
     @property
     def base(self) -> tuple[Quantity, ...]:
         """The paper's k_m and the spin, per surface."""
-        k_m = {
-            name: Quantity(name, "m s^2", 1e-3 * s.setup.k_m, lower=0.0, typical=s.setup.k_m)
+        return tuple(
+            q
             for s in self.series
-            for name in [at("km.k_m", s.setup.surface)]
-        }
-        spin = [
-            Quantity(
-                at(SPIN, s.setup.surface + s.setup.label), "rad/s", 0.01, null=SPIN_AT_REST, prior_sigma=SPIN_SIGMA
+            for q in (
+                Quantity(at("km.k_m", s.setup.surface), "m s^2", 1e-3 * s.setup.k_m, lower=0.0, typical=s.setup.k_m),
+                Quantity(at(SPIN, s.setup.surface), "rad/s", 0.01, SPIN_AT_REST, prior_sigma=SPIN_SIGMA),
             )
-            for s in self.series
-        ]
-        return (*k_m.values(), *spin)
+        )
 
     @property
     def start(self) -> dict[str, float]:
         """Values from which the base fit begins."""
         return {q.name: q.null for q in self.base} | {at("km.k_m", s.setup.surface): s.setup.k_m for s in self.series}
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Effects that the model or the reading may lack."""
-        return self._candidates
 
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
         """Slip: friction coefficients that rolling would just exceed on every surface."""
@@ -194,7 +175,7 @@ class ExponentSystem:
         """Whitened residual (n, 1) and derivative (n, 1, k) by central differences, one-sided at bounds."""
         predicted = [self.outcomes(i, values) for i in range(len(self.series))]
         residual = self._rows([self._data(i) - p for i, p in enumerate(predicted)])
-        known = {q.name: q for q in (*self.base, *(q for c in self._candidates for q in c.quantities))}
+        known = {q.name: q for q in (*self.base, *(q for c in self.candidates for q in c.quantities))}
         derivative = np.zeros((len(residual), len(names)))
         for k, name in enumerate(names):
             q, value = known[name], values.get(name, 0.0)
@@ -223,9 +204,8 @@ class ExponentSystem:
         return rows
 
     def _concerns(self, index: int, name: str) -> bool:
-        plain, mark, owner = name.partition("@")
-        setup = self.series[index].setup
-        return not mark or owner == (setup.surface + setup.label if plain == SPIN else setup.surface)
+        _, mark, owner = name.partition("@")
+        return not mark or owner == self.series[index].setup.surface
 
     def seen_by(self, index: int, values: Values) -> dict[str, float]:
         """Values that one series sees, without the surface in their names; what both have adds up."""
@@ -238,7 +218,7 @@ class ExponentSystem:
 
     def _reading(self, index: int, values: Values) -> Reading:
         own = self.seen_by(index, values)
-        given = {field: own.get(q.name, 0.0) for field, q in _READING.values()}
+        given = {field: own.get(q.name, 0.0) for field, q, *_ in _READING.values()}
         assert set(given) == {f.name for f in fields(Reading)}
         return Reading(**given)
 
@@ -246,7 +226,7 @@ class ExponentSystem:
         own = self.seen_by(index, values)
         spin = own.pop(SPIN, SPIN_AT_REST)
         inverse = own.pop(SLIP, 0.0)
-        reading = {q.name for _, q in _READING.values()}
+        reading = {q.name for _, q, *_ in _READING.values()}
         laws = {name: value for name, value in own.items() if name not in reading and (value or name == "km.k_m")}
         if inverse > 0:
             laws["slip.mu"] = 1 / inverse

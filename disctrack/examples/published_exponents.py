@@ -5,100 +5,245 @@
 The tables give the exponents of nutation, precession rate and energy in t_f - t for nine trials on steel and eight on
 glass. On glass they contradict the paper's 2/3 and -1/3. The engine fits the paper's model to all of them, looks
 through the catalogue of motions and through what the reading may do wrong, and says which effects would remove the
-contradiction, which of them these tables cannot tell apart, and which trials would.
+contradiction, and which of them these tables cannot tell apart.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
-from disctrack.diagnosis import Settings, diagnose
-from disctrack.diagnosis.engine.fit import Fit
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+from calibration.arrays import Array, Mask
+from disctrack.diagnosis import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.held_out import held_out, training_rows
+from disctrack.diagnosis.engine.system import Values
+from disctrack.diagnosis.pages.general import document, table
+from disctrack.diagnosis.pages.words import quantity_text
 from disctrack.examples._command import Outcome, command
-from disctrack.examples.exponent_analysis import (
-    THIN_DISC,
-    Explanation,
-    Fixed,
-    early_stop,
-    explanation,
-    fixed,
-    misfit,
-    misfits,
-    power_shares,
-    scatter,
-)
-from disctrack.examples.exponent_figure import draw
-from disctrack.examples.exponent_plans import PLANS, Plan, pairs, planned_series, separation
-from disctrack.examples.exponent_report import Answer, document, report
+from disctrack.examples.exponent_model import LastStage, Setup
 from disctrack.examples.exponent_system import BRAKING, ExponentSystem, at, published_series
+from disctrack.pages.figures import dress
+from disctrack.pages.palette import INK, MUTED
+from disctrack.published import PREDICTED
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
-COMPARED = ("air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # the more adaptable, the later
-ASKED = ("t_f", *COMPARED)  # looked at, found or not
+ASKED = ("t_f", "air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # looked at, found or not
+THIN_DISC = np.array([PREDICTED[1], PREDICTED[2], PREDICTED[0]])  # n_theta, n_psidot, n_energy
+NAMES = ("n_theta", "n_psidot", "n_energy")
 
 
-def examine(system: ExponentSystem, plans: Sequence[Plan] = PLANS) -> Answer:
+@dataclass(frozen=True)
+class Misfit:
+    """Mean exponents of one surface against a prediction without error."""
+
+    surface: str
+    predicted: Array  # (3,) n_theta, n_psidot, n_energy
+    mean: Array  # (3,)
+    sigma: Array  # (3,) of the mean, from the scatter of the trials
+    t: Array  # (3,) Student's
+    sigmas: Array  # (3,) deviations as a normal variable of the same probability would have them
+    p_value: float  # of all three together, Hotelling's T-squared
+
+    @property
+    def joint_sigmas(self) -> float:
+        """The joint deviation, two-sided, in normal standard deviations."""
+        return float(stats.norm.isf(self.p_value / 2))
+
+
+def misfit(surface: str, exponents: Array, predicted: Array) -> Misfit:
+    """Student's t of each exponent and Hotelling's T-squared of all; exponents (n, 3), predicted (3,)."""
+    n, k = exponents.shape
+    mean, covariance = exponents.mean(axis=0), np.cov(exponents.T) / n
+    difference, sigma = mean - predicted, np.sqrt(np.diag(covariance))
+    t = difference / sigma
+    t_squared = float(difference @ np.linalg.solve(covariance, difference))
+    p = float(stats.f.sf(t_squared * (n - k) / (k * (n - 1)), k, n - k))
+    return Misfit(surface, predicted, mean, sigma, t, np.sign(t) * stats.norm.isf(stats.t.sf(np.abs(t), n - 1)), p)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """An effect fitted to all, or one whose size is known beforehand."""
+
+    name: str
+    fit: Fit
+    sizes: tuple[str, ...]  # its fitted quantities
+    gain: float  # decrease of chi-square against the base model
+    misfits: tuple[Misfit, ...]
+    held_out_gain: dict[str, float] = field(default_factory=dict)  # in 2 log density of the data left out, by split
+
+
+def explanation(
+    system: ExponentSystem, base: Fit, name: str, known: Values | None = None, said: str = ""
+) -> Explanation:
+    """Refit one candidate together with all that the base fit moves, and judge it on data left out.
+
+    known : sizes that are held; the candidate is then fitted beside them, or nothing where its name is empty
+    """
+    extra = tuple(q for c in system.candidates if c.name == name for q in c.quantities)
+    found = fit(system, (*system.base, *extra), base.values | dict(known or {}))
+    misfits = tuple(
+        misfit(s.setup.surface, s.exponents, system.outcomes(i, found.values)[:3]) for i, s in enumerate(system.series)
+    )
+    gains = {}
+    for split, rows in splits(system).items() if known is None else ():
+        without = held_out(system, system.base, base.values, rows)
+        with_it = held_out(system, found.quantities, found.values, rows)
+        sure = without.train.converged and with_it.train.converged
+        gains[split] = 2 * (with_it.log_density - without.log_density) if sure else float("nan")
+    gain = base.cost - found.cost if found.converged else float("nan")
+    return Explanation(said or name, found, tuple(q.name for q in extra), gain, misfits, gains)
+
+
+def splits(system: ExponentSystem) -> dict[str, Mask]:
+    """Rows to fit on, by what is then foretold."""
+    rows = {"later trials": training_rows(system)}
+    for i, surface in enumerate(system.surfaces):
+        rows[surface] = ~((system.number < 3) & (system.owner == i))
+    return rows | {"n_energy": system.number != 2}
+
+
+def early_stop(setup: Setup, theta: float = np.radians(0.5)) -> float:
+    """Time [s] before collapse at which the nutation falls to theta, where the disc comes to lie on its paper."""
+    stage = LastStage(setup, {"km.k_m": setup.k_m})
+    assert stage.curve is not None
+    time = np.linspace(stage.duration - setup.longest, stage.duration - 1e-3, 4000)
+    return float(stage.duration - time[np.argmax(np.exp(stage.curve(time)[:, 0]) < theta)])
+
+
+@dataclass(frozen=True)
+class Answer:
+    """All findings."""
+
+    diagnosis: Diagnosis
+    thin: tuple[Misfit, ...]  # against 2/3, -1/3, 2/3
+    explanations: tuple[Explanation, ...]
+    known: tuple[Explanation, ...]  # sizes that theory or the paper's own words give
+
+    @property
+    def undecided(self) -> tuple[Explanation, ...]:
+        """What was found, and what these tables cannot tell from it."""
+        return tuple(e for e in self.explanations if e.name in _named(self.diagnosis))
+
+
+def _named(diagnosis: Diagnosis) -> list[str]:
+    """Effects that were found, and those that cannot be told from them."""
+    rivals = [r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from]
+    return [*(f.candidate.name for f in diagnosis.found), *rivals]
+
+
+def examine(system: ExponentSystem) -> Answer:
     """Diagnosis of the trials, and everything that is said beside it; ASKED must be among the system's candidates."""
     diagnosis = diagnose(system, system.start, SETTINGS)
     base = diagnosis.before
-    found = [f.candidate.name for f in diagnosis.found]
-    rivals = [r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from]
-    explanations = {n: explanation(system, base, n) for n in dict.fromkeys([*found, *rivals, *ASKED])}
-    own = [{"km.k_m": s.setup.k_m} for s in system.series]
-    stop = tuple(early_stop(s.setup, v) for s, v in zip(system.series, own, strict=True))
-    return Answer(
-        thin=tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series),
-        before=misfits(system, base.values),
-        diagnosis=diagnosis,
-        explanations=explanations,
-        shares={n: power_shares(system, e) for n, e in explanations.items()},
-        fixed=known_sizes(system, base, stop),
-        scatter=tuple(scatter(s, v) for s, v in zip(system.series, own, strict=True)),
-        stop=stop,
-        separations=separations(system, base, explanations, plans) if plans else {},
-    )
-
-
-def known_sizes(system: ExponentSystem, base: Fit, stop: Sequence[float]) -> tuple[Fixed, ...]:
-    """Sizes that theory or the paper's own words give. stop [s] : `early_stop` of each surface."""
-    touch = {at("t_f.bias", s): -before for s, before in zip(system.surfaces, stop, strict=True)}
-    rest = {name: BRAKING + value for name, value in touch.items()}
-    nominal = {"air_bildsten.beta": 1.0}
-    return (
-        fixed(system, base, "t_f where the disc reaches its paper, 0.5 deg", touch),
-        fixed(system, base, f"t_f where it has come to rest on it, {1e3 * BRAKING:.0f} ms later", rest),
-        fixed(system, base, "Moffatt's layer as calculated", {"air_moffatt.f": 1.0}),
-        fixed(system, base, "Bildsten's boundary layers with a factor of one", nominal),
-        fixed(system, base, "the same with t_f fitted", nominal, "t_f_each"),
+    touch = {at("t_f.bias", s.setup.surface): -early_stop(s.setup) for s in system.series}
+    rest, nominal = {name: BRAKING + value for name, value in touch.items()}, {"air_bildsten.beta": 1.0}
+    known = (
+        ("t_f where the disc reaches its paper, 0.5 deg", "", touch),
+        (f"t_f where it has come to rest on it, {1e3 * BRAKING:.0f} ms later", "", rest),
+        ("Moffatt's layer as calculated", "", {"air_moffatt.f": 1.0}),
+        ("Bildsten's boundary layers with a factor of one", "", nominal),
+        ("the same with t_f fitted", "t_f_each", nominal),
         # the paper does not say where its fits end; the curves of its figures do so 0.05 s before t_f
-        fixed(system, base, "fits that end 0.02 s later, with t_f fitted", {"cut.shift": -0.02}, "t_f"),
-        fixed(system, base, "fits that end 0.05 s earlier, with t_f fitted", {"cut.shift": 0.05}, "t_f"),
+        ("fits that end 0.02 s later, with t_f fitted", "t_f", {"cut.shift": -0.02}),
+        ("fits that end 0.05 s earlier, with t_f fitted", "t_f", {"cut.shift": 0.05}),
+    )
+    return Answer(
+        diagnosis,
+        tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series),
+        tuple(explanation(system, base, name) for name in dict.fromkeys([*_named(diagnosis), *ASKED])),
+        tuple(explanation(system, base, free, sizes, said) for said, free, sizes in known),
     )
 
 
-def separations(
-    system: ExponentSystem, base: Fit, explanations: dict[str, Explanation], plans: Sequence[Plan]
-) -> dict[str, dict[tuple[str, str], float]]:
-    """Sigmas between the explanations COMPARED, by plan and pair."""
-    found = {}
-    for plan in plans:
-        planned = planned_series(system, base.values, plan)
-        asked = pairs(COMPARED)
-        found[plan.name] = {(a, b): separation(system, explanations[a], explanations[b], planned) for a, b in asked}
-    return found
+def sentence(answer: Answer) -> str:
+    """The answer in plain words."""
+    if not answer.undecided:
+        return f"Nothing is claimed: {answer.diagnosis.reason}."
+    gains = [e.gain for e in answer.undecided]
+    worst = max(answer.thin, key=lambda m: m.joint_sigmas)
+    after = max(m.joint_sigmas for e in answer.undecided for m in e.misfits)
+    what = "it" if len(gains) == 1 else "each of them alone"
+    text = (
+        f"The trials on {worst.surface} lie {worst.joint_sigmas:.1f} sigma from 2/3, -1/3, 2/3; {what} "
+        f"({', '.join(e.name for e in answer.undecided)}) brings every surface within {after:.1f} sigma, and "
+        f"chi-square down by {min(gains):.0f} to {max(gains):.0f}"
+    )
+    return text + (": not identifiable from these tables." if len(gains) > 1 else ".")
 
 
-def diagnose_exponents() -> Outcome:
+def report(answer: Answer) -> str:
+    """The findings for people."""
+    lines = [sentence(answer), "", "Mean of the trials against 2/3, -1/3, 2/3 (thin disc, slow precession):"]
+    for m in answer.thin:
+        for name, mean, sigma, predicted, s in zip(NAMES, m.mean, m.sigma, m.predicted, m.sigmas, strict=True):
+            lines.append(f"  {m.surface:6}{name:9}{mean:8.4f} +- {sigma:.4f}   {predicted:8.4f}{s:6.1f} sigma")
+        lines.append(f"  {m.surface:6}together {m.joint_sigmas:.1f} sigma (p = {m.p_value:.2g})")
+    lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size; gain in 2 ln p of data left out"]
+    for e in (*answer.explanations, *answer.known):
+        units = {q.name: q.unit for q in e.fit.quantities}
+        sizes = ", ".join(f"{n} = {quantity_text(e.fit.values[n], e.fit.sigma(n), units[n])}" for n in e.sizes)
+        left = ", ".join(f"{m.surface} {m.joint_sigmas:.1f}" for m in e.misfits)
+        gains = ", ".join(f"{split} {gain:.1f}" for split, gain in e.held_out_gain.items())
+        lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes, gains) if x))
+    return "\n".join([*lines, "", *table(answer.diagnosis)])
+
+
+def figure(system: ExponentSystem, answer: Answer) -> Figure:
+    """Per surface: trials, the thin disc's exponents, and what each explanation predicts."""
+    picture = Figure(figsize=(10.5, 4.1), layout="constrained")
+    for i, (axes, series) in enumerate(zip(picture.subplots(1, len(system.series)), system.series, strict=True)):
+        dress(axes)
+        axes.plot(*series.exponents[:, :2].T, ".", color=MUTED, label="trials")
+        axes.plot(*THIN_DISC[:2], "*", color=INK, ms=13, label="thin disc: 2/3, $-$1/3")
+        for e in answer.explanations:
+            axes.plot(*e.misfits[i].predicted[:2], "o", ms=7, alpha=0.8, mec="white", label=e.name)
+        axes.set(xlabel=r"$n_\theta$", ylabel=r"$n_{\dot\psi}$", title=series.setup.surface)
+    axes.legend(fontsize=8, frameon=False)
+    return picture
+
+
+def as_document(answer: Answer) -> dict[str, Any]:
+    """The findings for programs; keys as in the diagnosis.json of a recording, and what only these tables have."""
+
+    def of(m: Misfit) -> dict[str, Any]:
+        kinds = ("mean", "sigma", "predicted", "t")
+        columns = {k: dict(zip(NAMES, map(float, getattr(m, k)), strict=True)) for k in kinds}
+        return {"surface": m.surface, **columns, "p_value": m.p_value, "joint_sigmas": m.joint_sigmas}
+
+    def explained(e: Explanation) -> dict[str, Any]:
+        numbers = {n: {"value": e.fit.values[n], "sigma": e.fit.sigma(n)} for n in e.sizes}
+        exponents = [of(m) for m in e.misfits]
+        return {"name": e.name, "gain": e.gain, "parameters": numbers, "held_out_gain": e.held_out_gain,
+                "exponents": exponents}  # fmt: skip
+
+    model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
+    return document(answer.diagnosis, model, sentence(answer)) | {
+        "source": "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3",
+        "cannot_be_told_apart": [e.name for e in answer.undecided],
+        "against_thin_disc": [of(m) for m in answer.thin],
+        "explanations": [explained(e) for e in answer.explanations],
+        "known_sizes": [explained(e) for e in answer.known],
+    }
+
+
+def example() -> Outcome:
     """Diagnose the published exponents of Ma et al. (2014)."""
     system = ExponentSystem(published_series())
     answer = examine(system)
-    return Outcome(report(answer), document(answer), draw(system, answer))
+    return Outcome(report(answer), as_document(answer), figure(system, answer))
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    return command("published_exponents", None, diagnose_exponents, words)
+    return command("published_exponents", None, example, words)
 
 
 if __name__ == "__main__":

@@ -12,15 +12,7 @@ from disctrack.diagnosis.engine.fit import fit
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
-from disctrack.examples.exponent_analysis import (
-    THIN_DISC,
-    explanation,
-    misfit,
-    misfits,
-    scatter,
-)
 from disctrack.examples.exponent_model import LastStage, Reading, Setup, slope
-from disctrack.examples.exponent_plans import ALUMINIUM_OVER_STEEL, Plan, planned_series, separation
 from disctrack.examples.exponent_system import (
     ExponentSystem,
     Series,
@@ -29,6 +21,7 @@ from disctrack.examples.exponent_system import (
     series_of,
     setup_of,
 )
+from disctrack.examples.published_exponents import THIN_DISC, explanation, misfit
 from disctrack.published import SURFACES
 
 QUICK = replace(published_exponents.SETTINGS, shortlist=3, max_effects=1, judged=2)
@@ -138,10 +131,12 @@ def test_the_nutation_oscillation_moves_the_mean_exponents_less_than_the_trials_
     """What the module promises of leaving it out, and why it cannot make the scatter between trials either."""
     setup = setup_of(surface)
     plain = LastStage(setup, {"km.k_m": setup.k_m}, 1.0)
+    phases = 2 * np.pi * np.arange(8) / 8
     for share, bound in ((0.15, 0.002), (0.3, 0.005)):
-        moving = LastStage(replace(setup, share=share), {"km.k_m": setup.k_m}, 1.0)
-        assert np.abs(moving.outcomes() - plain.outcomes())[:3].max() < bound
-        assert moving.by_phase()[:, :3].std(axis=0).max() < 0.02 * share  # the trials scatter by 0.017 to 0.04
+        setups = [replace(setup, share=share, phase=phase) for phase in phases]
+        moving = np.array([LastStage(s, {"km.k_m": setup.k_m}, 1.0).outcomes()[:3] for s in setups])
+        assert np.abs(moving.mean(axis=0) - plain.outcomes()[:3]).max() < bound
+        assert moving.std(axis=0).max() < 0.02 * share  # the trials scatter by 0.017 to 0.04
 
 
 def fits_of_the_class(found):
@@ -171,20 +166,6 @@ def test_a_planted_layer_of_air_is_found_in_its_class_and_sized(published):
     assert abs(fit_.values["air_bildsten.beta"] - 0.3) < 3 * fit_.sigma("air_bildsten.beta")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("truth", [{"t_f.bias": -0.012}, {"air_bildsten.beta": 0.3}], ids=["t_f", "air_bildsten"])
-def test_trials_with_a_light_disc_name_the_planted_effect_alone(published, truth):
-    """The experiment that the example proposes: on aluminium the air weighs three times as much, and t_f the same."""
-    light = Plan("light", density=ALUMINIUM_OVER_STEEL)
-    both = (*published, *(replace(s, setup=light.setup(s.setup)) for s in published))
-    values = ExponentSystem(both).start | truth
-    system = ExponentSystem(tables(both, values, np.random.default_rng(1), n=16), ("t_f", "air_bildsten"))
-    found = diagnose(system, system.start, QUICK)
-    ((name, value),) = truth.items()
-    assert list(fits_of_the_class(found)) == [name.partition(".")[0]]
-    assert abs(found.after.values[name] - value) < 3 * found.after.sigma(name)
-
-
 def test_nothing_is_claimed_where_nothing_was_planted(published, rng):
     start = ExponentSystem(published).start
     system = ExponentSystem(tables(published, start, rng, n=9), FEW)
@@ -198,8 +179,8 @@ def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(p
     system = ExponentSystem(published)
     base = fit(system, system.base, system.start)
     assert base.converged
-    before = misfits(system, base.values)
-    assert before[1].joint_sigmas > 2.5
+    glass = published[1]
+    assert misfit("glass", glass.exponents, system.outcomes(1, base.values)[:3]).joint_sigmas > 2.5
     explained = [explanation(system, base, name) for name in ("t_f", "air_bildsten")]
     for e in explained:
         assert e.gain > 17
@@ -207,12 +188,6 @@ def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(p
         assert e.held_out_gain["later trials"] > 3
     assert abs(explained[0].gain - explained[1].gain) < 5
     assert_allclose(explained[0].fit.values["t_f.bias"], -0.0103, atol=5e-4)  # 50 times the 0.2 ms that are stated
-    again, light = (
-        separation(system, explained[1], explained[0], planned_series(system, base.values, plan))
-        for plan in (Plan("again"), Plan("light", density=ALUMINIUM_OVER_STEEL))
-    )
-    assert again < 1
-    assert light > 2.5
 
 
 def test_effects_that_cannot_bend_the_law_are_refused_on_the_published_trials(published):
@@ -221,13 +196,6 @@ def test_effects_that_cannot_bend_the_law_are_refused_on_the_published_trials(pu
     found = diagnose(system, system.start, QUICK)
     assert found.before.converged
     assert not found.found
-
-
-def test_the_glass_trials_scatter_as_errors_of_t_f_of_8_ms_would_make_them(published):
-    found = scatter(published[1], {"km.k_m": published[1].setup.k_m})
-    assert found.share > 0.85
-    assert 6e-3 < found.t_f_sigma < 9e-3
-    assert (found.nutation < 0.3 * published[1].exponents.std(axis=0)).all()
 
 
 @pytest.mark.slow
@@ -256,8 +224,4 @@ def test_the_example_says_that_the_tables_do_not_identify_the_effect(tmp_path, c
     for e in found["explanations"]:
         assert e["gain"] > 14.7  # what noise reaches
         assert all(m["joint_sigmas"] < 2 for m in e["exponents"])
-    apart = found["separations_sigma"]
-    worst = {plan: min(p["sigma"] for p in pairs) for plan, pairs in apart.items()}
-    assert worst["the same trials again"] < 1
-    assert worst["disc of aluminium"] > 2
     assert (tmp_path / "published_exponents.png").stat().st_size > 20000

@@ -36,8 +36,8 @@ def document(
     d: Diagnosis,
     model: str,
     sentence: str,
-    before: Mapping[str, Any] | None = None,
-    after: Mapping[str, Any] | None = None,
+    before: Mapping[str, Any] = _NOTHING,
+    after: Mapping[str, Any] = _NOTHING,
 ) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those that `disctrack diagnose` writes.
 
