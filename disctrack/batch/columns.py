@@ -6,6 +6,7 @@ _UNITS = ("m",) * 3 + ("rad",) * 3
 
 # Reduced chi-square of the rolling model with k_m alone; what thousands of dots scatter by is far below.
 LACKS_SOMETHING = 1.5
+FALSE_DISCOVERY = 0.05  # share of false ones among the recordings in which something is said to be missing
 
 # Every column of the summary in order, and what it means.
 COLUMNS: dict[str, str] = {
@@ -40,6 +41,8 @@ COLUMNS: dict[str, str] = {
     },
     "diagnosis": "verdict, where a diagnosis was asked for",
     "diagnosis_sentence": "",
+    "diagnosis_p_value": "probability with which noise alone would let some effect gain as much as the best one does",
+    "diagnosis_false_discovery": "share of false ones among the recordings whose p value is as small (at most)",
     "seconds": "that the measurement took",
     "folder": "of the recording; this and the following paths are relative to the summary's folder",
     "trajectory": "",

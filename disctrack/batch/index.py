@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from disctrack.batch.columns import LACKS_SOMETHING
+from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING
 from disctrack.batch.reasons import reason_of
 from disctrack.batch.together import FOLDER
 from disctrack.files.whole import write_whole
@@ -59,6 +59,14 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
     problems = [
         Markup(f"<b>{text(r['recording'])}</b> ({text(r['status'])}): {text(r['reason'])}") for r in rows if r["reason"]
     ]
+    diagnosed = [row for row in rows if row["diagnosis"]]
+    missing = [row for row in diagnosed if row["diagnosis"] != "nothing missing"]
+    if diagnosed:
+        sure = sum((row["diagnosis_false_discovery"] or 0.0) < FALSE_DISCOVERY for row in missing)
+        said += (
+            f" Something is missing in {len(missing)} of {_counted(len(diagnosed), 'diagnosed recording')}; {sure} of "
+            f"these stand at a rate of false discoveries of {FALSE_DISCOVERY:.0%} over the batch."
+        )
     header = (
         "recording",
         "status",

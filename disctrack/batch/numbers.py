@@ -83,8 +83,12 @@ def friction_numbers(trajectory: Trajectory) -> Numbers:
 
 
 def diagnosed_numbers(document: Mapping[str, Any]) -> Numbers:
-    """Verdict of a diagnosis.json."""
-    return {"diagnosis": str(document.get("verdict", "")), "diagnosis_sentence": str(document.get("sentence", ""))}
+    """Verdict of a diagnosis.json, and the probability of such a gain by chance."""
+    return {
+        "diagnosis": str(document.get("verdict", "")),
+        "diagnosis_sentence": str(document.get("sentence", "")),
+        "diagnosis_p_value": (document.get("chance") or {}).get("p_value"),
+    }
 
 
 def _number(value: Any) -> float | None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import disctrack
-from disctrack.batch.columns import COLUMNS, LACKS_SOMETHING
+from disctrack.batch.columns import COLUMNS, FALSE_DISCOVERY, LACKS_SOMETHING
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places, options_as_json
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
@@ -79,7 +79,7 @@ def write_summary(
 
     folder = places.common
     with _for_writing(folder):
-        rows = rows_of(places, recordings, results)
+        rows = with_false_discovery(rows_of(places, recordings, results))
         document = {
             "schema": SCHEMA,
             "schema_version": SCHEMA_VERSION,
@@ -95,6 +95,16 @@ def write_summary(
         problem = write_index(folder / "index.html", rows, compare=options.report)
     files = tuple(folder / name for name in ("summary.json", "summary.csv", "index.html"))
     return rows, files, (problem,) if problem else ()
+
+
+def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
+    """The rows with the share of false findings among all that are as improbable: the more that look, the more find."""
+    from disctrack.diagnosis.engine.significance import false_discovery  # SciPy's statistics: only where wanted
+
+    tested = [row for row in rows if row["diagnosis_p_value"] is not None]
+    shares = false_discovery([row["diagnosis_p_value"] for row in tested])
+    known = {row["recording"]: float(share) for row, share in zip(tested, shares, strict=True)}
+    return [row | {"diagnosis_false_discovery": known.get(row["recording"])} for row in rows]
 
 
 @contextlib.contextmanager
@@ -151,7 +161,9 @@ def line_of(row: Row, width: int) -> str:
     if None not in rms:
         parts.append(f"rms {max(rms):.4f} px")
     if row["diagnosis"]:
-        parts.append(str(row["diagnosis"]))
+        share = row["diagnosis_false_discovery"]
+        doubt = "" if share is None or share < FALSE_DISCOVERY else f" (of as improbable ones {share:.0%} are chance)"
+        parts.append(f"{row['diagnosis']}{doubt if row['diagnosis'] != 'nothing missing' else ''}")
     if row["reason"]:
         parts.append(f"but {row['reason']}")
     return f"{head}  {', '.join(parts)}"

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.arrays import Mask
+from disctrack.diagnosis.engine.chance import Chance, chance
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.memory import inflation
@@ -103,6 +104,7 @@ class Diagnosis:
     settings: Settings = field(default_factory=Settings)
     partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
+    chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
 
 def diagnose(system: System, start: Values, settings: Settings | None = None, rows: Mask | None = None) -> Diagnosis:
@@ -158,6 +160,7 @@ class _Search:
         before = current
         linear = Linearisation(self.system, base, self.system.candidates)
         scores = score_all(linear, self.system.candidates)
+        by_chance = chance(linear, scores, self.noise) if scores else None
         while len(current.candidates) < self.settings.max_effects:
             better = self._next(current, linear, scores if not current.candidates else None)
             if better is None:
@@ -167,11 +170,11 @@ class _Search:
             self.noise = min(self.noise, self._noise(current.fit))
             linear = Linearisation(self.system, current.fit, self.system.candidates)
         if current.candidates and not self._worth_naming(before, current):
-            return self._answer(before, before, (), scores, partial=current)
+            return replace(self._answer(before, before, (), scores, partial=current), chance=by_chance)
         current = self._standing(current)
         current, rivals = self._settled(current)
         found = tuple(self._found(current, c, rivals[c.name]) for c in current.candidates)
-        return self._answer(before, current, found, scores)
+        return replace(self._answer(before, current, found, scores), chance=by_chance)
 
     def _noise(self, fit_: Fit) -> float:
         stated = self.settings.noise

@@ -1,11 +1,26 @@
-"""How surprising a gain of chi-square is, in the sigmas of a normal number."""
+"""How surprising a gain of chi-square is; and how many of many findings may be false."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import special, stats
 
+from calibration.arrays import Array
+
 LARGE = 500.0  # chi-square beyond which its tail is taken from the asymptotic series: the probability underflows
+
+
+def log_tail(gain: float, n: int) -> float:
+    """Logarithm of the probability with which noise gains so much by n numbers."""
+    if not gain > 0:
+        return 0.0
+    if gain < LARGE:
+        return float(stats.chi2.logsf(gain, n))
+    x, a = gain / 2, n / 2  # Gamma(a, x) = x^(a-1) e^-x (1 + (a-1)/x + (a-1)(a-2)/x^2 + ...)
+    series = 1 + (a - 1) / x + (a - 1) * (a - 2) / x**2 + (a - 1) * (a - 2) * (a - 3) / x**3
+    return float((a - 1) * np.log(x) - x + np.log(series) - special.gammaln(a))
 
 
 def as_sigmas(gain: float, n: int) -> float:
@@ -13,12 +28,18 @@ def as_sigmas(gain: float, n: int) -> float:
 
     No pay is taken here for having looked among many candidates: that is what thresholds are for.
     """
-    if not gain > 0:
-        return 0.0
-    if gain < LARGE:
-        log_tail = float(stats.chi2.logsf(gain, n))
-    else:
-        x, a = gain / 2, n / 2  # Gamma(a, x) = x^(a-1) e^-x (1 + (a-1)/x + (a-1)(a-2)/x^2 + ...)
-        series = 1 + (a - 1) / x + (a - 1) * (a - 2) / x**2 + (a - 1) * (a - 2) * (a - 3) / x**3
-        log_tail = float((a - 1) * np.log(x) - x + np.log(series) - special.gammaln(a))
-    return float(-special.ndtri_exp(log_tail - np.log(2.0)))
+    return float(-special.ndtri_exp(log_tail(gain, n) - np.log(2.0))) if gain > 0 else 0.0
+
+
+def false_discovery(p_values: Sequence[float]) -> Array:
+    """For each of many p values, the share of false ones among all that are as small (Benjamini and Hochberg 1995).
+
+    Who believes every finding whose number is below 0.05 has 5 % false ones among them on average, if their noise is
+    independent or goes together (Benjamini and Yekutieli 2001).
+    """
+    p = np.asarray(p_values, float)
+    order = np.argsort(p)
+    n = len(p)
+    adjusted = np.empty(n)
+    adjusted[order] = np.minimum.accumulate((p[order] * n / np.arange(1, n + 1))[::-1])[::-1]
+    return np.minimum(adjusted, 1.0)

@@ -174,6 +174,7 @@ def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> d
         "after": (_errors(result.after, tuple(a for _, a in longer)) or {})
         | {"parameters": _declared(result.after_fit)},
         "noise_variance_over_stated": diagnosis.noise,
+        "chance": vars(diagnosis.chance) if diagnosis.chance else {},
         "holds": {
             name: None if span is None else vars(span)
             for name, span in (("first", result.regimes.first), ("last", result.regimes.last))
@@ -243,6 +244,11 @@ def lines(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> lis
         f"{f.threshold:.3g}); gain on held-out data {f.held_out_gain:.4g}"
         for f in result.diagnosis.found
     ]
+    if (by_chance := result.diagnosis.chance) is not None:
+        found.append(
+            f"{'chance':<13} noise alone would let some effect gain as much as the best one does with p = "
+            f"{by_chance.p_value:.2g} ({by_chance.tests:.0f} independent ones looked at)"
+        )
     found.append(
         f"{'chi-square':<13} {before.reduced_chi_square:.4g} -> {after.reduced_chi_square:.4g} per degree of freedom; "
         f"{before.rms_px:.4f} -> {after.rms_px:.4f} px rms"
