@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import disctrack
-from disctrack.pages.figures import dress, save_figure
+from disctrack.pages.figures import panels, save_figure
 from disctrack.pages.palette import BLUE, INK
 from disctrack.track.overlay import draw_pair
 
@@ -26,8 +26,7 @@ WIDTH = 900  # px of the copied figures: enough for a page, small enough for a r
 
 def theta_figure(trajectory: disctrack.Trajectory) -> Figure:
     """Nutation over time; below, what remains of it after a smooth curve, with the band of one sigma."""
-    figure = Figure(figsize=(7.6, 4.2), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    figure, (upper, lower) = panels(7.6, 4.2, 2, sharex=True, height_ratios=(2, 1))
     time, theta = trajectory.time, np.degrees(trajectory.q[:, 4])
     sigma = 1e3 * np.degrees(trajectory.coordinate_sigma[:, 4])
     smooth = disctrack.differentiate(trajectory).euler[:, 1]
@@ -37,8 +36,6 @@ def theta_figure(trajectory: disctrack.Trajectory) -> Figure:
     lower.fill_between(time, -sigma, sigma, color=BLUE, alpha=0.3, linewidth=0)
     lower.plot(time, rest, ".", color=INK, markersize=2)
     lower.set(ylabel="θ − smooth (mdeg)", xlabel="time (s)")
-    for axes in (upper, lower):
-        dress(axes)
     return figure
 
 

@@ -30,7 +30,7 @@ from disctrack.diagnosis.equations import Answer, Equations, Parameter, Run, Ter
 from disctrack.diagnosis.equations.system import EquationSystem
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
-from disctrack.pages.figures import dress
+from disctrack.pages.figures import panels
 from disctrack.pages.palette import BLUE, RED
 
 GRAVITY = 9.81  # [m/s^2] as declared
@@ -267,9 +267,7 @@ def report(answer: BallAnswer) -> str:
 
 def figure(answer: BallAnswer) -> Figure:
     """What gravity alone and the best law leave of every drop."""
-    picture = Figure(figsize=(9, 4), layout="constrained")
-    axes = picture.subplots()
-    dress(axes)
+    picture, (axes,) = panels(9, 4)
     sides = ((answer.together.diagnosis.before, RED, "gravity alone"),
              (answer.forms[0].fit, BLUE, _words(answer.forms[0].effects)))  # fmt: skip
     for fitted, colour, label in sides:

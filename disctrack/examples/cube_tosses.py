@@ -25,7 +25,7 @@ from disctrack.examples._command import Outcome, command
 from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Toss, read_tosses
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import GROUPS, HELD_OUT, CubeTosses
-from disctrack.pages.figures import dress
+from disctrack.pages.figures import panels
 from disctrack.pages.palette import BLUE, RED
 
 # The covariance of the noise is that of the data already. Eight effects at most.
@@ -110,13 +110,12 @@ def report(answer: CubeAnswer) -> str:
 
 def figure(answer: CubeAnswer) -> Figure:
     """Mean residual of held-out flights against the time from their middles, before and after."""
-    picture = Figure(figsize=(9, 4), layout="constrained")
+    picture, grid = panels(9, 4, 1, 2)
     held = answer.diagnosis.held_out_after
     flights = answer.system.flights
     test = [i for i, f in enumerate(flights) if f.number % HELD_OUT == HELD_OUT - 1]
     t = np.round(np.concatenate([flights[i].time for i in test]) * FRAME_RATE).astype(int)
-    for axes, name in zip(picture.subplots(1, 2), ("vertical", "across the flight"), strict=True):
-        dress(axes)
+    for axes, name in zip(grid, ("vertical", "across the flight"), strict=True):
         axes.set(title=f"held-out flights, {name}", xlabel="time from the middle [ms]", ylabel="mean residual [um]")
         for values, colour, label in (({}, RED, "before"), (held.train.values if held else {}, BLUE, "after")):
             left = answer.system.residuals(values)

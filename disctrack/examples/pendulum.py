@@ -20,7 +20,7 @@ from calibration.arrays import Array, Mask
 from disctrack.diagnosis.equations import Answer, Equations, Run, Term, diagnose, terms
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
-from disctrack.pages.figures import dress
+from disctrack.pages.figures import panels
 from disctrack.pages.palette import BLUE, MUTED, RED
 
 FITTED_S = 36.668  # by the authors; the rest is their validation
@@ -95,14 +95,12 @@ def example(folder: Path) -> Outcome:
 
 def figure(time: Array, angle: Array, left: dict[str, Array]) -> Figure:
     """The swing, and what the models leave of it: fitted up to the line, foretold after it."""
-    picture = Figure(figsize=(9, 6), layout="constrained")
-    top, bottom = picture.subplots(2, 1, sharex=True)
+    picture, (top, bottom) = panels(9, 6, 2, sharex=True)
     thin = slice(None, None, 10)
     top.plot(time[thin], angle[thin], lw=0.7, color=MUTED)
     for (side, x), colour in zip(left.items(), (RED, BLUE), strict=True):
         bottom.plot(time[thin], 1e3 * x[thin], lw=0.7, color=colour, label=side)
     for axes in (top, bottom):
-        dress(axes)
         axes.axvline(FITTED_S, color=MUTED, lw=1, ls="--")
     top.set(ylabel="angle [rad]")
     bottom.set(ylabel="measured - model [mrad]", xlabel="time [s]")

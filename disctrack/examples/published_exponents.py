@@ -29,7 +29,7 @@ from disctrack.diagnosis.pages.words import quantity_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_model import LastStage, Setup
 from disctrack.examples.exponent_system import BRAKING, ExponentSystem, at, published_series
-from disctrack.pages.figures import dress
+from disctrack.pages.figures import panels
 from disctrack.pages.palette import INK, MUTED
 from disctrack.published import PREDICTED
 
@@ -198,15 +198,14 @@ def report(answer: Answer) -> str:
 
 def figure(system: ExponentSystem, answer: Answer) -> Figure:
     """Per surface: trials, the thin disc's exponents, and what each explanation predicts."""
-    picture = Figure(figsize=(10.5, 4.1), layout="constrained")
-    for i, (axes, series) in enumerate(zip(picture.subplots(1, len(system.series)), system.series, strict=True)):
-        dress(axes)
+    picture, grid = panels(10.5, 4.1, 1, len(system.series))
+    for i, (axes, series) in enumerate(zip(grid, system.series, strict=True)):
         axes.plot(*series.exponents[:, :2].T, ".", color=MUTED, label="trials")
         axes.plot(*THIN_DISC[:2], "*", color=INK, ms=13, label="thin disc: 2/3, $-$1/3")
         for e in answer.explanations:
             axes.plot(*e.misfits[i].predicted[:2], "o", ms=7, alpha=0.8, mec="white", label=e.name)
         axes.set(xlabel=r"$n_\theta$", ylabel=r"$n_{\dot\psi}$", title=series.setup.surface)
-    axes.legend(fontsize=8, frameon=False)
+    grid[-1].legend(fontsize=8, frameon=False)
     return picture
 
 

@@ -21,7 +21,7 @@ from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
 from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.first_look.declare import board_size, some_images
+from disctrack.first_look.declare import board_size, evenly, some_images
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.recording.declaration import CalibrationViews, Recording, read_recording
@@ -152,7 +152,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
         views = find_views(declared.left, declared.right, recording.folder)
         if table.view >= len(views):
             raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
-        chosen = sorted({*_spread(len(views), VIEWS_LOOKED_AT), table.view})
+        chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table.view})
         some = TargetImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen))
         settings = CalibrationSettings()
         found, problems = calibrate_views(
@@ -417,7 +417,3 @@ def _pairs_at(pairs: ImagePairs, indices: list[int], slip: int = 0) -> NDArray:
 
 def _first(images: NDArray) -> NDArray | None:
     return images[0] if len(images) else None
-
-
-def _spread(n: int, most: int) -> list[int]:
-    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})

@@ -160,13 +160,14 @@ def some_images(pattern: str, folder: Path, camera: str = "left") -> list[NDArra
     """A few of one camera's views; they may be in colour. Raises RecordingError."""
     files = match_files(split_member(pattern)[0], folder, camera)
     if len(files) > 1:
-        chosen = [files[i] for i in _spread(len(files), VIEWS_TRIED)]
+        chosen = [files[i] for i in evenly(len(files), VIEWS_TRIED)]
         return [decode(file.read_bytes(), str(file)) for file in chosen]
     reader = open_frames(pattern, folder, camera)
-    return [np.array(reader.read(i)) for i in _spread(len(reader), VIEWS_TRIED)]
+    return [np.array(reader.read(i)) for i in evenly(len(reader), VIEWS_TRIED)]
 
 
-def _spread(n: int, most: int) -> list[int]:
+def evenly(n: int, most: int) -> list[int]:
+    """Numbers of at most `most` of n things, evenly over them."""
     return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
 
 

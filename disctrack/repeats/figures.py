@@ -7,12 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibration.arrays import Array
 from disctrack.analyse.figures import INSET_DURATION, MIN_INSET_SHARE
-from disctrack.pages.figures import Drawn, dress
+from disctrack.pages.figures import Drawn, dress, panels
 from disctrack.pages.palette import AMBER, BLUE, INK, MUTED, SERIES
 from disctrack.repeats.averages import Average
 from disctrack.repeats.compare import ExponentTable, RepeatGroup
@@ -51,9 +50,7 @@ def _lines(axes: Axes, time: Array, values: Array, runs: Sequence[AnalysedRun], 
 
 
 def _nutation(group: RepeatGroup, found: Spread, stem: str) -> Drawn:
-    figure = Figure(figsize=(7.2, 3.8), layout="constrained")
-    axes = figure.add_subplot()
-    dress(axes)
+    figure, (axes,) = panels(7.2, 3.8)
     theta = np.degrees(found.value[:, :, INDEX["theta"]])
     _lines(axes, found.time, theta, group.runs)
     axes.set(xlabel=f"time from {group.alignment.zero} (s)", ylabel="nutation θ (deg)")
@@ -80,10 +77,8 @@ def _shown(name: str, value: float) -> str:
 
 
 def _spread(group: RepeatGroup, found: Spread, stem: str) -> Drawn:
-    figure = Figure(figsize=(9.5, 9.0), layout="constrained")
-    grid = figure.subplots(4, 2, sharex=True)
-    for i, (quantity, axes) in enumerate(zip(QUANTITIES, grid.T.ravel(), strict=True)):
-        dress(axes)
+    figure, grid = panels(9.5, 9.0, 4, 2, sharex=True)
+    for i, (quantity, axes) in enumerate(zip(QUANTITIES, grid[::2] + grid[1::2], strict=True)):
         several = found.common
         for values, colour, label, style in (
             (found.std, INK, "spread of the runs", "-"),
@@ -95,9 +90,9 @@ def _spread(group: RepeatGroup, found: Spread, stem: str) -> Drawn:
                 axes.plot(found.time, shown, color=colour, linestyle=style, linewidth=0.9, label=label)
         axes.set_yscale("log")
         axes.set_ylabel(f"{quantity.symbol} ({quantity.unit})")
-    for axes in grid[-1]:
+    for axes in grid[-2:]:
         axes.set_xlabel(f"time from {group.alignment.zero} (s)")
-    handles, labels = grid[0, 0].get_legend_handles_labels()
+    handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     caption = (
         f"Standard deviation over {len(group.runs)} runs as a function of time. x, y, ψ and φ without a constant "
@@ -107,10 +102,8 @@ def _spread(group: RepeatGroup, found: Spread, stem: str) -> Drawn:
 
 
 def _deviations(group: RepeatGroup, found: Spread, stem: str) -> Drawn:
-    figure = Figure(figsize=(7.2, 6.0), layout="constrained")
-    rows = figure.subplots(3, 1, sharex=True)
+    figure, rows = panels(7.2, 6.0, 3, sharex=True)
     for axes, name in zip(rows, ("theta", "psidot", "energy"), strict=True):
-        dress(axes)
         quantity, i = QUANTITIES[INDEX[name]], INDEX[name]
         several = np.where(found.common, 1.0, np.nan)
         deviation = quantity.scale * (found.value[:, :, i] - found.mean[:, i]) * several
@@ -131,12 +124,10 @@ def fitted_figure(table: ExponentTable, number: int) -> Drawn | None:
     shown = [name for name in FITTED_LABELS if table.averages[name].n > 1]
     if not shown:
         return None
-    figure = Figure(figsize=(9.5, 0.32 * len(table.rows) + 1.6), layout="constrained")
-    grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    figure, grid = panels(9.5, 0.32 * len(table.rows) + 1.6, 1, len(shown), sharey=True)
     groups = list(dict.fromkeys(group for group, _, _ in table.rows))
     height = -np.arange(len(table.rows))
     for axes, name in zip(grid, shown, strict=True):
-        dress(axes)
         scale, mean = FITTED_SCALES[name], table.averages[name]
         value, sigma = mean.best
         axes.axvspan(scale * (value - sigma), scale * (value + sigma), color=MUTED, alpha=0.25, lw=0)

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import signal
 
-from disctrack.pages.figures import Drawn, draw, dress, gallery
+from disctrack.pages.figures import Drawn, draw, gallery, panels
 from disctrack.pages.html import Markup, bullets, page, paragraph, section, table
 from disctrack.pages.palette import BLUE, MUTED, RED
 
@@ -82,8 +81,7 @@ def _number(value: float | None) -> str:
 def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
     """Data and model, and what is left in time and frequency: the first stretches."""
     unit = answer.equations.units.get(name, "")
-    picture = Figure(figsize=(9, 7), layout="constrained")
-    top, middle, bottom = picture.subplots(3, 1)
+    picture, (top, middle, bottom) = panels(9, 7, 3)
     sides = [answer.predicted(f)[:_MOST_STRETCHES] for f in (answer.diagnosis.before, answer.diagnosis.after)]
     for i, ((s, old), (_, new)) in enumerate(zip(*sides, strict=True)):
         thin = slice(None, None, max(1, len(s.time) // _MOST_POINTS))
@@ -103,7 +101,6 @@ def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
     middle.set_yscale("symlog", linthresh=max(3 * answer.after[name].noise, 1e-12))
     bottom.set(xlabel="frequency [Hz]", ylabel="residual per root Hz")
     for axes in (top, middle, bottom):
-        dress(axes)
         if axes.get_legend_handles_labels()[1]:
             axes.legend(frameon=False, fontsize=8)
     caption = f"{name}: measured, modelled, and what is left before and after, in time and in frequency."

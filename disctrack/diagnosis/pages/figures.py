@@ -17,7 +17,7 @@ from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForce
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
-from disctrack.pages.figures import Drawn, dress
+from disctrack.pages.figures import Drawn, dress, panels
 from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -91,8 +91,7 @@ def _frame(axes: Axes, values: Array) -> None:
 def residuals(result: DiscDiagnosis) -> Drawn:
     """Measured minus fitted pose, before and after, with the band of the noise."""
     system, diagnosis = result.system, result.diagnosis
-    figure = Figure(figsize=(9.5, 6.2), layout="constrained")
-    grid = figure.subplots(4, 2, sharex=True)
+    figure, grid = panels(9.5, 6.2, 4, 2, sharex=True)
     rows = [("x", 1e6, "um"), ("y", 1e6, "um"), ("z", 1e6, "um"), ("theta", 1e3 * np.degrees(1), "mdeg")]
     for column, (fit, name, colour) in enumerate(
         ((diagnosis.before, "before", RED), (result.after_fit, "after", BLUE))
@@ -102,13 +101,12 @@ def residuals(result: DiscDiagnosis) -> Drawn:
         theta = np.sum(e1 * delta[:, 3:], axis=1), np.sqrt(np.sum((e1 * sigma[:, 3:]) ** 2, axis=1))
         series = [*((delta[:, i], sigma[:, i]) for i in range(3)), theta]
         for row, ((label, scale, unit), (value, noise)) in enumerate(zip(rows, series, strict=True)):
-            axes = grid[row, column]
-            dress(axes)
+            axes = grid[2 * row + column]
             axes.fill_between(system.time, -2 * scale * noise, 2 * scale * noise, color=GRID, lw=0)
             axes.plot(system.time, scale * value, lw=0.7, color=colour)
             axes.set_ylabel(f"{label} [{unit}]")
-        grid[0, column].set_title(name, fontsize=10, color=INK)
-        grid[-1, column].set_xlabel("time [s]")
+        grid[column].set_title(name, fontsize=10, color=INK)
+        grid[column - 2].set_xlabel("time [s]")
     caption = "Measured minus fitted pose. The grey band is two standard deviations of a frame's noise."
     return Drawn("residuals", "Residual before and after", caption, figure)
 
@@ -116,8 +114,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
 def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
     """Error of the free run over the part that the fit has not seen."""
     system = result.system
-    figure = Figure(figsize=(9.5, 3.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(9.5, 3.4, 1, 2)
     last = system.time[~before.test_rows & (system.weights > 0)].max()
     for held, colour, name in ((before, RED, "before"), (after, BLUE, "after")):
         delta, sigma = system.pose_difference(held.train.values)
@@ -129,7 +126,6 @@ def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
     left.semilogy(system.time, 1e3 * np.linalg.norm(sigma[:, :3], axis=1), lw=1, color=MUTED, label="noise")
     right.semilogy(system.time, np.degrees(noise), lw=1, color=MUTED, label="noise")
     for axes, label in ((left, "error of the position [mm]"), (right, "error of the nutation [deg]")):
-        dress(axes)
         axes.axvline(last, color=AMBER, lw=1)
         axes.set_xlabel("time [s]")
         axes.set_ylabel(label)
@@ -144,9 +140,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     """Gain of each candidate at the base fit, largest first."""
     diagnosis = result.diagnosis
     tried = diagnosis.tried[:N_TRIED]
-    figure = Figure(figsize=(9.5, 0.6 + 0.28 * max(len(tried), 3)), layout="constrained")
-    axes = figure.add_subplot()
-    dress(axes)
+    figure, (axes,) = panels(9.5, 0.6 + 0.28 * max(len(tried), 3))
     gains = [max(t.gain if t.gain is not None else t.score, 1e-2) for t in tried]
     named = {f.candidate.name for f in diagnosis.found}
     alike = {r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from}
@@ -163,13 +157,11 @@ def candidates(result: DiscDiagnosis) -> Drawn:
 
 def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment | None) -> Drawn:
     """Moment that the model fails to supply, with its two-sigma band, and what the effects found add to it."""
-    figure = Figure(figsize=(9.5, 5.4), layout="constrained")
-    grid = figure.subplots(3, 1, sharex=True)
+    figure, grid = panels(9.5, 5.4, 3, sharex=True)
     law = None if of_law is None else (of_law.time, of_law.moment)
     if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
         law = result.system.time, learned_moment(result.system, result.learned.fit, result.learned.law)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        dress(axes)
         value, sigma = 1e6 * missing.moment[:, i], 1e6 * missing.sigma[:, i]
         axes.fill_between(missing.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
         axes.plot(missing.time, value, lw=1.3, color=RED, label="missing")
@@ -200,10 +192,8 @@ def force(result: DiscDiagnosis, measured: ModelFreeForces) -> Drawn:
     """Force on the disc that the model fails to supply, from the accelerations alone, and what was found adds to it."""
     system = result.system
     before, after = force_of(system, result.diagnosis.before), force_of(system, result.after_fit)
-    figure = Figure(figsize=(9.5, 5.4), layout="constrained")
-    grid = figure.subplots(3, 1, sharex=True)
+    figure, grid = panels(9.5, 5.4, 3, sharex=True)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        dress(axes)
         value, sigma = 1e3 * (measured.force - before)[:, i], 1e3 * measured.force_sigma[:, i]
         axes.fill_between(system.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
         axes.plot(system.time, value, lw=1.1, color=RED, label="missing")
@@ -227,9 +217,7 @@ def spectrum(result: DiscDiagnosis) -> Drawn:
     system = result.system
     present = system.weights >= 6
     rate = float(1.0 / np.median(np.diff(system.time)))
-    figure = Figure(figsize=(9.5, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    dress(axes)
+    figure, (axes,) = panels(9.5, 3.2)
     for fit, colour, name in ((result.diagnosis.before, RED, "before"), (result.after_fit, BLUE, "after")):
         residual = system.pose_residual(fit.values)[present]
         if np.isfinite(residual).all():

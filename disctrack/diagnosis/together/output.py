@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from disctrack.diagnosis.engine.search import Diagnosis, Found
@@ -17,7 +16,7 @@ from disctrack.diagnosis.pages.output import effect_json, tried_json
 from disctrack.diagnosis.pages.words import effect_text, quantity_text
 from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.files.json_text import plain
-from disctrack.pages.figures import Drawn, dress
+from disctrack.pages.figures import Drawn, panels
 from disctrack.pages.html import bullets, details, page, paragraph, section, table, warning
 from disctrack.pages.palette import AMBER, BLUE, MUTED
 
@@ -327,9 +326,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
                     points.append((i, a.values[local], sigma))
         if len(points) < 2:
             continue
-        figure = Figure(figsize=(9.5, 2.6), layout="constrained")
-        axes = figure.add_subplot()
-        dress(axes)
+        figure, (axes,) = panels(9.5, 2.6)
         x, y, s = (np.array(c) for c in zip(*points, strict=True))
         value, sigma = after.values[q.name], after.sigma(q.name)
         axes.axhspan(value - 2 * sigma, value + 2 * sigma, color=AMBER, alpha=0.35, lw=0)
