@@ -90,7 +90,9 @@ def test_opencv_corners_at_the_usual_window_are_worse(board_drawer):
     assert error[0] < 0.5 * error[1]
 
 
-@pytest.mark.parametrize("optical_blur", [0.02, 0.1, 0.2])
+@pytest.mark.parametrize(
+    "optical_blur", [0.02, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.slow)]
+)
 def test_edges_sharper_than_the_pixel_are_located_as_well(board_drawer, optical_blur):
     board = Board((9, 6), 8e-3)
     R, t = pose(board, (-35, 10, 33))

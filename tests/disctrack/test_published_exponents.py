@@ -157,6 +157,7 @@ def test_a_planted_bias_of_t_f_is_found_in_its_class_and_sized(published):
     assert abs(fits["t_f"].values["t_f.bias"] + 0.012) < 3 * fits["t_f"].sigma("t_f.bias")
 
 
+@pytest.mark.slow
 def test_a_planted_layer_of_air_is_found_in_its_class_and_sized(published):
     truth = ExponentSystem(published).start | {"air_bildsten.beta": 0.3}
     system = ExponentSystem(tables(published, truth, np.random.default_rng(2)), ("air_bildsten", "theta_zero"))

@@ -33,6 +33,7 @@ def diagnosis_of(recording, *options, model="paper"):
     return json.loads((out / "diagnosis" / "diagnosis.json").read_text())
 
 
+@pytest.mark.slow  # of the default tests, one with an independent motion: test_diagnosis_independent
 def test_pivoting_friction_hidden_in_images_is_found_and_sized(tmp_path):
     recording = render_hidden(
         tmp_path,
