@@ -21,6 +21,7 @@ from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import whole_file
 from disctrack.progress import compiling, progress_bar
+from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import Recording
 from disctrack.track import summary
 
@@ -79,7 +80,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
         )
     return CalibrationSource(
         recording.name,
-        find_views(views.left, views.right, recording.folder),
+        find_views(views.left, views.right, recording.folder, flat_fields(recording)),
         views.target,
         table.view,
         table.board_thickness,

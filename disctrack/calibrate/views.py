@@ -19,6 +19,7 @@ from disctrack.readers import open_frames
 from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
 from disctrack.readers.decoding import decode
 from disctrack.readers.files import file_number, match_files
+from disctrack.readers.flat_field import FlatField, FlatFields, flat_fields
 from disctrack.recording.declaration import Recording
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
@@ -50,6 +51,7 @@ class TargetImages:
 
     left: tuple[View, ...]
     right: tuple[View, ...]
+    fields: FlatFields = (None, None)  # by which grey views of the frames' own size are corrected
 
     def __len__(self) -> int:
         return len(self.left)
@@ -63,7 +65,9 @@ class TargetImages:
     def sha256(self) -> str:
         """SHA-256 (hex) of all views' content, in order."""
         digest = hashlib.sha256()
-        for side in (self.left, self.right):
+        for side, flat in zip((self.left, self.right), self.fields, strict=True):
+            if flat is not None:
+                digest.update(flat.sha256.encode())
             for view in side:
                 if not isinstance(view, FrameView):
                     digest.update(hashlib.sha256(_content(view)).digest())
@@ -72,13 +76,14 @@ class TargetImages:
         return digest.hexdigest()
 
 
-def find_views(left: str, right: str, folder: Path) -> TargetImages:
+def find_views(left: str, right: str, folder: Path, fields: FlatFields = (None, None)) -> TargetImages:
     """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
 
+    fields : of the two cameras, where their views are to be corrected for the pixels' gains and offsets
     Raises RecordingError if they do not pair up.
     """
     sides = [_views_of(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
-    views = TargetImages(*sides)
+    views = TargetImages(sides[0], sides[1], fields)
     numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
     if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
         _refuse_unpaired(views, numbers)
@@ -128,7 +133,7 @@ def calibrate_recording(
             f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
             "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
         )
-    views = find_views(declared.left, declared.right, recording.folder)
+    views = find_views(declared.left, declared.right, recording.folder, flat_fields(recording))
     settings = replace(settings or CalibrationSettings(), tolerances=recording.board_tolerances)
     return calibrate_views(views, declared.target, table.view, table.board_thickness, settings, progress)
 
@@ -155,7 +160,10 @@ def calibrate_views(
     used, problems = [], []
     for i, pair in enumerate(zip(views.left, views.right, strict=True)):
         try:
-            left, right = (_pixels(view, f"{view} (calibration view {i})") for view in pair)
+            left, right = (
+                _pixels(view, f"{view} (calibration view {i})", flat)
+                for view, flat in zip(pair, views.fields, strict=True)
+            )
         except RecordingError as error:
             if i == table_view:
                 raise RecordingError(f"{error} It is the table view: without it there is no lab frame.") from error
@@ -173,9 +181,10 @@ def calibrate_views(
     return found, tuple(problems)
 
 
-def _pixels(view: View, where: str) -> NDArray:
+def _pixels(view: View, where: str, flat: FlatField | None) -> NDArray:
     """Grey values or colours of a view. Raises RecordingError, which begins with `where` or names the frame."""
-    return view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), where)
+    image = view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), where)
+    return flat.corrected(image) if flat is not None and flat.fits(image) else image
 
 
 def _content(file: Path) -> bytes:

@@ -21,7 +21,7 @@ FILE_NAME = RECORDING_FILE
 # Every key that a recording.toml may hold, in the order of the reference example.
 KEYS: dict[str, tuple[str, ...]] = {
     "": ("name", "case", "surface"),
-    "cameras": ("frame_rate_hz", "left", "right", "exposure_us"),
+    "cameras": ("frame_rate_hz", "left", "right", "exposure_us", "left_flat", "left_dark", "right_flat", "right_dark"),
     "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm", "name"),
     "markers": ("diameter_mm", "centres_mm"),
     "calibration": (
@@ -58,6 +58,7 @@ TARGET_KEYS: dict[str, tuple[str, ...]] = {
 OPTIONAL = {
     ("air", "pressure_hPa"),
     ("cameras", "exposure_us"),
+    *(("cameras", f"{camera}_{kind}") for camera in ("left", "right") for kind in ("flat", "dark")),
     ("disc", "name"),
     ("calibration", "target"),
     *(("calibration", key) for keys in TARGET_KEYS.values() for key in keys if key not in TARGET_KEYS["chessboard"]),
@@ -78,6 +79,14 @@ class CalibrationViews:
     left: str  # file pattern relative to the recording's folder
     right: str
     target: Target
+
+
+@dataclass(frozen=True)
+class SensorImages:
+    """What shows the gain and the offset of a camera's pixels: file patterns, or folders of images to be averaged."""
+
+    flat: str | None = None  # an evenly lit surface
+    dark: str | None = None  # no light at all
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,7 @@ class Recording:
     gravity: float  # [m/s^2]
     board_tolerances: BoardTolerances
     declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
+    sensors: tuple[SensorImages, SensorImages] = (SensorImages(), SensorImages())  # left, right
 
     @property
     def file(self) -> Path:
@@ -151,7 +161,15 @@ def read_recording(path: str | Path) -> Recording:
         board_tolerances=_tolerances(file, declared),
         gravity=_Section(file, declared, "gravity").get("g_m_s2", _positive),
         declared=declared,
+        sensors=(_sensor(cameras, "left"), _sensor(cameras, "right")),
     )
+
+
+def _sensor(cameras: _Section, camera: str) -> SensorImages:
+    flat, dark = (
+        cameras.get(key, _pattern) if key in cameras else None for key in (f"{camera}_flat", f"{camera}_dark")
+    )
+    return SensorImages(flat, dark)
 
 
 def _recording_file(path: Path) -> Path:

@@ -24,6 +24,7 @@ from disctrack.readers.base import FrameReader
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
 from disctrack.readers.camera_header import check_headers, header_of
 from disctrack.readers.file_numbers import check_same_numbers
+from disctrack.readers.flat_field import flat_fielded, flat_fields
 from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording.declaration import Recording
 from disctrack.track.motion_span import MotionSpan, find_motion
@@ -88,10 +89,11 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     Raises RecordingError if images are missing, do not belong together, or the range holds no frame; or if a camera's
     own header contradicts the other's, or the declared frame rate.
     """
-    left, right = (
+    readers = [
         open_frames(pattern, recording.folder, camera)
         for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
-    )
+    ]
+    left, right = flat_fielded(readers, flat_fields(recording))
     warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
     check_pair(left, right)
     stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)

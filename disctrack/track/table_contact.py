@@ -150,7 +150,7 @@ def _narrowed(
 ) -> tuple[StereoRig, Array]:
     """Rig and departures of the plane by the disc's sizes (3, 2), what was assumed of either as small as `plane` is.
 
-    Height and slopes each tell of the assumptions that act on them most; nothing becomes larger.
+    Height or slopes, whichever would show it best, tell of an assumption; nothing becomes larger.
     """
     shifts = np.array([a.shift for a in rig.allowances]).reshape(-1, N_RIG)
     of_board = np.array([a.assumed for a in rig.allowances], bool)
@@ -162,7 +162,7 @@ def _narrowed(
 
     def factors(columns: Array) -> Array:
         whole = np.maximum(np.sum(columns**2, axis=1), 1e-300)  # (3,)
-        most = np.argmax(columns**2 / whole[:, None], axis=0)
+        most = np.argmax(columns**2 / told[:, None], axis=0)  # where it would show best
         found: Array = np.sqrt(np.minimum(1.0, seen / whole))[most]
         return found
 

@@ -10,6 +10,7 @@ rays per pixel, blurred there, and gathered to pixels.
 
 import argparse
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -138,10 +139,6 @@ class Camera:
         grid = np.stack(np.meshgrid(np.arange(0, size, 8.0), np.arange(0, size, 8.0)), -1)
         raw = self._raw_field(grid)
         self.field_mean, self.field_scale = raw.mean((0, 1)), faults.lens_field / raw.std((0, 1))
-        fine = (np.arange(size * SUB) + 0.5) / SUB - 0.5
-        pixels = np.stack(np.meshgrid(fine, fine), -1)
-        self.rays = self._rays(pixels)  # (size SUB, size SUB, 2)
-        self.coarse = self._rays(np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).astype(float))
         self.gain = 1 + faults.gains * rng.normal(size=(size, size))
         self.offset = faults.columns * rng.normal(size=size)
         u = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1) / size - 0.5
@@ -152,6 +149,17 @@ class Camera:
         texture = cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), 6.0)
         self.table = 85 + 2 * texture / texture.std()
         self.curve = faults.curve
+
+    @cached_property
+    def rays(self):
+        """(size SUB, size SUB, 2) of the sub-pixels: only images need them."""
+        fine = (np.arange(self.size * SUB) + 0.5) / SUB - 0.5
+        return self._rays(np.stack(np.meshgrid(fine, fine), -1))
+
+    @cached_property
+    def coarse(self):
+        """(size, size, 2) of the pixels."""
+        return self._rays(np.stack(np.meshgrid(np.arange(self.size), np.arange(self.size)), -1).astype(float))
 
     def _raw_field(self, pixels):
         turns = np.einsum("...j,kj->...k", pixels, self.waves)
@@ -403,6 +411,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--frame-rate", type=float, default=1000.0, help="pairs per second")
     parser.add_argument("--theta", type=float, default=12.0, help="nutation at the start [deg]")
     parser.add_argument("--omega3", type=float, default=1.5)
     parser.add_argument("--effect", choices=sorted(EFFECTS), default="none")
@@ -416,7 +425,7 @@ def main():
         faults = replace(IDEAL, **{name: getattr(full, name) for name in kept})
     faults = replace(faults, **dict.fromkeys(asked.without, 0.0))
     plan = Plan(asked.seed, asked.frames, theta_deg=asked.theta, omega3=asked.omega3, effect=asked.effect)
-    write(asked.folder, replace(plan, imperfections=faults))
+    write(asked.folder, replace(plan, frame_rate=asked.frame_rate, imperfections=faults))
 
 
 if __name__ == "__main__":
