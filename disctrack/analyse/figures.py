@@ -13,7 +13,7 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.disc import MA_2014
-from disctrack.pages.figures import Drawn, dress, panels
+from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 BAND = 3.0  # sigmas shown as a band
@@ -46,7 +46,7 @@ def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
 
 
 def _axes(width: float = 7.2, height: float = 3.6) -> tuple[Figure, Axes]:
-    figure, (axes,) = panels(width, height)
+    figure, (axes,) = panels(width, height, margins=NO_TITLE)
     return figure, axes
 
 
@@ -234,7 +234,7 @@ def axial_rates(analysis: Analysis) -> Drawn | None:
     w3, wz = analysis.series("omega_3"), analysis.series("omega_z")
     if _nothing(w3.value):
         return None
-    figure, (upper, lower) = panels(7.2, 4.4, 2, sharex=True)
+    figure, (upper, lower) = panels(7.2, 4.4, 2, margins=NO_TITLE, sharex=True)
     for axes, series, name in ((upper, w3, "ω₃ (rad/s)"), (lower, wz, "ω_z (rad/s)")):
         _band(axes, time, series, 1.0, BLUE, name)
         axes.axhline(0, color=MUTED, linewidth=0.7)
@@ -287,7 +287,7 @@ def energy_parts(analysis: Analysis) -> Drawn | None:
     time = analysis.motion.time
     if _nothing(analysis.series("total").value):
         return None
-    figure, (upper, lower) = panels(7.2, 5.0, 2, sharex=True, height_ratios=(3, 2))
+    figure, (upper, lower) = panels(7.2, 5.0, 2, margins=NO_TITLE, sharex=True, height_ratios=(3, 2))
     parts = (
         ("translation", AMBER, "translation"),
         ("rotation_1", GREEN, "rotation about e₁"),
@@ -311,7 +311,7 @@ def contact_forces(analysis: Analysis) -> Drawn | None:
     time = analysis.motion.time
     if _nothing(analysis.series("force_z").value):
         return None
-    figure, (upper, lower) = panels(7.2, 5.0, 2, sharex=True, height_ratios=(3, 2))
+    figure, (upper, lower) = panels(7.2, 5.0, 2, margins=NO_TITLE, sharex=True, height_ratios=(3, 2))
     for name, colour, label in (("force_z", INK, "F_z"), ("force_n", BLUE, "F_n"), ("force_m", RED, "F_m")):
         _band(upper, time, analysis.series(name), 1.0, colour, label)
     upper.set_ylabel("force (N)")
@@ -426,7 +426,7 @@ def exponents_against_window(analysis: Analysis) -> Drawn | None:
 def pose_quality(analysis: Analysis) -> Drawn:
     """Quality per frame: reprojection error and sigma of the measured poses."""
     trajectory = analysis.trajectory
-    figure, (upper, middle, lower) = panels(7.2, 5.4, 3, sharex=True)
+    figure, (upper, middle, lower) = panels(7.2, 5.4, 3, margins=NO_TITLE, sharex=True)
     time = trajectory.time
     for camera, (name, colour) in enumerate((("left", BLUE), ("right", RED))):
         upper.plot(time, trajectory.reprojection_rms_px[:, camera], ".", color=colour, markersize=2, label=name)

@@ -1,4 +1,4 @@
-"""The report of an analysis: one HTML file that needs nothing else, and its figures as PNG and PDF."""
+"""The report of an analysis: one HTML file that needs nothing else, and, if wanted, its figures as PNG and PDF."""
 
 from __future__ import annotations
 
@@ -30,10 +30,12 @@ SECTIONS = (
 )
 
 
-def write_report(folder: Path, analysis: Analysis, provenance: Provenance) -> tuple[Path, tuple[Path, ...]]:
-    """Write report.html and figures/*.png, *.pdf; returns the report and the figures. Raises OutputError."""
+def write_report(
+    folder: Path, analysis: Analysis, provenance: Provenance, files: bool = False
+) -> tuple[Path, tuple[Path, ...]]:
+    """Write report.html, and figures/*.png, *.pdf if `files`; returns the report and those. Raises OutputError."""
     figures = all_figures(analysis)
-    written, pictures = draw(folder, figures)
+    written, pictures = draw(folder, figures, ("png", "pdf") if files else ())
     path = folder / "report.html"
     write_whole(path, html_report(analysis, provenance, figures, pictures).encode())
     return path, tuple(written)

@@ -65,10 +65,12 @@ def run_analyse(
     window: float = WINDOW,
     circle_duration: float = CIRCLE_DURATION,
     overwrite: bool = False,
+    figures: bool = False,
 ) -> AnalyseOutcome:
-    """Analyse the trajectory file, add the groups to it, write report.html and the figures.
+    """Analyse the trajectory file, add the groups to it, write report.html.
 
     output : folder for the report; without it, `<name>_analysis` beside the file
+    figures : also write every figure of the report as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, OutputError (also when there is a report and not `overwrite`).
     """
     from disctrack.analyse.report import write_report  # matplotlib is wanted here only
@@ -86,8 +88,8 @@ def run_analyse(
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
-    report, figures = write_report(folder, analysis, provenance)
-    return AnalyseOutcome(analysis, path, report, figures)
+    report, written = write_report(folder, analysis, provenance, figures)
+    return AnalyseOutcome(analysis, path, report, written)
 
 
 def _in_words(exponent: Exponent) -> str:

@@ -30,15 +30,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rerun:
         require_rerun(motion)  # at once: the analysis takes a while
     origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
-    told = None if arguments.overwrite or (arguments.rerun and not motion.exists()) else reusable(folder, origin)
-    if told is not None:
+    told = reusable(folder, origin)
+    more = (arguments.rerun and not motion.exists()) or (arguments.figures and not (folder / "figures").is_dir())
+    if told is not None and not (arguments.overwrite or more):
         print(
             "\n".join([f"reused        {folder}: complete result of the same trajectory, settings and version", *told])
         )
         return DONE
-    again = arguments.overwrite or reusable(folder, origin) is not None
+    again = arguments.overwrite or told is not None
     with stage("analyse"):
-        outcome = run_analyse(path, folder, window=arguments.window, circle_duration=arguments.circle, overwrite=again)
+        outcome = run_analyse(path, folder, arguments.window, arguments.circle, again, arguments.figures)
     lines = outcome.lines()
     page = folder / "motion.html"
     with stage("motion.html"):

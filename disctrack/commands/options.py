@@ -110,6 +110,9 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
         help="last seconds for the circle through the contact (default: 0.6)",
     )
     parser.add_argument(
+        "--figures", action="store_true", help="also write every figure of the report as PNG and PDF, into figures/"
+    )
+    parser.add_argument(
         "--rerun",
         action="store_true",
         help="also write motion.rrd for the 3-D viewer (needs rerun-sdk)",

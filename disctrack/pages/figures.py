@@ -20,6 +20,7 @@ from disctrack.pages.html import Markup
 from disctrack.pages.palette import GRID, INK, MUTED
 
 DPI = 150
+NO_TITLE = (0.95, 0.15, 0.55, 0.15)  # margins [in] of labelled axes
 LARGE = 400_000  # [bytes] vector graphics beyond it go into a page as a bitmap: thousands of points
 
 
@@ -45,9 +46,21 @@ def dress(axes: Axes) -> None:
     axes.yaxis.label.set_color(INK)
 
 
-def panels(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, list[Axes]]:
-    """A figure [in] with its axes row by row, dressed; options as for matplotlib's `subplots`."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+def panels(
+    width: float,
+    height: float,
+    rows: int = 1,
+    columns: int = 1,
+    margins: tuple[float, float, float, float] | None = None,
+    **options: Any,
+) -> tuple[Figure, list[Axes]]:
+    """A figure [in] with its axes row by row, dressed; options as for matplotlib's `subplots`.
+
+    margins : as for `lay_out`, where what stands at the edges is known; without them all labels are measured
+    """
+    figure = Figure(figsize=(width, height), layout="constrained" if margins is None else None)
+    if margins is not None:
+        lay_out(figure, (rows, columns), margins, (0.9, 0.2))
     grid = figure.subplots(rows, columns, squeeze=False, **options)
     for axes in grid.flat:
         dress(axes)
@@ -84,14 +97,15 @@ def save_figure(figure: Figure, path: Path) -> Path:
 def draw(
     folder: Path, figures: Sequence[Drawn], kinds: Sequence[str] = ("png", "pdf")
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write figures/*.png, *.pdf (`kinds`); returns them, and a data URI per name. Raises OutputError."""
+    """Write figures/*.png, *.pdf (`kinds`, may be none); returns them, and a data URI per name. Raises OutputError."""
     written: list[Path] = []
     pictures: dict[str, str] = {}
     with rc_context({"font.size": 10, "svg.fonttype": "path", "svg.hashsalt": "disctrack", "mathtext.fontset": "cm"}):
         for drawn in figures:
             FigureCanvasAgg(drawn.figure)
-            drawn.figure.draw_without_rendering()
-            drawn.figure.set_layout_engine("none")  # laid out once, for all formats
+            if (engine := drawn.figure.get_layout_engine()) is not None:
+                engine.execute(drawn.figure)
+                drawn.figure.set_layout_engine("none")  # laid out once, for all formats
             written += [save_figure(drawn.figure, folder / "figures" / f"{drawn.name}.{kind}") for kind in kinds]
             pictures[drawn.name] = _inline(drawn.figure)
     return written, pictures

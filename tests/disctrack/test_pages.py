@@ -66,6 +66,9 @@ def test_a_figure_is_written_whole_and_shown(tmp_path):
     files, pictures = draw(tmp_path, [drawn])
     assert [f.name for f in files] == ["01_line.png", "01_line.pdf"]
     assert (tmp_path / "figures/01_line.pdf").read_bytes().startswith(b"%PDF")
+    files, pictures = draw(tmp_path / "page alone", [drawn], ())
+    assert files == []
+    assert not (tmp_path / "page alone").exists()
     shown = gallery([drawn], pictures)
     assert "data:image/svg+xml;base64," in shown
     assert "rises &amp; falls" in shown

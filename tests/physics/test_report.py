@@ -26,7 +26,7 @@ def reported(tmp_path_factory, true_motion, as_tracked):
     )
     path = folder / "rolling down.h5"
     write_trajectory(path, trajectory, Provenance("rolling <down>", {"left": "0" * 64}, {}))
-    return run_analyse(path, folder / "out")
+    return run_analyse(path, folder / "out", figures=True)
 
 
 def test_report_needs_nothing_else(reported):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
 
 from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.energy import analyse_energy, energy_quantities
@@ -15,6 +16,7 @@ from disctrack.analyse.power_laws import (
     fit_power_laws,
     nutation_ratio,
     power_law_end,
+    prominent_maxima,
 )
 from disctrack.analyse.propagation import MotionState, propagate, rates
 from disctrack.disc import MA_2014
@@ -164,6 +166,14 @@ def test_nutation_ratio_of_this_disc(theta_deg, ratio):
 def test_nutation_ratio_of_a_thin_disc_is_root_three_fifths():
     thin = replace(MA_2014, half_thickness=1e-7)
     assert_allclose(nutation_ratio(1e-3, thin), np.sqrt(0.6), rtol=1e-4)
+
+
+def test_prominent_maxima_are_those_of_scipy(rng):
+    for kind in range(40):
+        series = rng.standard_normal(80).cumsum() if kind % 2 else rng.integers(0, 4, 80).astype(float)  # plateaus
+        for prominence in (0.0, 1.0, 2.5):
+            expected = find_peaks(series, prominence=prominence)[0]
+            np.testing.assert_array_equal(prominent_maxima(series, prominence), expected)
 
 
 def test_counted_ratio_lies_where_theory_puts_it(true_motion):
