@@ -80,7 +80,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
         )
     return CalibrationSource(
         recording.name,
-        find_views(views.left, views.right, recording.folder, flat_fields(recording)),
+        find_views(views.left, views.right, recording.folder, flat_fields(recording.folder, recording.sensors)),
         views.target,
         table.view,
         table.board_thickness,

@@ -133,7 +133,9 @@ def calibrate_recording(
             f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
             "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
         )
-    views = find_views(declared.left, declared.right, recording.folder, flat_fields(recording))
+    views = find_views(
+        declared.left, declared.right, recording.folder, flat_fields(recording.folder, recording.sensors)
+    )
     settings = replace(settings or CalibrationSettings(), tolerances=recording.board_tolerances)
     return calibrate_views(views, declared.target, table.view, table.board_thickness, settings, progress)
 

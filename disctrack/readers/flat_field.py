@@ -26,7 +26,6 @@ from disctrack.frames import CAMERAS
 from disctrack.readers import open_frames
 from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
 from disctrack.readers.files import match_files
-from disctrack.recording.declaration import Recording, SensorImages
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
 MOST_DEAD = 0.01  # of all pixels: more, and it is the flat image that is wrong
@@ -95,11 +94,12 @@ class FlatFielded:
 FlatFields = tuple[FlatField | None, FlatField | None]  # of the left and of the right camera
 
 
-def flat_fields(recording: Recording) -> FlatFields:
-    """Of both cameras of a recording, None where none is declared. Raises RecordingError."""
-    left, right = (
-        _flat_field(images, recording.folder, camera) for images, camera in zip(recording.sensors, CAMERAS, strict=True)
-    )
+def flat_fields(folder: Path, patterns: Sequence[tuple[str | None, str | None]]) -> FlatFields:
+    """Of the left and of the right camera, None where nothing is declared. Raises RecordingError.
+
+    patterns : of each camera its flat and its dark images, relative to `folder`: a file, a pattern, or a folder
+    """
+    left, right = (_flat_field(*images, folder, camera) for images, camera in zip(patterns, CAMERAS, strict=True))
     return left, right
 
 
@@ -177,9 +177,9 @@ def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
     return _Mean(where, mean, clipped > 0.05 * n, n, first.bit_depth, digest.hexdigest())
 
 
-def _flat_field(images: SensorImages, folder: Path, camera: str) -> FlatField | None:
-    flat = None if images.flat is None else _mean(images.flat, folder, camera, "flat")
-    dark = None if images.dark is None else _mean(images.dark, folder, camera, "dark")
+def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, camera: str) -> FlatField | None:
+    flat = None if flat_images is None else _mean(flat_images, folder, camera, "flat")
+    dark = None if dark_images is None else _mean(dark_images, folder, camera, "dark")
     one = flat or dark
     if one is None:
         return None

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
 from calibration.tolerances import BoardTolerances
@@ -81,8 +81,7 @@ class CalibrationViews:
     target: Target
 
 
-@dataclass(frozen=True)
-class SensorImages:
+class SensorImages(NamedTuple):
     """What shows the gain and the offset of a camera's pixels: file patterns, or folders of images to be averaged."""
 
     flat: str | None = None  # an evenly lit surface

@@ -93,7 +93,7 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
         open_frames(pattern, recording.folder, camera)
         for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
     ]
-    left, right = flat_fielded(readers, flat_fields(recording))
+    left, right = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
     warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
     check_pair(left, right)
     stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)

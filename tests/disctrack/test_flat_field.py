@@ -107,7 +107,7 @@ def test_results_depend_on_the_flats_and_views_of_the_same_size_are_corrected(fo
     assert open_pairs(plain).inputs() != open_pairs(corrected).inputs()
     views = [
         find_views("views/left*.png", "views/right*.png", folder, fields)
-        for fields in ((None, None), flat_fields(corrected))
+        for fields in ((None, None), flat_fields(folder, corrected.sensors))
     ]
     assert views[0].sha256() != views[1].sha256()
     one, other = (v.fields[0] for v in views)
@@ -115,13 +115,13 @@ def test_results_depend_on_the_flats_and_views_of_the_same_size_are_corrected(fo
     image = cv2.imread(str(views[0].left[0]), cv2.IMREAD_UNCHANGED)
     assert other.fits(image)
     assert not other.fits(np.zeros((SIZE // 2, SIZE, 3), np.uint8))
-    assert flat_fields(plain) == (None, None)
+    assert flat_fields(folder, plain.sensors) == (None, None)
     raw = open_frames("left/*.png", folder, "left")
     assert type(open_pairs(plain).left) is type(raw)  # nothing stands between where nothing is declared
 
 
 def test_clipped_pixels_stay_clipped(folder):
-    field = flat_fields(declared(folder, ALL))[0]
+    field = flat_fields(folder, declared(folder, ALL).sensors)[0]
     image = np.full((SIZE, SIZE), 255, np.uint8)
     assert np.all(field.corrected(image) == 65535)
     dark = field.corrected(np.zeros((SIZE, SIZE), np.uint8))
