@@ -40,6 +40,10 @@ class Disc:
         """Height of the centre [m] when the rim touches the table, r sin theta + h |cos theta|; theta (...) [rad]."""
         return self.radius * np.sin(theta) + self.half_thickness * np.abs(np.cos(theta))
 
+    def arm_to_contact(self, e2: Array, e3: Array) -> Array:
+        """r_OA = -r e2 - h e3 (..., 3) [m] from the centre to the contact, in the axes of e2 and e3 (..., 3)."""
+        return -self.radius * e2 - self.half_thickness * e3
+
     @property
     def n_markers(self) -> int:
         """Number of dots on the upper face."""

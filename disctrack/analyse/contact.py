@@ -74,7 +74,7 @@ class Circle:
 def r_OA(state: MotionState, disc: Disc) -> Array:
     """Arm (n, 3) from the centre to the contact, world axes [m]."""
     _, e2, e3 = state.axes()
-    return -disc.radius * e2 - disc.half_thickness * e3
+    return disc.arm_to_contact(e2, e3)
 
 
 def contact_velocity_material(state: MotionState, disc: Disc) -> Array:

@@ -238,7 +238,7 @@ def _blocks(motion: MeasuredMotion, size: int) -> tuple[Array, Array]:
     good = motion.known & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
     if good.sum() < size or np.ptp(psi[good]) < MIN_TURN:
         return np.empty(0), np.empty(0)
-    arm = -disc.radius * e2 - disc.half_thickness * e3
+    arm = disc.arm_to_contact(e2, e3)
     along = np.sum(motion.omega_world * e3, axis=1)[:, None] * e3
     spin = J1 * motion.omega_world + (J3 - J1) * along
     change = J1 * motion.alpha_world + (J3 - J1) * np.sum(motion.alpha_world * e3, axis=1)[:, None] * e3

@@ -2,8 +2,8 @@
 
 Base model: the centre of the tags is the centre of mass and falls with the declared gravity; a uniform cube turns at a
 constant angular velocity. Place, velocity, attitude and angular velocity are each flight's own: they are cleared out,
-so that a sample is judged by what the samples before it in the same flight foretell of it (recursive residuals). Every
-effect is small; its residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
+and what is judged are the combinations of a flight's samples that these cannot move. Every effect is small; its
+residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ GROUPS = {"horizontal": (0, 1), "vertical": (2,), "turn": (3, 4, 5)}  # channels
 HELD_OUT = 3  # every third toss
 _START = {"horizontal": SmoothNoise(2e-5, 5e-5, 0.03), "vertical": SmoothNoise(2e-5, 3e-5, 0.03),
           "turn": SmoothNoise(2e-4, 3e-4, 0.03)}  # fmt: skip
-_DIFFUSE = 1e6  # variance of a flight's own numbers over that of the noise, before they are cleared exactly
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class _Rows:
 
 
 class CubeTosses:
-    """Poses in free flight, one row a sample (its first two foretell nothing), then heights at rest, one row a toss."""
+    """Poses in free flight, two rows fewer than samples in each, then heights at rest, one row a toss."""
 
     base: tuple[Quantity, ...] = ()
     candidates: tuple[Candidate, ...] = CANDIDATES
@@ -145,18 +144,10 @@ def _cleared(left: Array, rows: _Rows, seen: Mask) -> Array:
     return left - np.concatenate([place, own @ amount], axis=1)
 
 
-def recursive_whitening(covariance: Array, basis: Array) -> Array:
-    """W (m - k, m): rows blind to the basis (m, k), W covariance W^T = 1, row i made of the samples up to k + i.
-
-    With a diffuse prior on the basis the Cholesky factor predicts each sample from those before it; the first k
-    foretell nothing. What the finite prior leaves is projected out.
-    """
-    k = basis.shape[1]
-    scaled = basis / np.linalg.norm(basis, axis=0) * np.sqrt(len(basis) * np.trace(covariance) / len(basis))
-    root = np.linalg.cholesky(covariance + _DIFFUSE * scaled @ scaled.T)
-    W = np.linalg.inv(root)[k:]
-    Q = np.linalg.qr(basis)[0]
-    return np.asarray(W - (W @ Q) @ Q.T, float)
+def whitening_blind_to(basis: Array, covariance: Array) -> Array:
+    """W (m - k, m) with W basis = 0 for a basis (m, k), and W covariance W^T = 1."""
+    W = np.linalg.inv(np.linalg.cholesky(covariance))
+    return np.asarray(np.linalg.qr(W @ basis, mode="complete")[0][:, basis.shape[1] :].T @ W, float)
 
 
 def _whitened(rows: _Rows, noise: Mapping[str, SmoothNoise]) -> Array:
@@ -167,10 +158,10 @@ def _whitened(rows: _Rows, noise: Mapping[str, SmoothNoise]) -> Array:
     for name, channels in GROUPS.items():
         K = noise[name].covariance(rows.flight.time)
         if name == "turn":
-            W = recursive_whitening(np.asarray(np.kron(K, np.eye(3)), float), rows.own.reshape(-1, 6))
+            W = whitening_blind_to(rows.own.reshape(-1, 6), np.asarray(np.kron(K, np.eye(3)), float))
             found[:, 3:] = (W @ everything[:, 3:].reshape(3 * n, k)).reshape(n - 2, 3, k)
         else:
-            W = recursive_whitening(K, _line(rows.flight))
+            W = whitening_blind_to(_line(rows.flight), K)
             for c in channels:
                 found[:, c] = W @ everything[:, c]
     return found

@@ -19,7 +19,6 @@ from disctrack.render import render_disc, rig_after_faults
 from disctrack.scene.description import CameraFault, Faults, Scene
 from disctrack.track.tracking import Tracking
 from disctrack.validate.comparison import PoseErrors, compare
-from disctrack.validate.poses import centre_height
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, LOST_ALLOWED, stress_poses
 from disctrack.validate.trial import every, locate
 
@@ -128,7 +127,7 @@ def _alarms(tracking: Tracking, comparison: PoseErrors, q: Array, disc: Disc) ->
     shift = np.linalg.norm(tracking.as_built.marker_shift, axis=1)
     if shift.max() > ALARM_SHIFT:
         alarms.append(f"dot {int(shift.argmax())} refined by {1e3 * shift.max():.3f} mm")
-    gap = q[:, 2] - centre_height(q[:, 4], disc)
+    gap = q[:, 2] - disc.resting_height(q[:, 4])
     rms = float(np.sqrt(np.nanmean(gap**2)))
     if rms > ALARM_GAP:
         alarms.append(f"rim {1e3 * rms:.3f} mm off the table")

@@ -19,11 +19,6 @@ SMALLEST_SEMI_MINOR_PX = 3.2  # a dot seen flatter than this is all edge: its bl
 FEWEST_DOTS = 3  # two numbers each, six unknowns
 
 
-def centre_height(theta: Array, disc: Disc) -> Array:
-    """Height [m] of the disc's centre while its rim touches the table: r sin(theta) + h cos(theta)."""
-    return disc.radius * np.sin(theta) + disc.half_thickness * np.cos(theta)
-
-
 def static_poses(n: int, rig: StereoRig, disc: Disc, middle: tuple[float, float], rng: np.random.Generator) -> Array:
     """(n, 6) poses q on the table, by increasing nutation: strata in turn, all psi and phi, anywhere in the field.
 
@@ -42,7 +37,7 @@ def _pose(i: int, rig: StereoRig, disc: Disc, middle: tuple[float, float], rng: 
         # the field shrinks slowly, for small images and long strides of the rim
         reach = FIELD_RADIUS * np.sqrt(rng.uniform()) * (1 - attempt / 500)
         x, y = middle[0] + reach * np.cos(direction), middle[1] + reach * np.sin(direction)
-        q = np.array([x, y, centre_height(theta, disc), psi, theta, phi])
+        q = np.array([x, y, disc.resting_height(theta), psi, theta, phi])
         if _inside(q, rig, disc):
             return q
     raise SceneError(

@@ -21,7 +21,7 @@ from disctrack.regular_precession import precession_rate
 from disctrack.render import render_disc
 from disctrack.scene.description import GlareSettings, Occluder, Scene
 from disctrack.validate.comparison import compare
-from disctrack.validate.poses import cameras_in_sight, centre_height
+from disctrack.validate.poses import cameras_in_sight
 from disctrack.validate.trial import every, locate
 
 CLAIM_POSITION = 5e-6  # [m] and
@@ -129,7 +129,7 @@ def stress_poses(n: int, rig: StereoRig, scene: Scene, rng: np.random.Generator)
     for theta in thetas:
         for _ in range(200):
             x, y = np.array(scene.rig.target_mm[:2]) * 1e-3 + rng.uniform(-8e-3, 8e-3, 2)
-            q = np.array([x, y, centre_height(theta, disc), rng.uniform(-np.pi, np.pi), theta, rng.uniform(0, 6)])
+            q = np.array([x, y, disc.resting_height(theta), rng.uniform(-np.pi, np.pi), theta, rng.uniform(0, 6)])
             if cameras_in_sight(q[None], rig, disc)[0] == 2:
                 break
         found.append(q)

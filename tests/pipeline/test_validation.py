@@ -12,7 +12,7 @@ from disctrack.render import render_disc, rig_of
 from disctrack.validate import QUICK, complaints, scene_of, summarise, validate, verdict, write_validation
 from disctrack.validate.bound import camera_maps, dot_pixels, pose_bound
 from disctrack.validate.comparison import compare, joined, noise_consistency
-from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, centre_height, static_poses
+from disctrack.validate.poses import STRATA_DEG, cameras_in_sight, static_poses
 from disctrack.validate.run import ValidationPlan
 from disctrack.validate.stress import (
     CLAIM_POSITION,
@@ -273,7 +273,7 @@ def test_exposure_shortens_the_nutation_by_the_law_of_the_mean(rng):
     rig, disc = rig_of(scene), scene.declared_disc
     q = np.repeat(stress_poses(4, rig, scene, rng), 3, axis=0)
     q[:, 4] = np.radians(10)
-    q[:, 2] = centre_height(q[:, 4], disc)
+    q[:, 2] = disc.resting_height(q[:, 4])
     q[:, 3] += np.tile([0.0, 2.1, 4.2], 4)
     rates, exposure = rolling_rates(q, disc, 9.81), 0.9e-3
     expected = np.sin(q[:, 4]) * (rates[:, 3] * exposure) ** 2 / 24

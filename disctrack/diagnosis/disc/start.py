@@ -47,7 +47,7 @@ def first_slip(time: Array, q: Array, disc: Disc) -> float:
     """Horizontal speed [m/s] of the disc's point at the contact at the first instant; rolling has none."""
     coefficients, (psi, theta, _) = _cubic(time, q)
     _, e2, e3 = nodal_axes_world(psi, theta)
-    arm = -disc.radius * e2 - disc.half_thickness * e3
+    arm = disc.arm_to_contact(e2, e3)
     slip = coefficients[1, :3] + np.cross(coefficients[1, 3:], arm)
     return float(np.hypot(*slip[:2]))
 
