@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration import _corner_kernel, compiled, corner_fit
 from disctrack.readers import _png
+from disctrack.rolling import integrate
 from disctrack.track import _kernels, following
 
 PREPARED = (
@@ -22,6 +23,8 @@ PREPARED = (
     (_png._undo_filters, _png.prepare),
     (_kernels.track_frames, lambda: following.prepare(np.uint8)),
     (_kernels.track_frames, lambda: following.prepare(np.uint16)),
+    (integrate._dop853, lambda: integrate.prepare(float)),
+    (integrate._dop853, lambda: integrate.prepare(complex)),
 )
 
 TYPES_IN_WORDS = 5  # of what numba keeps after the library

@@ -10,12 +10,13 @@ from calibration import corner_fit
 from disctrack.commands import DONE
 from disctrack.progress import compiling
 from disctrack.readers import _png as png
+from disctrack.rolling import integrate
 from disctrack.track import _kernels as kernels
 from disctrack.track.following import prepare
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile what reading, calibrating and tracking use; returns the exit code."""
+    """Compile what reading, calibrating, tracking and simulating use; returns the exit code."""
     with compiling("readers", 1):
         png.prepare()
     with compiling("corners", "1 to 8"):
@@ -24,5 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
         prepare(np.uint8)
     with compiling("tracking, 16 bit", "5 to 20"):
         prepare(np.uint16)
+    with compiling("the integrator of motions", "2 to 20"):
+        integrate.prepare(float)
+        integrate.prepare(complex)
     print(f"inner loops are compiled; kept in {kernels.track_frames.stats.cache_path}")
     return DONE

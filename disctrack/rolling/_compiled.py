@@ -13,41 +13,11 @@ from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import from_dtype, types
-from numba.extending import intrinsic, register_jitable
+from numba.extending import register_jitable
 
 from calibration.compiled import cfunc
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
-
-
-def _call_by_address(n_pointers: int) -> Callable[..., Any]:
-    """Intrinsic call(address, p1, ..., pn): calls the C function void(void*, ..., void*) at `address`."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = ir.IntType(8).as_pointer()
-        function = ir.FunctionType(ir.VoidType(), [pointer] * n_pointers)
-        target = builder.inttoptr(args[0], function.as_pointer())
-        builder.call(target, [builder.inttoptr(a, pointer) for a in args[1:]])
-        return context.get_dummy_value()
-
-    return codegen
-
-
-@intrinsic
-def _call_law(typingctx, address, p, s, w):  # type: ignore[no-untyped-def]
-    """Law at `address` with its parameters, the kinematics and the wrench, all as addresses."""
-    return types.void(types.int64, types.int64, types.int64, types.int64), _call_by_address(3)
-
-
-@intrinsic
-def _call_system(typingctx, address, t, y, out, a0, a1, a2, a3):  # type: ignore[no-untyped-def]
-    """System function f(t, y, out, a0, a1, a2, a3) at `address`; all arguments are addresses."""
-    return types.void(*[types.int64] * 8), _call_by_address(7)
-
-
-call_law: Any = _call_law  # the type checker takes an intrinsic for what numba calls while compiling
-call_system: Any = _call_system
 
 
 def _pointer(scalar: type) -> types.Type:

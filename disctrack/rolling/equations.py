@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from calibration.compiled import njit
-from disctrack.rolling._compiled import call_law
+from disctrack.rolling._addresses import call_law
 
 ROLLING, SLIPPING, FLYING = 0, 1, 2
 EVENTS = ("theta_end", "load", "grip", "upright")

@@ -12,15 +12,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import typeof
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from calibration.arrays import Array
 from calibration.compiled import njit
-from disctrack.rolling._compiled import call_system
+from disctrack.rolling._addresses import call_system
 
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
 RTOL_IMAGINARY = 1e-7  # error of fifth order per step; the derivatives then hold to about 1e-9 of their size
+
+_part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
 
 _N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 serve the dense output
 _A_ALL = np.zeros((_N + 4, _N + 4))
@@ -66,10 +69,25 @@ def integrate(
 
     grid : (n_grid,) increasing, none before t0.   atol : (n,)
     """
+    passed = _passed(system, t0, y0, grid, rtol, atol, max_steps)
+    solution, _, t_last, y_last = passed[-4:]
+    status, n_filled, event, n_steps = _dop853(*passed)
+    return SolvedStretch(status, n_filled, solution, t_last[0], y_last, event, n_steps)
+
+
+def prepare(scalar: type) -> None:
+    """Compile the integrator for real or complex states, or load it."""
+    system = CompiledSystem(0, 0, 1, np.zeros(4, np.int64))
+    passed = _passed(system, 0.0, np.zeros(1, scalar), np.zeros(1), RTOL_IMAGINARY, np.zeros(1), 1)
+    _dop853.compile(tuple(map(typeof, passed)))
+
+
+def _passed(
+    system: CompiledSystem, t0: Any, y0: NDArray[Any], grid: Array, rtol: float, atol: Array, max_steps: int
+) -> tuple[Any, ...]:
+    """What the compiled integrator is called with; the last four are its results and its scratch."""
     kind = y0.dtype
-    solution = np.full((len(grid), len(y0)), np.nan, kind)
-    t_last, y_last = np.array([t0], kind), y0.copy()
-    status, n_filled, event, n_steps = _dop853(
+    return (
         system.rates,
         system.margins,
         system.arguments,
@@ -81,21 +99,27 @@ def integrate(
         max_steps,
         kind.kind == "c",
         _TABLEAU,
-        solution,
+        np.full((len(grid), len(y0)), np.nan, kind),
         np.zeros(system.n_margins, kind),
-        t_last,
-        y_last,
+        np.array([t0], kind),
+        y0.copy(),
     )
-    return SolvedStretch(status, n_filled, solution, t_last[0], y_last, event, n_steps)
 
 
-@njit(error_model="numpy")
+@_part
+def _assign(target: Any, values: Any) -> None:
+    """As target[:] = values, for which numba compiles the text of an error besides: a second."""
+    for i in range(target.size):
+        target[i] = values[i]
+
+
+@_part
 def _call(function: int, t: Any, y: Any, out: Any, t_box: Any, args: Any) -> None:
     t_box[0] = t
     call_system(function, t_box.ctypes.data, y.ctypes.data, out.ctypes.data, args[0], args[1], args[2], args[3])
 
 
-@njit(error_model="numpy")
+@_part
 def _stages(
     rates: int, args: Any, t: Any, y: Any, h: Any, first: int, last: int, A: Any, C: Any, K: Any, box: Any
 ) -> None:
@@ -110,7 +134,7 @@ def _stages(
         _call(rates, t + C[i] * h, y_stage, K[i], t_box, args)
 
 
-@njit(error_model="numpy")
+@_part
 def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, box: Any, y_new: Any) -> None:
     """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
     A, B, C, _, _, _ = tableau
@@ -122,7 +146,7 @@ def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, b
         y_new[k] = y[k] + h * total
 
 
-@njit(error_model="numpy")
+@_part
 def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float, atol: Any) -> float:
     """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance."""
     _, _, _, E3, E5, _ = tableau
@@ -133,14 +157,15 @@ def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float,
             e5 += E5[i] * K[i, k].real
             e3 += E3[i] * K[i, k].real
         scale = atol[k] + rtol * max(abs(y[k].real), abs(y_new[k].real))
-        sum5 += (e5 / scale) ** 2
-        sum3 += (e3 / scale) ** 2
+        e5, e3 = e5 / scale, e3 / scale
+        sum5 += e5 * e5
+        sum3 += e3 * e3
     if sum5 == 0.0 and sum3 == 0.0:
         return 0.0
     return abs(h) * sum5 / np.sqrt((sum5 + 0.01 * sum3) * y.size)
 
 
-@njit(error_model="numpy")
+@_part
 def _imaginary_error(y_new: Any, h: float, K: Any, tableau: Any, atol: Any, size: Any) -> float:
     """Embedded error of the imaginary parts in units of its tolerance; `size` (1,) is their largest so far in atol."""
     _, _, _, _, E5, _ = tableau
@@ -154,7 +179,7 @@ def _imaginary_error(y_new: Any, h: float, K: Any, tableau: Any, atol: Any, size
     return abs(h) * worst / (RTOL_IMAGINARY * size[0]) if size[0] > 0.0 else 0.0
 
 
-@njit(error_model="numpy")
+@_part
 def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
     """Coefficients F (7, n) of the polynomial of degree 7 through the step."""
     for k in range(y.size):
@@ -169,7 +194,7 @@ def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
             F[3 + row, k] = h * total
 
 
-@njit(error_model="numpy")
+@_part
 def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
     """Value at the fraction x of the step, by nested factors x, 1 - x, x, ..."""
     for k in range(y.size):
@@ -179,7 +204,7 @@ def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
         out[k] = y[k] + total
 
 
-@njit(error_model="numpy")
+@_part
 def _fill(
     rates: int,
     args: Any,
@@ -205,7 +230,7 @@ def _fill(
     return i_grid
 
 
-@njit(error_model="numpy")
+@_part
 def _first_step(y: Any, f: Any, atol: Any) -> float:
     """A hundredth of the time in which the fastest component changes by its own size."""
     fastest = 0.0
@@ -214,7 +239,7 @@ def _first_step(y: Any, f: Any, atol: Any) -> float:
     return 0.01 / (1.0 + fastest)
 
 
-@njit(error_model="numpy")
+@_part
 def _ran_out(before: Any, after: Any) -> int:
     """Number of the first margin that was positive and is no longer, or -1."""
     for e in range(after.size):
@@ -223,7 +248,7 @@ def _ran_out(before: Any, after: Any) -> int:
     return -1
 
 
-@njit(error_model="numpy")
+@_part
 def _locate(
     system: Any,
     args: Any,
@@ -289,14 +314,15 @@ def _dop853(
     _call(margins, t, y, margin, box[1], args)
     h_next, i_grid = _first_step(y, K[0], atol), 0
     for steps in range(max_steps):
-        t_last[0], y_last[:] = t, y
+        t_last[0] = t
+        _assign(y_last, y)
         if i_grid == grid.size:
             return REACHED_END, i_grid, -1, steps
         room = grid[-1] - t
         h = room if room.real <= h_next else h_next * unit
         if room.real < 1e-15:  # the last points coincide with t up to rounding
             while i_grid < grid.size:
-                solution[i_grid] = y
+                _assign(solution[i_grid], y)
                 i_grid += 1
             continue
         _step(rates, args, t, y, h, tableau, K, box, y_new)
@@ -317,11 +343,14 @@ def _dop853(
         _call(rates, t + h, y_new, K[n_stages], box[1], args)
         if grid[i_grid] <= (t + h).real:
             i_grid = _fill(rates, args, t, y, h, tableau, K, box, y_new, F, grid, i_grid, solution)
-        t, y[:] = t + h, y_new
+        t = t + h
+        _assign(y, y_new)
         if event >= 0:
-            t_last[0], y_last[:] = t, y
+            t_last[0] = t
+            _assign(y_last, y)
             return EVENT, i_grid, event, steps
-        K[0], margin[:] = K[n_stages], margin_new
+        _assign(K[0], K[n_stages])
+        _assign(margin, margin_new)
     return TOO_MANY_STEPS, i_grid, -1, max_steps
 
 

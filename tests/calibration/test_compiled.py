@@ -9,9 +9,15 @@ import pytest
 from calibration import compiled
 from calibration._corner_kernel import fit_corners
 from disctrack.readers import _png
+from disctrack.rolling import integrate
 from disctrack.track._kernels import track_frames
 
-SHIPPED = {"fit_corners": (fit_corners, 1), "_undo_filters": (_png._undo_filters, 2), "track_frames": (track_frames, 2)}
+SHIPPED = {
+    "fit_corners": (fit_corners, 1),
+    "_undo_filters": (_png._undo_filters, 2),
+    "track_frames": (track_frames, 2),
+    "_dop853": (integrate._dop853, 2),
+}
 
 
 def headers(function):
