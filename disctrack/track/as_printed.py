@@ -34,8 +34,6 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 # not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
 SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
-# Dots that are found this near their declared places (rms) are left there: SYSTEMATIC_PX alone makes 0.5 um.
-MIN_MARKER_SHIFT = 2e-6  # [m]
 ITERATIONS = 4
 MIN_FRAMES = 10
 
@@ -71,8 +69,8 @@ def refine_as_built(
 ) -> AsBuilt:
     """Refine dots and rig from the marker centres of n frames; shapes as in `pose.fit_poses`.
 
-    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared, and so do
-    dots that turn out to lie within MIN_MARKER_SHIFT (rms) of their declared places.
+    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared. Dots are moved
+    by that share of their displacements which is theirs, not their sigma's (`share_of_places`).
     """
     good = np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4))
     rows = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).astype(int))] if len(good) else good
@@ -126,15 +124,7 @@ def refine_as_built(
         size, size_sigma = pattern_size(disc, moved, remaining[N_RIG:, N_RIG:])
         current_rig, size_share = sized_by_pattern(rig, size, size_sigma)
         moved = moved + size_share * size * _from_middle(disc)
-        unchanged = replace(unchanged, rig=current_rig, size=size, size_sigma=size_sigma, size_share=size_share)
-        if np.sqrt(np.mean(moved**2)) < MIN_MARKER_SHIFT:
-            return replace(
-                unchanged,
-                marker_shift_sigma=sigma,
-                reduced_chi_square_before=before,
-                reduced_chi_square_after=after if size_share * abs(size) > size_sigma else before,
-            )
-    kept = declared_places_kept(disc, moved)
+    kept = share_of_places(disc, moved, sigma) * declared_places_kept(disc, moved)
     current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
@@ -151,6 +141,17 @@ def refine_as_built(
         size_sigma=size_sigma,
         size_share=size_share,
     )
+
+
+def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
+    """Part of displacements (m, 2) of sigma (m, 2) to believe in: 1 - noise / power, or 0 (James and Stein 1961).
+
+    Power and noise are those of the displacements against each other. What is found of dots that lie where they were
+    declared is noise, and keeps them there; of dots that are off by ten times as much, 1 % is left out.
+    """
+    motions = _pattern_motions(disc).reshape(-1, 3)
+    own = shift.reshape(-1) - motions @ (np.linalg.pinv(motions) @ shift.reshape(-1))
+    return float(max(0.0, 1.0 - np.sum(sigma**2) / max(float(own @ own), 1e-30)))
 
 
 def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from calibration.camera import StereoRig
 from calibration.causes import causes
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.track.as_printed import MIN_MARKER_SHIFT, AsBuilt, refine_as_built
+from disctrack.track.as_printed import AsBuilt, refine_as_built, share_of_places
 from disctrack.track.dots import NoiseModel, TemplateLimits
 from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
 from disctrack.track.exposure import shift_by_exposure
@@ -192,11 +192,9 @@ def _without_false_shifts(as_built: AsBuilt, rig: StereoRig, declared: Disc, fau
     """Where cameras and clock are wrong, dots refined alone would be moved to make up for that: take the joint ones."""
     if not as_built.reduced_chi_square_after > FAULTY * max(1.0, faults.reduced_chi_square):
         return as_built
-    shift = faults.marker_shift
-    if np.sqrt(np.mean(shift**2)) < MIN_MARKER_SHIFT:
-        shift = np.zeros_like(shift)
-    disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
     sigma = faults.marker_shift_sigma
+    shift = share_of_places(declared, faults.marker_shift[:, :2], sigma) * faults.marker_shift
+    disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
     return replace(as_built, rig=rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
 
 

@@ -189,17 +189,27 @@ def judge_poses(
     rest = _at_rest(fits)
     lost = repeated & ~_still_over_the_repeats(repeated, rest)
     good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
-    moved = np.fmin.reduce([departure(good, weights) for weights in (FROM_BEFORE, FROM_AFTER, FROM_BOTH)])
-    # a disc at rest does not tell how smooth its motion will be
-    usual_move = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
-    quiet = np.fmax(usual_move / _USUAL_MEDIAN[6], 1.0)
+    one_sided = [departure(good, weights) for weights in (FROM_BEFORE, FROM_AFTER)]
+    both = departure(good, FROM_BOTH)
+    nearest = np.fmin(*one_sided)
+    moved = nearest / _quiet(nearest, rest)
+    # next to an end or a gap, a quadratic is all there is, and it follows a slow camera's frames far worse
+    inner = np.fmin.reduce([*one_sided, both])
+    moved = np.where(np.isnan(both), moved, inner / _quiet(inner, rest))
     with np.errstate(invalid="ignore"):
-        jumped = moved / quiet > chdtri(6, CHANCE) * 2.0  # the smallest of three, in motion that is not quite steady
+        jumped = moved > chdtri(6, CHANCE) * 2.0  # the smallest of three, in motion that is not quite steady
     status[jumped | torn_off(good, period, radius)] = FrameStatus.JUMPED
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
     status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge
     return Verdicts(status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0))
+
+
+def _quiet(moved: Array, rest: Mask) -> Array:
+    """(n,) how many times farther than noise makes them, at least once, poses usually are from where others lead."""
+    # a disc at rest does not tell how smooth its motion will be
+    usual = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
+    return np.fmax(usual / _USUAL_MEDIAN[6], 1.0)
 
 
 def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
