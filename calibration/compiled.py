@@ -19,7 +19,8 @@ import hashlib
 import inspect
 import pickle
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +57,26 @@ def njit(function: Any = None, *, cache: bool = False, **rules: Any) -> Any:
     return compiled(function) if inspect.isfunction(function) else compiled
 
 
+_to_be_told: list[Callable[[], None]] = []
+
+
+@contextmanager
+def when_compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Call `tell` whenever a function that is kept is about to be compiled, or optimised from what ships."""
+    _to_be_told.append(tell)
+    try:
+        yield
+    finally:
+        _to_be_told.remove(tell)
+
+
 class _ShippedOrKept(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         kept = super().load_overload(sig, target_context)
         if kept is not None:
             return kept
+        for tell in tuple(_to_be_told):
+            tell()
         codegen = target_context.codegen()
         entry = _shipped(self._py_func, sig, self._impl.locator.get_source_stamp(), codegen)
         if entry is None:

@@ -54,9 +54,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.print_help()
             return USAGE
         from disctrack.files.inputs import inputs_kept  # here, so that --help does not wait for what it imports
+        from disctrack.progress import recorded_times
 
         command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
-        with inputs_kept():
+        with inputs_kept(), recorded_times():
             return int(command.run(arguments))
     except KeyboardInterrupt:
         return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)

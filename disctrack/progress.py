@@ -11,8 +11,51 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass
 
 from tqdm import tqdm
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """What a stage took."""
+
+    stage: str
+    seconds: float  # by the clock
+    processor_seconds: float  # of this process, all its threads
+    count: int | None = None  # of what it went through
+    unit: str | None = None
+
+
+_recorded: ContextVar[list[StageTime] | None] = ContextVar("recorded", default=None)
+
+
+@contextlib.contextmanager
+def recorded_times() -> Iterator[list[StageTime]]:
+    """List that every stage which ends well in the meantime is added to."""
+    times: list[StageTime] = []
+    token = _recorded.set(times)
+    try:
+        yield times
+    finally:
+        _recorded.reset(token)
+
+
+def times_so_far() -> tuple[StageTime, ...]:
+    """Of the stages since `recorded_times` began."""
+    return tuple(_recorded.get() or ())
+
+
+@contextlib.contextmanager
+def timed(what: str, count: int | None = None, unit: str | None = None) -> Iterator[None]:
+    """Add the time of a stage to those recorded, without a word."""
+    began, used = time.perf_counter(), time.process_time()
+    yield
+    times = _recorded.get()
+    if times is not None:
+        seconds, processor = time.perf_counter() - began, time.process_time() - used
+        times.append(StageTime(what, round(seconds, 3), round(processor, 3), count, unit))
 
 
 @contextlib.contextmanager
@@ -22,7 +65,7 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
     What is reported beyond the total is not shown.
     """
     began = time.perf_counter()
-    with tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
+    with timed(what, total, unit), tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
         yield lambda n: bar.update(max(0, min(n, total - bar.n))) and None
     _tell(began, f"{what}: {total} {unit}{'' if total == 1 else 's'}")
 
@@ -41,7 +84,8 @@ def stage(what: str) -> Iterator[None]:
     if ticking is not None:
         ticking.start()
     try:
-        yield
+        with timed(what):
+            yield
     finally:
         over.set()
         if ticking is not None:
@@ -59,25 +103,24 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
 
 @contextlib.contextmanager
 def compiling(what: str, seconds: int | str) -> Iterator[None]:
-    """Say on stderr what is compiled and for how long, unless it is over at once because it was compiled before.
+    """Say on stderr what is compiled and for how long, as soon as the compiler begins; nothing where it is only loaded.
 
     seconds: of processor time that it took where it was measured, with and without code that ships for this Python.
     """
-    began, over = time.perf_counter(), threading.Event()
+    from calibration.compiled import when_compiling  # numba: those who call this have it, others need not wait
+
+    began = time.perf_counter()
     told = f"compiling the inner loops of {what}: once per installation, about {seconds} s of a free core"
+    said: list[str] = []
 
     def tell() -> None:
-        if not over.wait(1.0):  # loading what was compiled before takes half a second
+        if not said:
             print(told, file=sys.stderr, flush=True)
+        said.append(told)
 
-    telling = threading.Thread(target=tell, daemon=True)
-    telling.start()
-    try:
+    with when_compiling(tell):
         yield
-    finally:
-        over.set()
-        telling.join()
-    if time.perf_counter() - began > 2.0:
+    if said:
         _tell(began, f"inner loops of {what} compiled")
 
 

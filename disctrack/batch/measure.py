@@ -37,6 +37,7 @@ from disctrack.errors import AnalysisError, DiscTrackError, OutputError
 from disctrack.files import trajectory_file as storage
 from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import write_whole
+from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.stage import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
@@ -87,12 +88,13 @@ def make_recording(job: Job, progress: Progress) -> Result:
 
 
 def _make_recording(job: Job, results: Path, progress: Progress) -> Result:
-    began = time.perf_counter()
+    began, used = time.perf_counter(), time.process_time()
     asked = stages_asked(job.options)
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
     check_rig(rig, pairs, job.rig)
     path = results / "trajectory.h5"
+    tracking: list[StageTime] = []
     provenance = _reusable(path, recording, rig, pairs) if not job.options.overwrite else None
     if provenance is not None:
         record = read_record(results)
@@ -100,11 +102,15 @@ def _make_recording(job: Job, results: Path, progress: Progress) -> Result:
             return Result(SKIPPED, record)
         trajectory, findings = storage.read_trajectory(path), storage.read_findings(path)
     else:
-        trajectory, findings, provenance = _track(path, recording, rig, pairs, job, progress)
+        with recorded_times() as tracking, timed("track"):
+            trajectory, findings, provenance = _track(path, recording, rig, pairs, job, progress)
     progress(_TRACKED)
-    record = _after_tracking(results, path, trajectory, findings, provenance, job, asked)
+    with recorded_times() as times:
+        record = _after_tracking(results, path, trajectory, findings, provenance, job, asked)
     numbers = record.numbers | _origin(recording, provenance)
     numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
+    numbers |= {"processor_seconds": round(time.process_time() - used, 3)}
+    numbers |= {f"processor_seconds_{t.stage}": t.processor_seconds for t in (*tracking, *times)}
     record = dataclasses.replace(record, numbers=numbers)
     write_record(results, record)
     return Result(MEASURED, record)
@@ -155,7 +161,8 @@ def _after_tracking(
     files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
     missing = _shortcomings(findings)
     try:
-        analysis, report = _analyse(path, trajectory, job)
+        with timed("analyse"):
+            analysis, report = _analyse(path, trajectory, job)
         numbers |= analysed_numbers(analysis)
         files |= {"report": report.relative_to(results).as_posix()} if report is not None else {}
     except AnalysisError as error:
@@ -163,7 +170,8 @@ def _after_tracking(
     numbers |= friction_numbers(trajectory)
     if job.options.diagnose:
         try:
-            page, document = _diagnose(path)
+            with timed("diagnose"):
+                page, document = _diagnose(path)
             numbers |= diagnosed_numbers(document)
             files["diagnosis_report"] = page.relative_to(results).as_posix()
         except AnalysisError as error:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,11 @@ from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files import trajectory_file as storage
+from disctrack.files.json_text import json_file
+from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
-from disctrack.progress import progress_bar
+from disctrack.files.whole import write_whole
+from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.declaration import Recording
 from disctrack.track import summary
 from disctrack.track.overlay import shown_rows, write_overlay
@@ -156,6 +161,28 @@ def pair_of(pairs: ImagePairs, row: int) -> NDArray:
         except RecordingError:
             image[...] = 0
     return images
+
+
+def write_times(folder: Path, command: str) -> None:
+    """Keep in times.json what the stages of this command took; nothing where all was reused. Raises OutputError.
+
+    The processor's seconds are those of the whole process: with its imports, and with what is in no stage.
+    """
+    stages = times_so_far()
+    if not stages:
+        return
+    path = folder / "times.json"
+    try:
+        document = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # not there, or not ours to mend
+        document = {}
+    document[command] = {
+        "version": software_version(),
+        "seconds": round(sum(stage.seconds for stage in stages), 3),
+        "processor_seconds": round(time.process_time(), 3),
+        "stages": [asdict(stage) for stage in stages],
+    }
+    write_whole(path, json_file(document))
 
 
 def relative(path: Path) -> Path:

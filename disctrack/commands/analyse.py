@@ -12,7 +12,7 @@ from disctrack.analyse.motion_page import write_motion_page
 from disctrack.analyse.stage import run_analyse
 from disctrack.analyse.viewer import require_rerun, write_rerun
 from disctrack.commands import DONE
-from disctrack.commands._outputs import pair_of
+from disctrack.commands._outputs import pair_of, write_times
 from disctrack.errors import RecordingError
 from disctrack.files.reuse import origin_of, remember, reusable
 from disctrack.files.trajectory_file import read_provenance
@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rerun:
         write_rerun(motion, outcome.analysis)
         lines.append(f"              {motion}")
+    write_times(folder, "analyse")
     remember(folder, origin, lines, (outcome.report, page, *outcome.figures))
     print("\n".join(lines))
     return DONE

@@ -35,6 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     files = [outputs.relative(file) for file in (path, *outcome.files)]
     lines = [*outcome.summary, *summary.file_lines(files)]
+    outputs.write_times(folder, "diagnose")
     remember(folder, origin, lines, outcome.files)
     print("\n".join(lines))
     return DONE

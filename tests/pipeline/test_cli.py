@@ -1,6 +1,7 @@
 """The commands on a real recording: one line runs the measurement, a second run reuses it, and the summary tells."""
 
 import csv
+import json
 import os
 import re
 import subprocess
@@ -44,6 +45,11 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == len(trajectory)
     video.release()
     assert (results / "summary.txt").read_text().splitlines()[0] in output
+
+    times = json.loads((results / "times.json").read_text())["run"]
+    assert [stage["stage"] for stage in times["stages"]] == ["calibrate", "track", "figures", "video"]
+    assert times["stages"][1]["count"] == len(trajectory)
+    assert 0 < sum(stage["processor_seconds"] for stage in times["stages"]) < times["processor_seconds"]
 
     before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
     (results / "dots.png").unlink()
