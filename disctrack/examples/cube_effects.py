@@ -103,12 +103,13 @@ def _nothing(f: Flight, part: str) -> _Moved:
 
 
 def _effect(
-    name: str, kind: str, title: str, unit: str, scale: float, typical: float, parts: dict[str, str],
-    moved: _Move = _nothing, lower: float = -np.inf,
+    name: str, kind: str, title: str, size: tuple[str, float, float], parts: dict[str, str], moved: _Move = _nothing,
+    lower: float = -np.inf,
 ) -> tuple[Candidate, _Move]:  # fmt: skip
-    """An effect; parts : meaning of each of its quantities by the name's last part."""
+    """An effect; size : unit, step and typical size; parts : meaning of its quantities by their names' last part."""
+    unit, step, typical = size
     own = tuple(
-        Quantity(f"{name}.{part}", unit, scale, typical=typical, meaning=meaning, lower=lower)
+        Quantity(f"{name}.{part}", unit, step, typical=typical, meaning=meaning, lower=lower)
         for part, meaning in parts.items()
     )
     return Candidate(name, name, kind, title, "", own), moved
@@ -116,60 +117,60 @@ def _effect(
 
 _M, _S = "motion", "measurement"
 _EFFECTS = (
-    _effect("gravity", _M, "another gravity", "m/s^2", 0.01, 0.01, {"change": "added to the declared one"},
+    _effect("gravity", _M, "another gravity", ("m/s^2", 0.01, 0.01), {"change": "added to the declared one"},
             lambda f, part: _fallen(f, -UP / GRAVITY)),
-    _effect("frame_rate", _S, "frame rate wrong", "1", 1e-3, 1e-3, {"change": "true over declared, minus 1"},
+    _effect("frame_rate", _S, "frame rate wrong", ("1", 1e-3, 1e-3), {"change": "true over declared, minus 1"},
             lambda f, part: _fallen(f, 2 * UP)),  # true time is shorter if the true rate is higher
-    _effect("length_scale", _S, "scale of the lengths wrong", "1", 1e-3, 0.02,
+    _effect("length_scale", _S, "scale of the lengths wrong", ("1", 1e-3, 0.02),
             {"change": "measured over true, minus 1"}, lambda f, part: _fallen(f, -UP)),
-    _effect("tilt", _S, "vertical wrong, the same way in the axes of the file for all tosses", "rad", 1e-3, 0.01,
+    _effect("tilt", _S, "vertical wrong, the same way in the axes of the file for all tosses", ("rad", 1e-3, 0.01),
             {f"beta_{a}": f"gravity leans towards {a}" for a in "xy"},
             lambda f, part: _fallen(f, np.eye(3)["xy".index(part[-1])])),
-    _effect("toss_tilt", _S, "vertical wrong, the same way in the axes of every toss", "rad", 1e-3, 0.01,
+    _effect("toss_tilt", _S, "vertical wrong, the same way in the axes of every toss", ("rad", 1e-3, 0.01),
             {a: f"gravity leans {a} the flight" for a in _AXES[:2]}, lambda f, part: _fallen(f, _axes(f)[part])),
-    _effect("linear_drag", _M, "drag in proportion to the speed", "1/s", 1e-2, 0.03, {"k": "deceleration over speed"},
+    _effect("linear_drag", _M, "drag in proportion to the speed", ("1/s", 1e-2, 0.03), {"k": "deceleration over speed"},
             lambda f, part: _pushed(f, -f.velocity), 0.0),
-    _effect("quadratic_drag", _M, "drag in proportion to the square of the speed", "1/m", 1e-2, 0.02,
+    _effect("quadratic_drag", _M, "drag in proportion to the square of the speed", ("1/m", 1e-2, 0.02),
             {"k": "deceleration over speed squared"},
             lambda f, part: _pushed(f, -f.velocity * np.linalg.norm(f.velocity, axis=1)[:, None]), 0.0),
-    _effect("side_force", _M, "force across the horizontal velocity, to its left", "1/s", 1e-2, 0.01,
+    _effect("side_force", _M, "force across the horizontal velocity, to its left", ("1/s", 1e-2, 0.01),
             {"c": "acceleration over speed"}, lambda f, part: _pushed(f, np.cross(UP, f.velocity))),
-    _effect("magnus", _M, "lift of the spinning cube (Magnus)", "1", 1e-3, 0.004, {"c": "acceleration over omega x v"},
-            lambda f, part: _pushed(f, np.cross(f.omega, f.velocity))),
+    _effect("magnus", _M, "lift of the spinning cube (Magnus)", ("1", 1e-3, 0.004),
+            {"c": "acceleration over omega x v"}, lambda f, part: _pushed(f, np.cross(f.omega, f.velocity))),
     # the room turns about the vertical by Omega t: place and attitude turn along, and so does the angular velocity
-    _effect("frame_rotation", _S, "world axes turn about the vertical", "rad/s", 1e-3, 1e-3,
+    _effect("frame_rotation", _S, "world axes turn about the vertical", ("rad/s", 1e-3, 1e-3),
             {"rate": "of what is measured"},
             lambda f, part: (np.cross(UP, f.path) * f.time[:, None], _in_body(f, UP * f.time[:, None]))),
     # the tags' centre is seen, which stands off by minus the offset of the centre of mass
-    _effect("centre_of_mass", _M, "centre of mass not in the centre of the tags", "m", 1e-3, 2e-3,
+    _effect("centre_of_mass", _M, "centre of mass not in the centre of the tags", ("m", 1e-3, 2e-3),
             {f"c_{i}": f"along body axis {i}" for i in (1, 2, 3)},
             lambda f, part: (-f.rotation[:, :, int(part[-1]) - 1], None)),
-    _effect("principal_moments", _M, "moments of inertia not those of a uniform cube", "1", 1e-2, 0.05,
+    _effect("principal_moments", _M, "moments of inertia not those of a uniform cube", ("1", 1e-2, 0.05),
             {f"e_{i}{i}": f"J_{i} over J_3, minus 1" for i in (1, 2)}, _inertia),
-    _effect("products_of_inertia", _M, "products of inertia", "1", 1e-2, 0.05,
+    _effect("products_of_inertia", _M, "products of inertia", ("1", 1e-2, 0.05),
             {f"e_{ij}": f"J_{ij} over J" for ij in (12, 13, 23)}, _inertia),
-    _effect("rotational_drag", _M, "drag of the rotation", "1/s", 1e-2, 0.01,
+    _effect("rotational_drag", _M, "drag of the rotation", ("1/s", 1e-2, 0.01),
             {"k": "deceleration over angular velocity"}, lambda f, part: _twisted(f, -f.omega), 0.0),
-    _effect("side_torque", _M, "torque that turns the angular velocity about the vertical", "1/s", 1e-2, 0.01,
+    _effect("side_torque", _M, "torque that turns the angular velocity about the vertical", ("1/s", 1e-2, 0.01),
             {"c": "rate of turning"}, lambda f, part: _twisted(f, np.cross(UP, f.omega))),
-    _effect("twist", _S, "measured place and attitude turn about the vertical with height", "rad/m", 1e-2, 0.01,
+    _effect("twist", _S, "measured place and attitude turn about the vertical with height", ("rad/m", 1e-2, 0.01),
             {"a": "angle over height"},
             lambda f, part: (np.cross(UP, f.path) * f.path[:, 2:], _in_body(f, UP * f.path[:, 2:]))),
-    _effect("perspective", _S, "scale of the lengths changes with place", "1/m", 1e-3, 5e-3,
+    _effect("perspective", _S, "scale of the lengths changes with place", ("1/m", 1e-3, 5e-3),
             {a: f"of the scale, {a}" for a in _AXES},
             lambda f, part: (f.path * (f.path @ _axes(f)[part])[:, None], None)),
-    _effect("face_bias", _S, "error of place that depends on which faces look up", "m", 1e-4, 5e-4,
+    _effect("face_bias", _S, "error of place that depends on which faces look up", ("m", 1e-4, 5e-4),
             {f"{i}": f"of {_AXES[a]} by body axis {b + 1}" for i, (a, b) in enumerate(_FACES)}, _face_bias),
-    _effect("clock_offset", _S, "positions later than attitudes", "s", 1e-4, 1e-3, {"delay": "of the positions"},
+    _effect("clock_offset", _S, "positions later than attitudes", ("s", 1e-4, 1e-3), {"delay": "of the positions"},
             lambda f, part: (f.velocity, None)),
-    _effect("smoothing", _S, "exposure, or smoothing of the positions", "s^2", 1e-6, 1e-5,
+    _effect("smoothing", _S, "exposure, or smoothing of the positions", ("s^2", 1e-6, 1e-5),
             {"T2": "square of its duration"},
             lambda f, part: (np.broadcast_to(-UP * GRAVITY / 24, f.position.shape), None)),
-    _effect("table_height", _S, "table not at height zero", "m", 1e-4, 1e-3, {"z": "height of the table"}),
-    _effect("half_width", _S, "half width of the cube wrong", "m", 1e-4, 5e-4, {"change": "true minus declared"}),
-    _effect("tag_axes", _S, "axes of the tags turned against those of the cube", "rad", 1e-4, 5e-3,
+    _effect("table_height", _S, "table not at height zero", ("m", 1e-4, 1e-3), {"z": "height of the table"}),
+    _effect("half_width", _S, "half width of the cube wrong", ("m", 1e-4, 5e-4), {"change": "true minus declared"}),
+    _effect("tag_axes", _S, "axes of the tags turned against those of the cube", ("rad", 1e-4, 5e-3),
             {f"turn_{i}": f"about body axis {i}" for i in (1, 2, 3)}),
-    _effect("table_tilt", _S, "table leans against the vertical", "rad", 1e-4, 1e-2,
+    _effect("table_tilt", _S, "table leans against the vertical", ("rad", 1e-4, 1e-2),
             {a: f"rises {a} the flight" for a in _AXES[:2]}),
 )  # fmt: skip
 CANDIDATES = tuple(candidate for candidate, _ in _EFFECTS)

@@ -59,7 +59,6 @@ class Check:
     recording: Recording | None = None
     remarks: list[Remark] = field(default_factory=list)
     calibration: StereoCalibration | None = None
-    table_images: tuple[NDArray, NDArray] | None = None
     shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
     raw: NDArray | None = None  # (2, h, w) a pair in which the disc was not found
 
