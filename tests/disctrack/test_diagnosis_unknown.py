@@ -16,15 +16,6 @@ DISC = Scene().declared_disc
 RATE = 500.0
 
 
-def spring(stiffness: float):
-    """A force towards a point of the table."""
-    return lambda disc, now: (
-        newton_euler.ZERO,
-        newton_euler.ZERO,
-        -stiffness * np.array([now.O[0], now.O[1], 0.0]),
-    )
-
-
 def contour_friction_below(mu: float, theta_deg: float):
     """Dry contour friction that sets in at a nutation."""
     edge = np.sin(np.radians(theta_deg))
@@ -50,7 +41,7 @@ def recording(law, theta_deg: float, omega3: float, duration: float, seed: int =
     low.terminal = True
     times = np.arange(0.0, duration, 1 / 6000)
     found = solve_ivp(
-        lambda t, s: newton_euler.rate(body, s, "rolling"), (0, times[-1]), start, "DOP853", times, rtol=1e-10,
+        lambda t, s: newton_euler.rate(body.at(t), s, "rolling"), (0, times[-1]), start, "DOP853", times, rtol=1e-10,
         atol=1e-11, max_step=2e-3, events=low,
     )  # fmt: skip
     q = newton_euler.coordinates(body, found.y)
@@ -61,15 +52,30 @@ def recording(law, theta_deg: float, omega3: float, duration: float, seed: int =
 
 
 def test_a_spring_is_no_tilt_with_an_inertia():
-    result = diagnose_trajectory(recording(spring(0.8), 14.0, 1.0, 0.9), separate=False)
+    result = diagnose_trajectory(recording(newton_euler.spring(0.8), 14.0, 1.0, 0.9), separate=False)
+    assert [f.candidate.name for f in result.diagnosis.found] == ["spring"]
+    assert result.after.reduced_chi_square < 1.05
+    fit = result.diagnosis.after
+    for name, truth in (("k", 0.8), ("F_x", 0.0), ("F_y", 0.0)):
+        assert abs(fit.values[f"spring.{name}"] - truth) < 3 * fit.sigma(f"spring.{name}")
+
+
+def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
+    """3 um at 60 Hz, 16 deg before the course of the cosine's; the frames begin 2 ms after the motion."""
+    acceleration = 3e-6 * (2 * np.pi * 60) ** 2 * np.array([0.6, 0.3, 0.7])
+    law = newton_euler.vibration(-np.sin(0.3) * acceleration, -np.cos(0.3) * acceleration, 60.0)
+    result = diagnose_trajectory(recording(law, 14.0, 1.0, 0.9), separate=False)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
-    assert {c[0] for c in result.learned.law.formulas} == {"X"}  # a force, no moment
-    assert result.after.reduced_chi_square < 1.05
     fit = result.learned.fit
-    stiffness = [q.name for q in result.learned.law.candidate.quantities if abs(fit.values[q.name]) > 0.1]
-    for name in stiffness:
-        assert abs(fit.values[name] - 0.8) < 4 * fit.sigma(name) + 1e-3
+    value = lambda name: (fit.values[f"learned.{name}"], fit.sigma(f"learned.{name}"))  # noqa: E731
+    rate, sigma = value("rate_0")
+    assert abs(rate - 2 * np.pi * 60) < 3 * sigma
+    assert result.after.reduced_chi_square < 1.05
+    # the phase at t = 0 and the rate go together: of each axis the size of the force
+    for axis, true in enumerate(DISC.mass * acceleration):
+        (c, c_sigma), (s, s_sigma) = value(f"c_0_{2 * axis}"), value(f"c_0_{2 * axis + 1}")
+        assert abs(np.hypot(c, s) - true) < 3 * max(c_sigma, s_sigma)
 
 
 def test_a_law_below_a_nutation_is_told_with_the_nutation():

@@ -21,6 +21,12 @@ class Disc:
         J1 = m * r * r / 4 + m * h * h / 3
         self.J = np.diag([J1, J1, m * r * r / 2]) if J_body is None else np.array(J_body, float)
         self.com = np.array(com_body, float)
+        self.t = 0.0
+
+    def at(self, t):
+        """Itself, at an instant that laws may ask for."""
+        self.t = t
+        return self
 
 
 def matrix_of(quaternion):
@@ -133,7 +139,7 @@ def rate(disc, state, regime):
 def follow(disc, state, times, regime="rolling", rtol=1e-11, atol=1e-12, events=None, method="DOP853"):
     """solve_ivp over the times; returns its result."""
     return solve_ivp(
-        lambda t, s: rate(disc, s, regime),
+        lambda t, s: rate(disc.at(t), s, regime),
         (times[0], times[-1]),
         state,
         method,
@@ -175,6 +181,24 @@ def classical_rolling_friction(delta):
         return ZERO, -delta * horizontal / np.linalg.norm(horizontal), ZERO
 
     return law
+
+
+def adhesive_rolling_friction(a):
+    def law(disc, now):
+        horizontal = now.omega - now.omega[2] * K
+        return -a * horizontal / np.linalg.norm(horizontal), ZERO, ZERO
+
+    return law
+
+
+def spring(k, point=(0.0, 0.0)):
+    return lambda disc, now: (ZERO, ZERO, -k * np.array([now.O[0] - point[0], now.O[1] - point[1], 0.0]))
+
+
+def vibration(cosine, sine, frequency):
+    """Of a table, in its own axes; accelerations."""
+    course = lambda t: np.cos(2 * np.pi * frequency * t) * cosine + np.sin(2 * np.pi * frequency * t) * sine  # noqa: E731
+    return lambda disc, now: (ZERO, ZERO, -disc.m * course(disc.t))
 
 
 def linear_drag(c):

@@ -171,23 +171,47 @@ def test_compiled_rates_satisfy_the_derived_rows_on_random_states(rng):
         assert_allclose(residual, 0, atol=1e-12)  # N m; the terms are of order 1, rounding 1e-14
 
 
+STANDING_FORCES = (
+    newton_euler.spring(0.8, (0.05, -0.03)),
+    newton_euler.vibration(np.array([0.3, -0.2, 0.5]), np.array([0.7, 0.4, -0.1]), 60.0),
+)
 EFFECTS = {
     "ideal": ({}, {}),
     "friction": (
-        {"km": {"k_m": 4e-8}, "kn": {"k_n": 1e-6}, "kz": {"k_z": 1e-4}, "rolling_classical": {"delta": 1e-4}},
+        {
+            "km": {"k_m": 4e-8},
+            "kn": {"k_n": 1e-6},
+            "kz": {"k_z": 1e-4},
+            "rolling_classical": {"delta": 1e-4},
+            "rolling_adhesive": {"a": 1e-4},
+        },
         {
             "laws": [
                 newton_euler.precession_friction(4e-8),
                 newton_euler.nutation_friction(1e-6),
                 newton_euler.pivoting_friction(1e-4),
                 newton_euler.classical_rolling_friction(1e-4),
+                newton_euler.adhesive_rolling_friction(1e-4),
             ]
         },
     ),
     "forces": (
-        {"drag_linear": {"c": 0.02}, "table_tilt": {"tilt_x": 0.03, "tilt_y": -0.02}, "air_moffatt": {"f": 3.0}},
         {
-            "laws": [newton_euler.linear_drag(0.02), newton_euler.moffatt(3 * 1.81e-5)],
+            "drag_linear": {"c": 0.02},
+            "table_tilt": {"tilt_x": 0.03, "tilt_y": -0.02},
+            "air_moffatt": {"f": 3.0},
+            "spring": {"k": 0.8, "F_x": 0.04, "F_y": -0.024},
+            "table_vibration": {
+                **{"a_cos_x": 0.3, "a_cos_y": -0.2, "a_cos_z": 0.5, "a_sin_x": 0.7, "a_sin_y": 0.4, "a_sin_z": -0.1},
+                "frequency": 60.0,
+            },
+        },
+        {
+            "laws": [
+                newton_euler.linear_drag(0.02),
+                newton_euler.moffatt(3 * 1.81e-5),
+                *STANDING_FORCES,
+            ],
             "gravity": 9.81 * np.array([0.03, -0.02, -np.sqrt(1 - 0.03**2 - 0.02**2)]),
         },
     ),
@@ -229,8 +253,8 @@ def test_accelerations_and_forces_agree_with_the_world_vector_system(name, regim
     model, oracle = pair(name)
     model = model.with_effects(CATALOGUE["slip"](mu=0.3))
     oracle.mu = 0.3
-    if regime == "flying":  # contact laws do nothing in the air; of these only the drag acts there
-        oracle.laws = [newton_euler.linear_drag(0.02)] if name == "forces" else []
+    if regime == "flying":  # contact laws do nothing in the air; drag, spring and vibration act there too
+        oracle.laws = [newton_euler.linear_drag(0.02), *STANDING_FORCES] if name == "forces" else []
     for _ in range(20):
         state = random_state(rng)
         velocity = None if regime == "rolling" else rng.normal(size=2)

@@ -208,4 +208,4 @@ def _hums(time: Array, frame_rate: float) -> Iterator[Family]:
             yield Family(f"a moment M_{axis} that swings", tuple({f"M_{axis}": w} for w in waves), shape, "hum M")
         level = tuple(along(w) for along in (along_x, along_y) for w in waves)
         upright = tuple({"X_z": w} for w in waves)
-        yield Family("a force that swings", (*level, *upright), shape, "hum X")
+        yield Family("a force that swings, as of a table that vibrates", (*level, *upright), shape, "hum X")

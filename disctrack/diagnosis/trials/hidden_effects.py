@@ -139,6 +139,8 @@ _TURN, _SHIFT = ("rotation_x", "rotation_y", "rotation_z"), ("translation_x", "t
 HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _vector("table_tilt", "tilted table", ("table_tilt.tilt_x", "table_tilt.tilt_y"), np.radians(0.35), "rad"),
     _law("kz", "pivoting friction", "k_z", 6e-5, "m"),
+    _law("spring", "force towards a point", "k", 0.05, "N/m", signed=True),
+    _law("rolling_adhesive", "rolling friction by adhesion", "a", 2e-5, "N m"),
     HiddenEffect("frame_rate", "wrong frame rate", 0.012, "1", _clock),
     _law("rolling_classical", "classical rolling friction", "delta", 2e-4, "m"),
     _law("air_moffatt", "air layer (Moffatt)", "f", 1.0, "1"),

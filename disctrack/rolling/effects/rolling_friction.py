@@ -123,3 +123,19 @@ class ViscousRollingFriction(Effect):
     def law(p: Any, s: Any, w: Any) -> None:
         w.load_n -= p.c * s.thetadot
         w.load_m += p.c * s.phidot * s.sin_theta
+
+
+class AdhesiveRollingFriction(Effect):
+    """Moment against the horizontal angular velocity that no load changes: what it costs to part the surfaces again."""
+
+    name = "rolling_adhesive"
+    title = "rolling friction by adhesion, M = -a (thetadot n0 - phidot sin theta m0) / |...|, whatever the load"
+    source = "Kendall 1975, Wear 33:351: rolling friction and adhesion between smooth solids"
+    parameters = (EffectParameter("a", "N m", 2e-5, "moment", lower=0.0),)
+
+    @staticmethod
+    def law(p: Any, s: Any, w: Any) -> None:
+        roll_n, roll_m = s.thetadot, -s.phidot * s.sin_theta
+        rate = np.sqrt(roll_n * roll_n + roll_m * roll_m + SLOWEST_ROLLING * SLOWEST_ROLLING)
+        w.M_n -= p.a * roll_n / rate
+        w.M_m -= p.a * roll_m / rate
