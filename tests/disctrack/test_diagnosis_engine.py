@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy import stats
 
 from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
 from disctrack.diagnosis.engine.fit import compress, fit, solve_bounded, triangle
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
 from disctrack.diagnosis.engine.score import Linearisation, angle, score_all
-from disctrack.diagnosis.engine.whiteness import ljung_box, whiteness
+from disctrack.diagnosis.engine.whiteness import ljung_box, no_memory, whiteness
 
 SIGMA = 0.01
 
@@ -232,3 +233,13 @@ def test_linear_quantities_that_are_taken_out_beforehand_leave_the_same_fit(rng)
     for one, other in zip(*scores, strict=True):
         assert one.candidate.name == other.candidate.name
         assert_allclose([other.gain, *other.sigma], [one.gain, *one.sigma], rtol=0.02, atol=0.02)
+
+
+def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
+    """Chi-square's is too thin: at 200 samples its 1e-3 is seen four times as often."""
+    statistic = ljung_box(rng.standard_normal((200, 20_000)))
+    for level in (0.05, 0.01, 1e-3):
+        seen = int(sum(no_memory(x, 200) < level for x in statistic if x > 25))
+        assert stats.binomtest(seen, 20_000, level).proportion_ci(1 - 1e-4).high > 0.7 * level
+        assert seen / 20_000 < 1.3 * level + 4 * np.sqrt(level / 20_000)
+    assert np.mean(stats.chi2.sf(statistic, 20) < 1e-3) > 2.5e-3

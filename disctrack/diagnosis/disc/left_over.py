@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.whiteness import ljung_box, whiteness
+from disctrack.diagnosis.engine.whiteness import ljung_box, no_memory, whiteness
 
 LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
 MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks
@@ -59,7 +58,7 @@ def left_over(system: DiscSystem, fit: Fit, noise: float) -> LeftOver | None:
     tested = whiteness(pose, float(1.0 / np.median(np.diff(system.time))), {})
     lags = min(20, max(1, n // 4))
     channels = other.shape[1]
-    p_other = float(min(1.0, channels * stats.chi2.sf(ljung_box(other, lags).max(), lags)))
+    p_other = min(1.0, channels * no_memory(float(ljung_box(other, lags).max()), n, lags))
     p_pose = min(1.0, 2 * tested.p_value, 2 * 6 * float(tested.peak_p_value.min()))
     moved = sum(not np.isfinite(q.prior_sigma) for q in fit.quantities)
     return LeftOver(
