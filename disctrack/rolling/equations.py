@@ -14,6 +14,13 @@ constant, hence  F = f0 - m omegadot x D  with  f0 = m (omega x (omega x r_OG) -
                [J + m (D x d + L) (D x k)'] omegadot = -omega x J omega + (D x d + L) f0_z + M_0 - r_OG x X
     flying     F = 0, M = M_0
 
+On a table of curvature kappa, a sphere about C = n_0 / kappa that passes through the origin with the normal n_0, the
+disc touches at the point of its rim that is farthest from C. With W = kappa (C - P), P the centre of the rim's circle,
+and W_f its part in the face, the contact lies in the direction e = -W_f / |W_f|, the normal is n = W - kappa r e in
+place of k, and |n| = 1 gives the height of O; nothing of this is singular at kappa = 0. Omega x a becomes the rate of
+r_OA, and in slip n . v_A = 0 is differentiated with the rate of n. A rim with the support function p(beta), beta the
+angle of e in the body, is touched at p e + p' e3 x e (both at once: to first order in kappa p'). F_z stands for n . F.
+
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
 thetadot, and (2.7) taken with Omega, the rate of the frame, not omega, that of the body.
@@ -77,7 +84,21 @@ def _solve(rows: Any, b: Any) -> Any:
 
 
 @njit(error_model="numpy")
-def _contact_arm(body: Any, s: Any, c: Any) -> Any:
+def _is_plain(body: Any) -> bool:
+    """A round rim on a level, flat table."""
+    return bool(
+        body.curvature == 0.0
+        and body.slope_x == 0.0
+        and body.slope_y == 0.0
+        and body.oval_c == 0.0
+        and body.oval_s == 0.0
+        and body.lobes_c == 0.0
+        and body.lobes_s == 0.0
+    )
+
+
+@njit(error_model="numpy")
+def _plain_arm(body: Any, s: Any, c: Any) -> Any:
     """r_OA and its part a that turns with the nodal frame, nodal components."""
     rho = body.edge_radius
     a2, a3 = rho - body.radius, rho - body.half_thickness
@@ -86,22 +107,104 @@ def _contact_arm(body: Any, s: Any, c: Any) -> Any:
 
 
 @njit(error_model="numpy")
+def _support(body: Any, cb: Any, sb: Any) -> Any:
+    """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
+    c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
+    c3, s3 = c2 * cb - s2 * sb, s2 * cb + c2 * sb
+    two, three = body.oval_c * c2 + body.oval_s * s2, body.lobes_c * c3 + body.lobes_s * s3
+    slope = 2.0 * (body.oval_s * c2 - body.oval_c * s2) + 3.0 * (body.lobes_s * c3 - body.lobes_c * s3)
+    return body.radius - body.edge_radius + two + three, slope, -4.0 * two - 9.0 * three
+
+
+@njit(error_model="numpy")
+def _place(body: Any, kin: Any) -> Any:
+    """W, its part in the face over its length, that length, the rim's support there, and the height of O."""
+    s, c = kin.sin_theta, kin.cos_theta
+    cf, sf, sp, cp = np.cos(kin.phi), np.sin(kin.phi), np.sin(kin.psi), np.cos(kin.psi)
+    kappa, rho = body.curvature, body.edge_radius
+    arm3 = body.half_thickness - rho
+    upright = np.sqrt(1.0 - body.slope_x * body.slope_x - body.slope_y * body.slope_y)
+    n0 = _nodal(body.slope_x * cp + body.slope_y * sp, body.slope_y * cp - body.slope_x * sp, upright, s, c)
+    level = _nodal(-(kin.x * cp + kin.y * sp), kin.x * sp - kin.y * cp, 0.0 * s, s, c)
+    z = (body.radius - rho) * s + arm3 * c + rho
+    W, across, w, p = n0, n0, 1.0 + 0.0 * s, (z, z, z)
+    for _ in range(6):  # Newton's method; the first guess errs by the table's slope
+        D = (level[0], level[1] - z * s, level[2] - z * c + arm3)
+        W = _add(n0, _scale(kappa, D))
+        w = np.sqrt(W[0] * W[0] + W[1] * W[1])
+        across = (W[0] / w, W[1] / w, 0.0 * w)  # -e
+        # e in body axes: nodal axes turned back by the spin
+        p = _support(body, -(cf * across[0] + sf * across[1]), -(cf * across[1] - sf * across[0]))
+        gap = 2.0 * _dot(n0, D) + kappa * _dot(D, D) + 2.0 * p[0] * w + kappa * p[0] * p[0] + (2.0 - kappa * rho) * rho
+        by_z = -2.0 * upright - 2.0 * kappa * (s * D[1] + c * D[2]) - 2.0 * kappa * p[0] * s * across[1]
+        z = z - gap / by_z
+    return W, across, w, p, z
+
+
+@njit(error_model="numpy")
+def _contact(body: Any, kin: Any) -> Any:
+    """r_OA, the normal of the table there, and the height of O."""
+    s, c = kin.sin_theta, kin.cos_theta
+    if _is_plain(body):
+        arm, _ = _plain_arm(body, s, c)
+        return arm, (0.0 * s, s, c), -(s * arm[1] + c * arm[2])
+    rho = body.edge_radius
+    W, across, _, p, z = _place(body, kin)
+    n = _scale(1.0 / (1.0 - body.curvature * rho), _add(W, _scale(body.curvature * p[0], across)))
+    along = (across[1], -across[0], 0.0 * s)  # e3 x e
+    rim = _add(_scale(-p[0], across), _scale(p[1], along))
+    arm = _add(_add(rim, (0.0 * s, 0.0 * s, rho - body.half_thickness)), _scale(-rho, n))
+    return arm, n, z
+
+
+@njit(error_model="numpy")
+def _contact_rates(body: Any, kin: Any, omega: Any, frame: Any, v: Any) -> Any:
+    """Rates of r_OA and of the normal, as vectors; v: velocity of O, nodal components."""
+    s, c = kin.sin_theta, kin.cos_theta
+    if _is_plain(body):
+        _, a = _plain_arm(body, s, c)
+        return _cross(frame, a), (0.0 * s, 0.0 * s, 0.0 * s)
+    rho, kappa = body.edge_radius, body.curvature
+    arm3 = rho - body.half_thickness
+    W, across, w, p, _ = _place(body, kin)
+    e3 = (0.0 * s, 0.0 * s, 1.0 + 0.0 * s)
+    e3_rate = _cross(omega, e3)
+    W_rate = _scale(-kappa, _add(v, _scale(arm3, e3_rate)))
+    in_face = _add(W_rate, _scale(-W[2], e3_rate))  # less its part along e3, which the next line takes off
+    e = _scale(-1.0, across)
+    along = _cross(e3, e)
+    e_rate = _scale(-1.0 / w, _add(in_face, _scale(-_dot(across, in_face), across)))
+    # e stays perpendicular to e3
+    e_rate = _add((e_rate[0], e_rate[1], 0.0 * s), _scale(-_dot(e, e3_rate), e3))
+    along_rate = _add(_cross(e3_rate, e), _cross(e3, e_rate))
+    turn = _dot(_add(e_rate, _scale(-1.0, _cross(omega, e))), along)
+    rim_rate = _add(_scale(p[1] * turn, e), _scale(p[0], e_rate))
+    rim_rate = _add(rim_rate, _add(_scale(p[2] * turn, along), _scale(p[1], along_rate)))
+    n_rate = _add(W_rate, _scale(-kappa, _add(_scale(p[0], e_rate), _scale(p[1] * turn, e))))
+    n_rate = _scale(1.0 / (1.0 - kappa * rho), n_rate)
+    return _add(_add(rim_rate, _scale(arm3, e3_rate)), _scale(-rho, n_rate)), n_rate
+
+
+@njit(error_model="numpy")
 def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
     """Fills the record of kinematic quantities from the state."""
     psi, theta = y[2], y[3]
     s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
     w1, w2, w3 = y[5], y[6], y[7]
-    arm, _ = _contact_arm(body, s, c)
-    turn = _cross((w1, w2, w3), arm)  # omega x r_OA
-    turn_n, turn_m, turn_z = turn[0], c * turn[1] - s * turn[2], s * turn[1] + c * turn[2]
     k.time, k.x, k.y, k.psi, k.theta, k.phi = t[0], y[0], y[1], psi, theta, y[4]
     k.sin_theta, k.cos_theta, k.thetadot, k.omega2, k.omega3 = s, c, w1, w2, w3
+    arm, normal, k.z = _contact(body, k)
+    turn = _cross((w1, w2, w3), arm)  # omega x r_OA
+    turn_n, turn_m, turn_z = turn[0], c * turn[1] - s * turn[2], s * turn[1] + c * turn[2]
+    k.normal_n, k.normal_m, k.normal_z = normal[0], c * normal[1] - s * normal[2], s * normal[1] + c * normal[2]
     k.psidot = w2 / s
     k.phidot = w3 - w2 * c / s
     k.omega_z = w2 * s + w3 * c
-    k.z, k.v_n, k.v_m, k.v_z = -(s * arm[1] + c * arm[2]), -turn_n, -turn_m, -turn_z
+    k.v_n, k.v_m, k.v_z = -turn_n, -turn_m, -turn_z
     if regime != ROLLING:
         k.v_n, k.v_m = y[8] * cp + y[9] * sp, y[9] * cp - y[8] * sp
+        rise = (k.v_n + turn_n) * k.normal_n + (k.v_m + turn_m) * k.normal_m
+        k.v_z = -turn_z - rise / k.normal_z  # the point at the contact stays on the table
     if regime == FLYING:
         k.z, k.v_z = y[10], y[11]
     k.slip_n, k.slip_m = k.v_n + turn_n, k.v_m + turn_m
@@ -135,8 +238,10 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     s, c, m = kin.sin_theta, kin.cos_theta, body.mass
     omega = (y[5], y[6], y[7])
     frame = (y[5], y[6], y[6] * c / s)
-    k = (0.0 * s, s, c)
-    arm, a = _contact_arm(body, s, c)
+    k = _nodal(kin.normal_n, kin.normal_m, kin.normal_z, s, c)
+    arm, _, _ = _contact(body, kin)
+    v = _nodal(kin.v_n, kin.v_m, kin.v_z, s, c)
+    arm_rate, k_rate = _contact_rates(body, kin, omega, frame, v)
     cf, sf = np.cos(kin.phi), np.sin(kin.phi)
     com = (body.com_1 * cf - body.com_2 * sf, body.com_1 * sf + body.com_2 * cf, body.com_3)
     D = _add(arm, _scale(-1.0, com))
@@ -146,7 +251,7 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     M0 = _nodal(w.M_n, w.M_m, w.M_z, s, c)
     L = _nodal(w.load_n, w.load_m, w.load_z, s, c)
     centripetal_G = _cross(omega, _cross(omega, com))
-    centripetal_A = _cross(omega, _cross(frame, a))
+    centripetal_A = _cross(omega, arm_rate)
     weight = _add(_scale(m, g), X)
     f0 = _add(_scale(m, _add(centripetal_G, _scale(-1.0, centripetal_A))), _scale(-1.0, weight))
     f0_z = _dot(k, f0)
@@ -166,8 +271,10 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     else:
         d = k
         if regime == SLIPPING:
-            v = body.inverse_friction * np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m)
-            d = _nodal(-kin.slip_n / v, -kin.slip_m / v, 1.0 + 0.0 * v, s, c)
+            slip_z = -(kin.slip_n * kin.normal_n + kin.slip_m * kin.normal_m) / kin.normal_z
+            slip = _nodal(kin.slip_n, kin.slip_m, slip_z, s, c)
+            d = _add(k, _scale(-1.0 / (body.inverse_friction * np.sqrt(_dot(slip, slip))), slip))
+            f0_z = f0_z - m * _dot(k_rate, slip)
             B = _add(_cross(D, d), L)
             J0, J1, J2 = _add(J0, _scale(B[0], Dk)), _add(J1, _scale(B[1], Dk)), _add(J2, _scale(B[2], Dk))
             b = _add(b, _scale(f0_z, B))
@@ -179,6 +286,9 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
         a_G = _scale(1.0 / m, _add(F, weight))
         a_O = _add(a_G, _scale(-1.0, _add(_cross(omegadot, com), centripetal_G)))
     w.F_n, w.F_m, w.F_z = F[0], c * F[1] - s * F[2], s * F[1] + c * F[2]
+    w.N = _dot(F, k)
+    tangential = _add(F, _scale(-w.N, k))
+    w.T = np.sqrt(_dot(tangential, tangential))
     return omegadot, frame, a_O
 
 
@@ -208,19 +318,18 @@ def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: An
 def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
     """Margins (EVENTS) that are positive while the regime lasts.
 
-    theta_end: nutation above its end. load: F_z, or in flight the gap. grip: rolling F_z - |F_t|/mu, slipping the slip
+    theta_end: nutation above its end. load: N, or in flight the gap. grip: rolling N - |F_t|/mu, slipping the slip
     speed. upright: the lower rim alone touches; beyond pi/2 it would be the other one.
     """
     _evaluate(t, y, table, body, kin, wrench)
     margin[0] = kin.theta - body.theta_end
     margin[3] = 0.5 * np.pi - kin.theta
-    margin[1] = wrench.F_z
+    margin[1] = wrench.N
     margin[2] = 1.0 + 0.0 * kin.theta
     if table[0] == ROLLING:
-        tangential = np.sqrt(wrench.F_n * wrench.F_n + wrench.F_m * wrench.F_m)
-        margin[2] = wrench.F_z - body.inverse_friction * tangential
+        margin[2] = wrench.N - body.inverse_friction * wrench.T
     if table[0] == SLIPPING:
         margin[2] = np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m) - STICK_SPEED
     if table[0] == FLYING:
-        arm, _ = _contact_arm(body, kin.sin_theta, kin.cos_theta)
-        margin[1] = kin.z + kin.sin_theta * arm[1] + kin.cos_theta * arm[2] + LIFT_OFF_GAP
+        _, _, z = _contact(body, kin)
+        margin[1] = kin.z - z + LIFT_OFF_GAP

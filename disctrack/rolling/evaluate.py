@@ -37,6 +37,7 @@ def kinematics(q: Array, qdot: Array, disc: Disc, gravity: float = 9.81, time: A
         "slip_n": v_n - h * omega2 + r * omega3,
         "slip_m": v_m + (r * s + h * c) * thetadot,
         **dict(radius=r, half_thickness=h, mass=disc.mass, gravity=gravity),
+        **dict(normal_n=0.0, normal_m=0.0, normal_z=1.0),
     }
     result = np.empty(theta.shape, record_dtype(KINEMATICS, float))
     for name in KINEMATICS:

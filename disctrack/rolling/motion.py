@@ -132,8 +132,8 @@ def motion_from_samples(
     omega_body = np.einsum("nji,nj->ni", R, omega)
     v_G = qdot[:, :3] + np.cross(omega, com)
     gravity = np.array([b["g_x"], b["g_y"], b["g_z"]])
-    load = w["F_z"]
-    force = np.stack([w["F_n"], w["F_m"], load], axis=-1)
+    load = w["N"]
+    force = np.stack([w[f"F_{a}"] for a in "nmz"], axis=-1)
     moment = np.stack([w[f"M_{a}"] + w[f"load_{a}"] * load for a in "nmz"], axis=-1)
     external = np.stack([w["X_n"], w["X_m"], w["X_z"]], axis=-1)
     contact_axes = np.stack(

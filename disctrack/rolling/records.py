@@ -43,6 +43,9 @@ KINEMATICS = (
     "half_thickness",
     "mass",
     "gravity",  # magnitude [m/s^2]
+    "normal_n",  # of the table at the contact
+    "normal_m",
+    "normal_z",
 )
 
 # Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k). F is the answer.
@@ -59,6 +62,8 @@ WRENCH = (
     "F_n",  # contact force on the disc [N], solved from the equations of motion; not to be set by a law
     "F_m",
     "F_z",
+    "N",  # its part along the normal of the table at the contact: F_z on a flat one
+    "T",  # and the size of the rest, which friction has to supply
 )
 
 # Constants of one body on one table. Inertia about the centre of mass in body axes.
@@ -67,6 +72,13 @@ BODY = (
     "radius",  # r: the contact runs on the circle of this radius ...
     "half_thickness",  # ... this far below O along -e3
     "edge_radius",  # of the rounded edge; 0 = sharp
+    "oval_c",  # rim's support function r + oval_c cos 2 beta + oval_s sin 2 beta + lobes_c cos 3 beta + ..., by the
+    "oval_s",  # angle beta in the body [m]
+    "lobes_c",
+    "lobes_s",
+    "curvature",  # of the table, a sphere through the origin: positive in a hollow [1/m]
+    "slope_x",  # of the table at the origin, descending towards i, and j
+    "slope_y",
     "com_1",  # centre of mass from O in body axes [m]
     "com_2",
     "com_3",

@@ -196,8 +196,8 @@ def _switch(
     if name == "load":
         return None, FLYING, _full_state(assembly, regime, t, y)
     _, _, wrench = _rates(assembly, ROLLING, t, y[:8])
-    F_n, F_m, F_z = (wrench[f"F_{axis}"][0] for axis in "nmz")
-    holds = (F_z - assembly.constant("inverse_friction") * np.sqrt(F_n * F_n + F_m * F_m)).real > 0
+    F_n, F_m = (wrench[f"F_{axis}"][0] for axis in "nm")
+    holds = (wrench["N"][0] - assembly.constant("inverse_friction") * wrench["T"][0]).real > 0
     if regime == SLIPPING and holds:
         return None, ROLLING, y[:8]
     return None, SLIPPING, _slipping_state(assembly, t, y[:8], F_n, F_m)

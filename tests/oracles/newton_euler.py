@@ -8,6 +8,7 @@ State: O (3), quaternion (4), velocity of O (3), omega (3), all in world axes; p
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 K = np.array([0.0, 0.0, 1.0])
 
@@ -15,8 +16,23 @@ K = np.array([0.0, 0.0, 1.0])
 class Disc:
     """Numbers of the body; defaults are the homogeneous disc with a sharp edge."""
 
-    def __init__(self, r, h, m, gravity=(0, 0, -9.81), J_body=None, com_body=(0, 0, 0), edge=0.0, mu=np.inf, laws=()):
+    def __init__(
+        self,
+        r,
+        h,
+        m,
+        gravity=(0, 0, -9.81),
+        J_body=None,
+        com_body=(0, 0, 0),
+        edge=0.0,
+        mu=np.inf,
+        laws=(),
+        bowl=None,
+        waves=(),
+    ):
         self.r, self.h, self.m, self.edge, self.mu, self.laws = r, h, m, edge, mu, laws
+        self.bowl = None if bowl is None else (np.array(bowl[0], float), bowl[1])  # centre and radius of a sphere
+        self.waves = waves  # of the rim: (number around, cosine, sine) of its support function
         self.g = np.array(gravity, float)
         J1 = m * r * r / 4 + m * h * h / 3
         self.J = np.diag([J1, J1, m * r * r / 2]) if J_body is None else np.array(J_body, float)
@@ -68,12 +84,48 @@ class Instant:
         rim, height = disc.r - disc.edge, disc.h - disc.edge
         self.arm = -rim * e2 - height * d - disc.edge * K
         self.arm_rate = -rim * e2_rate - height * d_rate
+        self.normal, self.normal_rate = K, np.zeros(3)
+        if disc.bowl is not None:
+            self.touch_the_bowl(disc, d, d_rate)
+        if disc.waves:
+            self.touch_with_the_rim(disc, d, d_rate, e2, e2_rate)
         self.n0 = np.cross(e2, d)  # e1 = e2 x e3
         self.m0 = np.cross(K, self.n0)
         self.psidot = (d[0] * d_rate[1] - d[1] * d_rate[0]) / sine**2
         self.phidot = self.omega @ d - self.psidot * d[2]
         self.thetadot = self.omega @ self.n0
         self.v_contact = self.v + np.cross(self.omega, self.arm)
+
+    def touch_the_bowl(self, disc, d, d_rate):
+        """A sharp edge in a sphere seen from inside: the point of the rim that is farthest from its centre."""
+        centre, radius = disc.bowl
+        to_centre, to_centre_rate = centre - (self.O - disc.h * d), -(self.v - disc.h * d_rate)
+        height = to_centre @ d
+        inwards = to_centre - height * d
+        inwards_rate = to_centre_rate - (to_centre_rate @ d + to_centre @ d_rate) * d - height * d_rate
+        length = np.linalg.norm(inwards)
+        out = -inwards / length
+        out_rate = -inwards_rate / length + inwards * (inwards @ inwards_rate) / length**3
+        self.arm = disc.r * out - disc.h * d
+        self.arm_rate = disc.r * out_rate - disc.h * d_rate
+        self.normal = (centre - self.O - self.arm) / radius
+        self.normal_rate = -(self.v + self.arm_rate) / radius
+
+    def touch_with_the_rim(self, disc, d, d_rate, e2, e2_rate):
+        """A sharp edge on a flat table: the point of the rim with the lowest tangent; the body's axes by R."""
+        e = -e2
+        angle = np.arctan2(e @ self.R[:, 1], e @ self.R[:, 0])
+        along = np.cross(d, e)
+        along_rate = np.cross(d_rate, e) - np.cross(d, e2_rate)
+        # the body turns under the contact
+        angle_rate = -(e2_rate + np.cross(self.omega, e)) @ along
+        p, slope, bend = disc.r, 0.0, 0.0
+        for k, c, s in disc.waves:
+            p += c * np.cos(k * angle) + s * np.sin(k * angle)
+            slope += k * (s * np.cos(k * angle) - c * np.sin(k * angle))
+            bend -= k * k * (c * np.cos(k * angle) + s * np.sin(k * angle))
+        self.arm = p * e + slope * along - disc.h * d
+        self.arm_rate = (slope * e + bend * along) * angle_rate - p * e2_rate + slope * along_rate - disc.h * d_rate
 
 
 def accelerations(disc, state, regime):
@@ -92,8 +144,9 @@ def accelerations(disc, state, regime):
     # m (a + wd x rho) - F = m g + X - m w x (w x rho)
     A[0:3, 0:3], A[0:3, 3:6], A[0:3, 6:9] = m * np.eye(3), -m * S(rho), -np.eye(3)
     b[0:3] = m * disc.g + X - m * np.cross(w, np.cross(w, rho))
-    # J_O wd + m rho x a - arm x F - M_load F_z = M_fixed + rho x m g - w x J_O w
-    A[3:6, 0:3], A[3:6, 3:6], A[3:6, 6:9] = m * S(rho), J_O, -S(now.arm) - np.outer(M_load, K)
+    # J_O wd + m rho x a - arm x F - M_load N = M_fixed + rho x m g - w x J_O w
+    n = now.normal
+    A[3:6, 0:3], A[3:6, 3:6], A[3:6, 6:9] = m * S(rho), J_O, -S(now.arm) - np.outer(M_load, n)
     b[3:6] = M_fixed + np.cross(rho, m * disc.g) - np.cross(w, J_O @ w)
     # a + wd x arm + w x arm_rate = 0, all of it (rolling) or its vertical part (slipping), or F = 0
     constraint = np.hstack([np.eye(3), -S(now.arm), np.zeros((3, 3))])
@@ -101,10 +154,12 @@ def accelerations(disc, state, regime):
     if regime == "rolling":
         A[6:9], b[6:9] = constraint, right
     elif regime == "slipping":
-        A[6], b[6] = constraint[2], right[2]
+        A[6], b[6] = n @ constraint, n @ right - now.normal_rate @ now.v_contact
         direction = now.v_contact / np.linalg.norm(now.v_contact)
-        for row, axis in ((7, 0), (8, 1)):
-            A[row, 6 + axis], A[row, 8] = 1.0, disc.mu * direction[axis]
+        # F + mu N direction has no part in the table's plane
+        for row, axis in ((7, np.array([1.0, 0, 0])), (8, np.array([0, 1.0, 0]))):
+            axis = axis - (axis @ n) * n
+            A[row, 6:9] = axis + disc.mu * (axis @ direction) * n
     else:
         A[6:9, 6:9] = np.eye(3)
     solution = np.linalg.solve(A, b)
@@ -120,9 +175,21 @@ def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, vel
     state[3:7], state[10:13], state[13], state[14] = quaternion_from_angles(psi, theta, phi), omega, psi, phi
     now = Instant(disc, state)
     state[:3] = x, y, -now.arm[2]
+    if disc.bowl is not None:  # lowered until the rim touches
+        centre, radius = disc.bowl
+
+        def gap(z):
+            state[2] = z
+            return np.linalg.norm(centre - state[:3] - Instant(disc, state).arm) - radius
+
+        state[2] = brentq(gap, state[2] - 0.03, state[2] + 0.03, xtol=1e-16, rtol=1e-15)
+        now = Instant(disc, state)
     state[7:10] = -np.cross(omega, now.arm)
     if velocity is not None:
+        n = now.normal
         state[7:9] = velocity
+        slip = state[7:10] + np.cross(omega, now.arm)
+        state[9] -= slip @ n / n[2]
     return state
 
 

@@ -215,6 +215,22 @@ EFFECTS = {
             "gravity": 9.81 * np.array([0.03, -0.02, -np.sqrt(1 - 0.03**2 - 0.02**2)]),
         },
     ),
+    "hollow": (
+        {
+            "table_curved": {"kappa": 0.8, "slope_x": 0.03, "slope_y": -0.02},
+            "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4},
+            "km": {"k_m": 4e-8},
+        },
+        {
+            "laws": [newton_euler.precession_friction(4e-8)],
+            "com_body": (1e-3, -5e-4, 3e-4),
+            "bowl": (np.array([0.03, -0.02, np.sqrt(1 - 0.03**2 - 0.02**2)]) / 0.8, 1 / 0.8),
+        },
+    ),
+    "out of round": (
+        {"rim": {"oval_c": 3e-4, "oval_s": -2e-4, "lobes_c": 1e-4, "lobes_s": 1.5e-4}, "km": {"k_m": 4e-8}},
+        {"laws": [newton_euler.precession_friction(4e-8)], "waves": ((2, 3e-4, -2e-4), (3, 1e-4, 1.5e-4))},
+    ),
     "body": (
         {
             "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4},
@@ -257,6 +273,9 @@ def test_accelerations_and_forces_agree_with_the_world_vector_system(name, regim
         oracle.laws = [newton_euler.linear_drag(0.02), *STANDING_FORCES] if name == "forces" else []
     for _ in range(20):
         state = random_state(rng)
+        if name == "hollow":  # within it, and steeper than its sides
+            state = random_state(rng, np.radians(rng.uniform(12, 85)))
+            state = state.moved(x=0.05 * state.x, y=0.05 * state.y)
         velocity = None if regime == "rolling" else rng.normal(size=2)
         start = newton_euler.state_from_angles(oracle, *state.array, velocity)
         if regime != "rolling":
@@ -281,7 +300,10 @@ def test_accelerations_and_forces_agree_with_the_world_vector_system(name, regim
             assert_allclose(rates[8:10], a[:2], atol=tolerance * (1 + np.abs(a).max()))
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("ideal", 2e-9), ("forces", 2e-9), ("body", 2e-9), ("friction", 1e-6)])
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [("ideal", 2e-9), ("forces", 2e-9), ("body", 2e-9), ("hollow", 2e-9), ("out of round", 2e-9), ("friction", 1e-6)],
+)
 def test_motion_agrees_with_the_world_vector_integration(name, tolerance):
     """Tolerances: accumulated errors of two integrators at 1e-11; with k_z, its sign smoothed over 0.01 rad/s."""
     model, oracle = pair(name)

@@ -10,7 +10,10 @@ from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, State
 
 # Parameters of one effect that act so differently that each part is a question of its own.
-_PARTS = {"centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)}}
+_PARTS: dict[str, dict[str, tuple[str, ...]]] = {
+    "centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)},
+    "rim": {"rim_oval": ("oval_c", "oval_s"), "rim_lobes": ("lobes_c", "lobes_s")},
+}
 SLIP = "slip.inverse_mu"
 STATE_SCALES = {
     "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,

@@ -115,6 +115,47 @@ class RoundedEdge(Effect):
         body.edge_radius = body.edge_radius + p.rho
 
 
+class CurvedTable(Effect):
+    """The table is a sphere: a hollow (positive curvature) or a dome, with any slope at the origin."""
+
+    name = "table_curved"
+    title = "table of curvature kappa = 1 / radius, z = kappa (x^2 + y^2) / 2 - slope_x x - slope_y y"
+    source = "geometry; the base of the toy is a shallow hollow (Moffatt 2000; Petrie, Hunt and Gray 2002)"
+    belongs_to = ("surface",)
+    parameters = (
+        EffectParameter("kappa", "1/m", 0.1, "curvature, positive in a hollow", lower=-10.0, upper=10.0),
+        EffectParameter("slope_x", "rad", 1e-3, "kappa times the x of the lowest point", lower=-0.3, upper=0.3),
+        EffectParameter("slope_y", "rad", 1e-3, "kappa times the y of the lowest point", lower=-0.3, upper=0.3),
+    )
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.curvature = body.curvature + p.kappa
+        body.slope_x, body.slope_y = body.slope_x + p.slope_x, body.slope_y + p.slope_y
+
+
+class RimShape(Effect):
+    """The rim is no circle: its distance from the axis, tangent by tangent, has two and three waves around."""
+
+    name = "rim"
+    title = "rim out of round, p = r + oval_c cos 2 beta + oval_s sin 2 beta + lobes_c cos 3 beta + lobes_s sin 3 beta"
+    source = "support function of a convex curve; a disc that is no circle: Baranyai and Varkonyi 2017"
+    belongs_to = ("disc",)
+    parameters = (
+        EffectParameter("oval_c", "m", 1e-5, "two waves, cosine of the angle in the body", lower=-2e-3, upper=2e-3),
+        EffectParameter("oval_s", "m", 1e-5, "two waves, sine", lower=-2e-3, upper=2e-3),
+        EffectParameter("lobes_c", "m", 1e-5, "three waves, cosine", lower=-1e-3, upper=1e-3),
+        EffectParameter("lobes_s", "m", 1e-5, "three waves, sine", lower=-1e-3, upper=1e-3),
+    )
+    passive = False
+
+    @staticmethod
+    def adjust(body: Any, p: Any) -> None:
+        body.oval_c, body.oval_s = body.oval_c + p.oval_c, body.oval_s + p.oval_s
+        body.lobes_c, body.lobes_s = body.lobes_c + p.lobes_c, body.lobes_s + p.lobes_s
+
+
 class DiametralInertia(Effect):
     """J1 = J2 differ from the homogeneous disc's."""
 
