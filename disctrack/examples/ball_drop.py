@@ -23,10 +23,10 @@ from calibration.arrays import Array
 from disctrack.diagnosis import Settings
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out
-from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, SmoothNoise, estimate
+from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, estimate
 from disctrack.diagnosis.engine.search import CLASS_GAIN
 from disctrack.diagnosis.engine.system import Subset
-from disctrack.diagnosis.equations import Answer, Equations, Parameter, Run, Term, diagnose
+from disctrack.diagnosis.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.diagnosis.equations.system import EquationSystem
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command

@@ -15,8 +15,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import disctrack
-from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
-from disctrack.diagnosis.equations import Equations, Parameter, Run, Term, diagnose, terms
+from disctrack.diagnosis.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, terms
 from disctrack.diagnosis.equations.declared import checked
 from disctrack.diagnosis.equations.formulas import formulas
 from disctrack.diagnosis.equations.noise import fast_part, step_of
@@ -81,6 +80,10 @@ def test_noise_of_known_memory_and_numbers_of_a_group_of_runs(rng):
     ]
     expected = sum(x @ np.linalg.solve(noise.covariance(time), x) for x in left)
     assert_allclose(np.sum(residual**2), expected, rtol=1e-6)
+    with pytest.raises(AnalysisError, match="run a: fewer than 8 samples until fit_until"):
+        diagnose(equations, replace(runs[0], fit_until=0.1), [terms.coulomb("v")])
+    with pytest.raises(AnalysisError, match="no run keeps samples back"):
+        diagnose(equations, runs[1:], [terms.coulomb("v")])
     with pytest.raises(AnalysisError, match="run a needs groups"):
         diagnose(equations, replace(runs[0], groups={}), [terms.coulomb("v")])
 

@@ -11,8 +11,9 @@
 is disctrack/docs/systems.md.
 """
 
+from disctrack.diagnosis.engine.noise_with_memory import SmoothNoise
 from disctrack.diagnosis.equations import terms
 from disctrack.diagnosis.equations.answer import Answer, diagnose
 from disctrack.diagnosis.equations.declared import Equations, Parameter, Run, Term
 
-__all__ = ["Answer", "Equations", "Parameter", "Run", "Term", "diagnose", "terms"]
+__all__ = ["Answer", "Equations", "Parameter", "Run", "SmoothNoise", "Term", "diagnose", "terms"]

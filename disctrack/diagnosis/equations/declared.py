@@ -203,6 +203,10 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
             f"run {name}: needs 8 samples or more at finite, increasing times; found {n}"
             + (f", and time[{bad}] = {time[bad]:g} after {time[bad - 1]:g}." if bad else ".")
         )
+    if run.fit_until is not None and np.sum(time - time[0] <= run.fit_until) < 8:
+        raise AnalysisError(
+            f"run {name}: fewer than 8 samples until fit_until = {run.fit_until:g} s; a fit needs them."
+        )
     missing = [c for c in channels if c not in run.data]
     if len(missing) == len(channels):
         raise AnalysisError(f"run {name}: no data for {', '.join(channels)}; there is {', '.join(run.data)}.")

@@ -26,7 +26,7 @@ from disctrack.diagnosis.equations.noise import (
     with_noise,
 )
 from disctrack.diagnosis.equations.start import LOST, guessed, led, misfit, turn
-from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part
+from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part, fitted_rows
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
@@ -62,6 +62,8 @@ def ask(
     runs = [runs] if isinstance(runs, Run) else list(runs)
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
+    if all(fitted_rows(s).all() for s in given):
+        raise AnalysisError("no run keeps samples back to judge the fit: give one of them a smaller fit_until.")
     channels = equations.channels(runs[0])
     offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
     compiled = formulas(equations, offered, channels)
