@@ -58,27 +58,10 @@ class Assessment:
 def consistency_factor(refinement: Refinement) -> float:
     """Variance of the parameters as the views disagree about them, over the one that the corners' noise predicts.
 
-    Each view, left out in turn, would move the parameters; to first order by H^-1 g_v with g_v its gradient at the
-    common minimum. Noise alone gives E[g_v g_v^T] = H_v - H_v H^-1 H_v, so the ratio of the sum of g_v^T H^-1 g_v to
-    its expectation is 1 for a right model, and more where errors are common to the corners of a view.
+    1 for a right model, and more where errors are common to the corners of a view.
     """
-    shift, spread, covariance = _shifts_by_views(refinement)
-    # the board's own shape is nuisance: compare the stereo parameters' shifts only
-    metric = np.linalg.inv(covariance[: covariance.shape[1]])
-    seen = float(np.einsum("vi,ij,vj->", shift, metric, shift))
-    expected = float(np.sum(metric * (covariance.T @ spread.sum(0) @ covariance)))
-    return seen / expected if expected > 0 else float("nan")
-
-
-def _shifts_by_views(refinement: Refinement) -> tuple[Array, Array, Array]:
-    """Shift of the stereo parameters by each view (v, s1), its gradients' expected (v, s, s), covariance (s, s1)."""
-    s1 = refinement.problem.stereo_basis.shape[1]
-    information, gradient = refinement.normal.view_information()
-    scale = 1.0 / np.sqrt(np.diag(information.sum(0)))  # the parameters' units differ by 10^6
-    information, gradient = information * scale[:, None] * scale, gradient * scale
-    inverse = np.linalg.inv(information.sum(0))
-    covariance: Array = inverse[:, :s1]
-    return gradient @ covariance, information - information @ inverse @ information, covariance
+    problem = refinement.problem
+    return refinement.normal.disagreement(problem.stereo_basis.shape[1])
 
 
 def stereo_covariance(refinement: Refinement) -> Array:
@@ -89,9 +72,10 @@ def stereo_covariance(refinement: Refinement) -> Array:
     them, are shrunk towards equal directions as far as so few views scatter (Ledoit and Wolf 2004); nothing gets
     smaller than by the corners' noise.
     """
-    shift, spread, inverse = _shifts_by_views(refinement)
-    s1, views = shift.shape[1], len(np.unique(refinement.problem.observations.view))
-    expected = inverse.T @ spread.sum(0) @ inverse
+    problem = refinement.problem
+    s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
+    shift, spread, inverse = refinement.normal.shifts_by_views(s1)
+    expected = inverse.T @ spread @ inverse
     values, vectors = np.linalg.eigh(expected)
     root = vectors * np.sqrt(np.maximum(values, 1e-12 * values.max()))  # expected = root root^T
     white = np.linalg.solve(root, shift.T)
@@ -102,8 +86,13 @@ def stereo_covariance(refinement: Refinement) -> Array:
     factor, directions = np.linalg.eigh(kept * seen + (1 - kept) * mean * np.eye(s1))
     beyond = root @ directions * np.sqrt(np.maximum(factor - 1.0, 0.0))
     share = s1 / max(float(np.trace(np.linalg.solve(inverse[:s1], expected))), 1e-12)  # noise moves fewer than all
-    scale = 1.0 / np.sqrt(np.diag(refinement.normal.view_information()[0].sum(0)))[:s1]
-    result: Array = (inverse[:s1] + share * beyond @ beyond.T) * scale[:, None] * scale
+    information = refinement.normal.view_information()[0]
+    scale = 1.0 / np.sqrt(np.diag(information.sum(0)))
+    by_prior = np.zeros((s1, s1))
+    if problem.prior is not None:  # it was weighted as if it were one of views that disagree as much
+        told = max(problem.prior.weight - 1.0, 0.0) * information[-1] * scale[:, None] * scale
+        by_prior = inverse.T @ told @ inverse
+    result: Array = (inverse[:s1] + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result
 
 
@@ -345,9 +334,8 @@ def _verdict(
     rms = refinement.rms()
     held_out = chosen.held_out_rms_px if chosen is not None and np.isfinite(chosen.held_out_rms_px) else rms
     limits = (0.05, GOOD_RMS_PX, POOR_RMS_PX)
-    judged = [(int(np.searchsorted(limits, held_out)), f"views left out of the fit give {held_out:.4f} px")]
-    if wide:
-        judged.append((3, wide[0].partition(":")[0]))
+    judged = [(3, wide[0].partition(":")[0])] if wide else []  # of equal grades the first is told: the cause
+    judged.append((int(np.searchsorted(limits, held_out)), f"views left out of the fit give {held_out:.4f} px"))
     if pairs < MIN_GOOD_VIEWS:
         judged.append((2 if pairs > 3 else 3, f"only {pairs} views were seen by both cameras"))
     if held_out > 2 * rms:

@@ -18,6 +18,7 @@ from calibration.grey_levels import level_step
 
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
 MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
+MOST_FURTHER = 3  # lines of corners beyond those declared that are counted: straight on, whatever the perspective
 MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
 
 
@@ -159,34 +160,42 @@ def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int,
 
 
 def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:
-    """A message if a full line of further corners lies beyond one side: the board is larger than was declared."""
+    """A message if full lines of further corners lie beyond a side: the board is larger than was declared."""
     columns, rows = inner_corners
     grid = view.points.reshape(rows, columns, 2)
-    sides = {
-        "i": (2 * grid[:, 0] - grid[:, 1], 2 * grid[:, -1] - grid[:, -2]),
-        "j": (2 * grid[0] - grid[1], 2 * grid[-1] - grid[-2]),
-    }
     axes = local_axes(view.points, view.accepted, inner_corners).reshape(rows, columns, 2, 2)
-    local = {"i": (axes[:, 0], axes[:, -1]), "j": (axes[0], axes[-1])}
-    typical = float(np.median(view.contrast[view.accepted]))
-    offsets = 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    for name, lines in sides.items():
-        for line, line_axes in zip(lines, local[name], strict=True):
-            at = line[:, None] + offsets @ line_axes
-            inside = np.isfinite(at).all((1, 2)) & (at >= 0).all((1, 2))
-            inside &= (at[..., 0] < grey.shape[1] - 1).all(1) & (at[..., 1] < grey.shape[0] - 1).all(1)
-            if inside.sum() < 3 or inside.mean() < 0.5:
-                continue
-            x, y = np.rint(at[inside]).astype(int).transpose(2, 0, 1)
-            v = grey[y, x]
-            saddle = np.minimum(np.minimum(v[:, 0], v[:, 1]) - np.maximum(v[:, 2], v[:, 3]), np.inf)
-            opposite = np.minimum(v[:, 2], v[:, 3]) - np.maximum(v[:, 0], v[:, 1])
-            if np.mean(np.maximum(saddle, opposite) > 0.5 * typical) > 0.7:
-                return (
-                    f"the board goes on beyond the {columns} x {rows} inner corners that were declared (along {name}): "
-                    "count the inner corners again"
-                )
-    return None
+    least = 0.5 * float(np.median(view.contrast[view.accepted]))
+    further = [0, 0]
+    for along, across in ((0, 1), (1, 0)):
+        for last, before in ((0, 1), (-1, -2)):
+            line, step = np.take(grid, last, across), np.take(grid, last, across) - np.take(grid, before, across)
+            line_axes = np.take(axes, last, across)
+            lines = 0
+            while lines < MOST_FURTHER and _crosses(grey, line + (lines + 1) * step, line_axes, least):
+                lines += 1
+            further[along] += lines
+    if not any(further):
+        return None
+    all_columns, all_rows = columns + further[0], rows + further[1]
+    return (
+        f"the board goes on beyond the {columns} x {rows} inner corners that were declared: {all_columns} x {all_rows} "
+        f"are in view. If that is all of them, declare inner_corners = [{all_columns}, {all_rows}]; a part of a board "
+        "cannot be told from its neighbour, one square further on"
+    )
+
+
+def _crosses(grey: Array, line: Array, axes: Array, least: float) -> bool:
+    """Whether two light and two dark squares meet at most points (n, 2) of a line; axes (n, 2, 2) of a square."""
+    at = line[:, None] + 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
+    inside = np.isfinite(at).all((1, 2)) & (at >= 0).all((1, 2))
+    inside &= (at[..., 0] < grey.shape[1] - 1).all(1) & (at[..., 1] < grey.shape[0] - 1).all(1)
+    if inside.sum() < 3 or inside.mean() < 0.5:
+        return False
+    x, y = np.rint(at[inside]).astype(int).transpose(2, 0, 1)
+    v = grey[y, x]
+    saddle = np.minimum(v[:, 0], v[:, 1]) - np.maximum(v[:, 2], v[:, 3])
+    opposite = np.minimum(v[:, 2], v[:, 3]) - np.maximum(v[:, 0], v[:, 1])
+    return bool(np.mean(np.maximum(saddle, opposite) > least) > 0.7)
 
 
 __all__ = ["BoardNotFound", "CornerView", "board_orders", "find_corners", "grey_values"]

@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.errors import CalibrationError
+from calibration.priors import Prior
 from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved, predict_poses
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations of one linearisation: shared parameters first, the views' poses kept apart."""
+    """Normal equations of one linearisation: shared parameters first, the views' poses kept apart.
+
+    A prior is one more view at the end, whose pose tells nothing.
+    """
 
     stereo: Array  # (n_views, s1, s1) each view's part, stereo parameters alone
     stereo_point: Array  # (n_views, s1, 3 n) the same between stereo parameters and the target's points
@@ -29,6 +33,7 @@ class Normal:
     pose: Array  # (n_views, 6, 6)
     pose_gradient: Array  # (n_views, 6)
     costs: Array  # (n_views,) chi-square, or Huber's sum when robust
+    n_views: int  # without the prior
 
     @property
     def cost(self) -> float:
@@ -36,8 +41,8 @@ class Normal:
         return float(self.costs.sum())
 
     def of_views(self, kept: NDArray[np.intp]) -> Normal:
-        """The normal equations of some of the views alone."""
-        use = np.zeros(len(self.costs), bool)
+        """The normal equations of some of the views alone, and of the prior."""
+        use = np.arange(len(self.costs)) >= self.n_views
         use[kept] = True
 
         def part(values: Array) -> Array:
@@ -100,6 +105,32 @@ class Normal:
         shared = np.stack([self._assembled(*part) for part in parts])
         return shared - self.cross @ carried, self.gradient - np.einsum("vsi,vi->vs", self.cross, own)
 
+    def shifts_by_views(self, s1: int) -> tuple[Array, Array, Array]:
+        """What each view, left out in turn, tells of the first s1 shared parameters, each in units of a `scale`.
+
+        To first order the shift is H^-1 g_v with g_v the view's gradient at the common minimum; noise alone gives
+        E[g_v g_v^T] = H_v - H_v H^-1 H_v. A prior is no view, and part of H alone.
+
+        returns : shifts (n_views, s1), the sum of the expected g_v g_v^T (s, s), and H^-1 (s, s1)
+        """
+        information, gradient = self.view_information()
+        scale = 1.0 / np.sqrt(np.diag(information.sum(0)))  # the parameters' units differ by 10^6
+        information, gradient = information * scale[:, None] * scale, gradient * scale
+        inverse = np.linalg.inv(information.sum(0))
+        views = information[: self.n_views]
+        expected = (views - views @ inverse @ views).sum(0)
+        covariance: Array = inverse[:, :s1]
+        return gradient[: self.n_views] @ covariance, expected, covariance
+
+    def disagreement(self, s1: int) -> float:
+        """Variance of the first s1 parameters as the views disagree about them, over what the noise predicts."""
+        shift, spread, covariance = self.shifts_by_views(s1)
+        # the board's own shape is nuisance: compare the stereo parameters' shifts only
+        metric = np.linalg.inv(covariance[:s1])
+        seen = float(np.einsum("vi,ij,vj->", shift, metric, shift))
+        expected = float(np.sum(metric * (covariance.T @ spread @ covariance)))
+        return seen / expected if expected > 0 else float("nan")
+
     def covariances(self) -> tuple[Array, Array, Array]:
         """Of the shared parameters (s, s), of each pose (v, 6, 6), and between shared and pose (v, s, 6)."""
         carried, _ = self._eliminated(self.pose)
@@ -131,10 +162,13 @@ class Problem:
     shape_basis: Array  # (n, 3, s2) free directions of the target's points
     n_views: int
     huber: float = np.inf  # residuals beyond this many sigmas count linearly
+    prior: Prior | None = None  # of the cameras
 
     def linearise(self, model: StereoModel) -> Normal:
         """Normal equations at the model."""
         o = self.observations
+        if np.any(np.diff(o.view) < 0):
+            raise ValueError("observations must be sorted by view")
         pixels, d_stereo, d_pose, R = predict_poses(model, o)
         residuals = o.pixels - pixels
         m, s1, s2 = len(o), self.stereo_basis.shape[1], self.shape_basis.shape[-1]
@@ -146,15 +180,19 @@ class Problem:
         block[..., -1] = residuals
         mahalanobis = np.sqrt(quadratic(self.weights, residuals))
         cost, factor = _huber(mahalanobis, self.huber)
-        costs = np.bincount(o.view, cost, self.n_views).astype(np.float64)
+        V = self.n_views + (self.prior is not None)
+        costs = np.bincount(o.view, cost, V).astype(np.float64)
         weights = self.weights * factor[:, None, None]
         block = _whitened(block, weights)
-        V = self.n_views
         squares = np.zeros((V, s1 + 7, s1 + 7))
         bounds = np.searchsorted(o.view, np.arange(V + 1))
         for v in range(V):
             rows = block[bounds[v] : bounds[v + 1]].reshape(-1, s1 + 7)
             squares[v] = rows.T @ rows
+        if self.prior is not None:
+            information, towards, costs[-1] = self.prior.normal(model)
+            squares[-1, :s1, :s1] = self.stereo_basis.T @ information @ self.stereo_basis
+            squares[-1, :s1, -1] = self.stereo_basis.T @ towards
         pose = squares[:, s1:-1, s1:-1]
         pose[bounds[1:] == bounds[:-1]] = np.eye(6)
         stereo_point, point = np.zeros((V, s1, 0)), np.zeros((V, 0, 3, 3))
@@ -183,12 +221,13 @@ class Problem:
             pose=pose,
             pose_gradient=squares[:, s1:-1, -1],
             costs=costs,
+            n_views=self.n_views,
         )
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""
         s1 = self.stereo_basis.shape[1]
-        return moved(model, self.stereo_basis @ shared[:s1], poses, self.shape_basis @ shared[s1:])
+        return moved(model, self.stereo_basis @ shared[:s1], poses[: self.n_views], self.shape_basis @ shared[s1:])
 
 
 def _whitened(block: Array, weights: Array) -> Array:

@@ -12,10 +12,12 @@ import numpy as np
 from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
+from calibration.priors import Prior, camera_priors
 from calibration.stereo_model import Observations, StereoModel, Terms, board_basis, predict_pixels, restricted
 
 FREE_ROUNDS = 6  # of rejection, in which a point may come back; then it may not, so that the rounds come to an end
 MAX_ROUNDS = 12
+MOST_DISAGREEMENT = 100.0  # of views among each other that is believed, and the least: few of them tell it badly
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ def refine_stereo(
     terms: Terms | None = None,
     reject_beyond: float = 5.5,
     begin: Refinement | None = None,
+    priors: bool = True,
 ) -> Refinement:
     """Refine everything `terms` frees, from image points of any flat target.
 
@@ -65,6 +68,7 @@ def refine_stereo(
     nominal : (n, 3) [m] the target's points as declared
     reject_beyond : sigmas, after the noise that the residuals themselves show: of 10^4 good points none lies beyond
     begin : an earlier refinement of the same observations with other terms: spares the robust start
+    priors : whether what is known of cameras beforehand counts, see `priors`
 
     Raises CalibrationError if the views cannot determine the parameters.
     """
@@ -74,13 +78,15 @@ def refine_stereo(
     stereo_basis, shape_basis = terms.stereo_basis(), board_basis(nominal, terms.board)
     kept = np.ones(len(observations), bool)
     model, total = restricted(start if begin is None else begin.model, nominal, terms), 0
+    prior = camera_priors(model) if priors else None
     if begin is None:
-        model, extra = _robust_start(observations, model, stereo_basis, shape_basis, n_views)
+        model, extra = _robust_start(observations, model, stereo_basis, shape_basis, n_views, prior)
     else:
         kept, extra = begin.kept, begin.unexplained_sigma**2
     for turn in range(MAX_ROUNDS):
         used = observations[kept]
-        problem = Problem(used, inverse_covariance(used.covariance, extra), stereo_basis, shape_basis, n_views)
+        weights = inverse_covariance(used.covariance, extra)
+        problem = Problem(used, weights, stereo_basis, shape_basis, n_views, prior=prior)
         dof = _degrees_of_freedom(problem, len(used))
         if dof <= 0:
             raise CalibrationError(
@@ -89,6 +95,10 @@ def refine_stereo(
             )
         minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
         model, total = minimum.model, total + minimum.iterations
+        if prior is not None:
+            disagreement = float(np.nan_to_num(minimum.normal.disagreement(stereo_basis.shape[1])))
+            weight = min(max(disagreement, 1.0 / MOST_DISAGREEMENT), MOST_DISAGREEMENT)
+            prior = replace(prior, weight=weight)
         residuals = observations.pixels - predict_pixels(model, observations)
         new_extra = _extra_variance(residuals[kept], used.covariance, dof)
         new_kept = _mahalanobis2(residuals, observations.covariance, new_extra) < reject_beyond**2
@@ -102,7 +112,7 @@ def refine_stereo(
     # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that
     # nothing is left of where the rough rounds happened to stop
     for _ in range(2):
-        problem = replace(problem, weights=inverse_covariance(used.covariance, extra))
+        problem = replace(problem, weights=inverse_covariance(used.covariance, extra), prior=prior)
         minimum = minimise(problem, model, tolerance=1e-14, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict_pixels(model, observations)
@@ -124,7 +134,12 @@ def refine_stereo(
 
 
 def _robust_start(
-    observations: Observations, model: StereoModel, stereo_basis: Array, shape_basis: Array, n_views: int
+    observations: Observations,
+    model: StereoModel,
+    stereo_basis: Array,
+    shape_basis: Array,
+    n_views: int,
+    prior: Prior | None,
 ) -> tuple[StereoModel, float]:
     """Huber's fit with the noise set by the median residual, and the extra variance [px^2] it shows."""
     flat = shape_basis[..., :0]
@@ -134,7 +149,7 @@ def _robust_start(
             residuals = observations.pixels - predict_pixels(model, observations)
             extra = _median_variance(residuals)
             weights = inverse_covariance(observations.covariance, extra)
-            problem = Problem(observations, weights, stereo_basis, basis, n_views, huber=2.0)
+            problem = Problem(observations, weights, stereo_basis, basis, n_views, huber=2.0, prior=prior)
             model = minimise(problem, model, iterations=30, tolerance=1e-5, rough=True).model
     residuals = observations.pixels - predict_pixels(model, observations)
     return model, _median_variance(residuals)

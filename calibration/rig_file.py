@@ -41,14 +41,15 @@ class CalibrationRecord:
     kept: Mask  # (m,)
     residuals: Array  # (m, 2) observed - predicted [px]
     unexplained_sigma: float  # [px]
-    R_left_board: Array  # (n_views, 3, 3)
-    t_left_board: Array  # (n_views, 3) [m]
+    R_left_board: Array  # (n_views + those apart, 3, 3), to which the observations' `view` refers
+    t_left_board: Array  # (n_views + those apart, 3) [m]
     settings: dict[str, Any]
     figures: dict[str, Any]  # rms, chosen terms, cross-validation table, assessment
     rejected_views: dict[int, str]
     rejected_corners: tuple[tuple[int, int, int, str], ...]  # view, camera, corner, reason
     warnings: tuple[str, ...]
     versions: dict[str, str] = field(default_factory=dict)
+    apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,7 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         rejected_corners=tuple(calibration.rejected_corners()),
         warnings=tuple(calibration.warnings),
         versions=versions(),
+        apart=calibration.apart,
     )
 
 
@@ -217,6 +219,8 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     group.attrs["warnings"] = json.dumps(record.warnings)
     group.attrs["view_names"] = json.dumps(record.view_names)
     group.attrs["rejected_views"] = json.dumps(record.rejected_views)
+    if record.apart:
+        group.attrs["apart"] = json.dumps(record.apart)
     group.attrs["table_view"] = -1 if record.table_view is None else record.table_view
     text = h5py.string_dtype()
     group.create_dataset("rejected_corners", data=json.dumps(record.rejected_corners), dtype=text)
@@ -226,10 +230,16 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     _put(group, "board_points", record.board_points, "m", "target points in board axes as refined")
     _put(group, "board_thickness", record.board_thickness, "m", "from the table to the printed face")
     _put(group, "unexplained_sigma", record.unexplained_sigma, "px", "per axis, added to each corner's own noise")
-    _put(group, "R_left_board", record.R_left_board, "1", "rotation from board to left camera axes, per view")
-    _put(group, "t_left_board", record.t_left_board, "m", "corner 0 in left camera axes, per view")
+    _put(
+        group,
+        "R_left_board",
+        record.R_left_board,
+        "1",
+        "rotation from board to left camera axes, per place: views, then right images apart",
+    )
+    _put(group, "t_left_board", record.t_left_board, "m", "corner 0 in left camera axes, per place")
     o = record.observations
-    for name, description in (("view", "index of the view"), ("camera", "0 left, 1 right"), ("point", "board point")):
+    for name, description in (("view", "index of the place"), ("camera", "0 left, 1 right"), ("point", "board point")):
         _put(group, name, getattr(o, name).astype(np.int64), "1", description)
     _put(group, "pixels", o.pixels, "px", "located corner")
     _put(group, "pixels_covariance", o.covariance, "px^2", "of the located corner, from the image's own noise")
@@ -369,7 +379,8 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
     board = _board(group)
     n = len(board.points)
     pixels = _get(group, "pixels", (None, 2))
-    m, n_views = len(pixels), len(attribute("view_names"))
+    apart = json.loads(group.attrs.get("apart", "[]"))
+    m, n_views = len(pixels), len(attribute("view_names")) + len(apart)
     indices = [_get(group, name, (m,), "iu").astype(np.intp) for name in ("view", "camera", "point")]
     for name, index, limit in zip(("view", "camera", "point"), indices, (n_views, 2, n), strict=True):
         if m and not (index.min() >= 0 and index.max() < limit):
@@ -396,4 +407,5 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
         rejected_corners=tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rejected),
         warnings=tuple(attribute("warnings")),
         versions=attribute("versions"),
+        apart=tuple(int(v) for v in apart),
     )

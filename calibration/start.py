@@ -75,8 +75,11 @@ def common_pair(rotations: Array, translations: Array) -> tuple[int, Mask]:
 
 def start_stereo(
     observations: Observations, nominal: Array, image_sizes: tuple[tuple[int, int], tuple[int, int]], n_views: int
-) -> tuple[StereoModel, Mask]:
-    """Start model, and which views (n_views,) agree with it or were seen by one camera only."""
+) -> tuple[StereoModel, Mask, dict[int, tuple[Array, Array]]]:
+    """Start model, which views (n_views,) agree with it or were seen by one camera only, and {view: (R, t)} of pairs.
+
+    The latter are poses of the board in the left camera's axes by the right image alone.
+    """
     left, left_poses = start_camera(observations, 0, nominal, image_sizes[0])
     right, right_poses = start_camera(observations, 1, nominal, image_sizes[1])
     both = sorted(left_poses.keys() & right_poses.keys())
@@ -88,6 +91,7 @@ def start_stereo(
     R_pair, t_pair = rotations[best], np.median(translations[agree], axis=0)
     usable = np.ones(n_views, bool)
     usable[[v for v, ok in zip(both, agree, strict=True) if not ok]] = False
+    by_right = {v: (R_pair.T @ right_poses[v][0], R_pair.T @ (right_poses[v][1] - t_pair)) for v in both}
     R_board, t_board = np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1))
     for view in range(n_views):
         if view in left_poses:
@@ -97,4 +101,4 @@ def start_stereo(
             R_board[view], t_board[view] = R_pair.T @ R, R_pair.T @ (t - t_pair)
         else:
             usable[view] = False
-    return StereoModel((left, right), R_pair, t_pair, R_board, t_board, nominal.copy()), usable
+    return StereoModel((left, right), R_pair, t_pair, R_board, t_board, nominal.copy()), usable, by_right

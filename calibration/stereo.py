@@ -23,11 +23,11 @@ from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
-from calibration.model_choice import TermsTried, choose_terms, fit_poses
-from calibration.pairs import motion_between_exposures, readmitted
+from calibration.model_choice import TermsTried, choose_terms
+from calibration.pairs import PairsJudged, judge_pairs, motion_between_exposures, own_places, pairs_that_agree
 from calibration.refinement import Refinement
-from calibration.start import MIN_POINTS, MIN_VIEWS, common_pair, start_camera, start_stereo
-from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations, predict_pixels
+from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
+from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
 from calibration.wide_lens import too_wide
@@ -35,8 +35,7 @@ from calibration.wide_lens import too_wide
 CAMERA_NAMES = ("left", "right")
 SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
-MAX_LOST = 0.3  # share of one image's corners that do not fit the others: beyond, the view as a whole is at fault
-MAX_VIEW_RATIO = 5.0  # a view's misfit against the median view's: beyond, the board moved between the two exposures
+REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
 Progress = Callable[[str, int, int], None]
 Finder = Callable[[NDArray, bool], CornerView | BoardNotFound]  # image, whether to search thoroughly
 
@@ -75,6 +74,7 @@ class StereoCalibration(Brief):
     candidates: tuple[TermsTried, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
+    apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
     shape: BoardShape | None = None  # of the board against the declared one, as far as the views tell
     lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
@@ -102,13 +102,16 @@ class StereoCalibration(Brief):
     @property
     def rms_per_view_px(self) -> Array:
         """(n_views, 2 cameras) [px]; NaN where a view was not used."""
-        o = self.refinement.observations
+        o, view = self.refinement.observations, self.views_of_observations()
         return np.array(
-            [
-                [self.refinement.rms((o.view == v) & (o.camera == c)) for c in (0, 1)]
-                for v in range(len(self.view_names))
-            ]
+            [[self.refinement.rms((view == v) & (o.camera == c)) for c in (0, 1)] for v in range(len(self.view_names))]
         )
+
+    def views_of_observations(self) -> NDArray[np.intp]:
+        """(m,) the number of the view, also where its right image has a place of the board of its own."""
+        return np.concatenate([np.arange(len(self.view_names)), np.array(self.apart, np.intp)])[
+            self.refinement.observations.view
+        ]
 
     def rejected_corners(self) -> list[tuple[int, int, int, str]]:
         """(view, camera, corner, reason) of every corner that was found but not used."""
@@ -118,12 +121,12 @@ class StereoCalibration(Brief):
                 if isinstance(view, CornerView):
                     found = np.flatnonzero(~view.accepted & [reason != "" for reason in view.reasons])
                     rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # without one: not in view
-        r = self.refinement
+        r, view_of = self.refinement, self.views_of_observations()
         o = r.observations
         for i in np.flatnonzero(~r.kept):
             distance = float(np.linalg.norm(r.residuals[i]))
             reason = f"{distance:.3f} px from where all other corners put it"
-            rejected.append((int(o.view[i]), int(o.camera[i]), int(o.point[i]), reason))
+            rejected.append((int(view_of[i]), int(o.camera[i]), int(o.point[i]), reason))
         return rejected
 
 
@@ -228,16 +231,9 @@ def calibrate_from_corners(
         warnings.append(note)
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
     observations = _observations(views)
-    start, agrees = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
+    start, agrees, right_poses = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
     wide = too_wide(observations, board.points, start.cameras)
-    start, agrees = readmitted(observations, start, board.points, agrees, MAX_VIEW_RATIO)
-    for v in np.flatnonzero(~agrees):
-        if int(v) not in rejected:
-            rejected[int(v)] = (
-                f"{names[v][0]}, {names[v][1]}: the board moved between the exposures, or the images are not a pair"
-                + (", or the lens is wider than the model" if wide else "")
-            )
-    observations = observations[~np.isin(observations.view, list(rejected))]
+    pairs = pairs_that_agree(observations, start, board.points, agrees, right_poses)
 
     def report(text: str) -> None:
         if progress:
@@ -250,23 +246,26 @@ def calibrate_from_corners(
         None if settings.distortion == "auto" else (settings.distortion,),
         boards if settings.board == "auto" else (settings.board,),
     )
-    refinement, candidates = choose_terms(observations, start, board.points, *choice, settings.equal_aspect, report)
-    bad = _misfitting_views(refinement, names)
-    if bad:
-        odd = _odd_images(refinement, [v for v in bad if v != table_view])
-        for view, camera in odd.items():
-            name, reason = CAMERA_NAMES[1 - camera], bad.pop(view)
-            warnings.append(f"view {view} is used in the {name} camera only: {reason}")
-            observations = observations[(observations.view != view) | (observations.camera != camera)]
-        rejected |= bad
-        observations = observations[~np.isin(observations.view, list(bad))]
+    places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
+    refinement, candidates = choose_terms(*places, board.points, *choice, settings.equal_aspect, report)
+    for _ in range(REJUDGED):
+        before = sorted(pairs.apart)
+        pairs = judge_pairs(observations, refinement, before)
+        if sorted(pairs.apart) == before and not pairs.bad_images:
+            break
+        observations, pairs, lost, notes = _without_images(observations, pairs, names)
+        rejected, warnings = rejected | lost, [*warnings, *notes]
+        places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
         terms = refinement.terms
         refinement, again = choose_terms(
-            observations, start, board.points, (terms.distortion,), (terms.board,), settings.equal_aspect, report
+            *places, board.points, (terms.distortion,), (terms.board,), settings.equal_aspect, report
         )
         candidates = (*candidates, *again)
-    if table_view in rejected:
-        raise CalibrationError(f"the table view {table_view} cannot be used: {rejected[table_view]}")
+    told = _told_apart(pairs.apart, names, bool(wide))
+    warnings += told
+    if table_view is not None and table_view in rejected | pairs.apart:
+        reason = rejected.get(table_view) or told[0]
+        raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
         also = f"{'; '.join(wide)}. " if wide else ""
@@ -305,6 +304,7 @@ def calibrate_from_corners(
         view_names=names,
         corner_views=(tuple(views[0]), tuple(views[1])),
         rejected_views=dict(sorted(rejected.items())),
+        apart=tuple(sorted(pairs.apart)),
         candidates=candidates,
         assessment=assessment,
         warnings=(*warnings, *assessment.warnings),
@@ -425,46 +425,37 @@ def _turn_of_order(order: NDArray[np.intp], board: Target) -> Array:
     return R
 
 
-def _misfitting_views(refinement: Refinement, names: Sequence[tuple[str, str]]) -> dict[int, str]:
-    """Views whose corners fit far worse than those of the others, or lost most of their corners."""
-    o = refinement.observations
-    views = np.unique(o.view)
-    rms = np.array([refinement.rms(o.view == v) for v in views])
-    typical = float(np.nanmedian(rms))
-    bad = {}
-    for v, value in zip(views, rms, strict=True):
-        lost = [1 - refinement.kept[(o.view == v) & (o.camera == c)] for c in np.unique(o.camera[o.view == v])]
-        share = max(float(np.mean(part)) for part in lost)
-        if share > MAX_LOST:
-            bad[int(v)] = (
-                f"{names[v][0]}, {names[v][1]}: {100 * share:.0f} % of one image's corners do not fit the other "
-                "views: the board moved between the exposures"
-            )
-        elif value > MAX_VIEW_RATIO * typical:
-            bad[int(v)] = (
-                f"{names[v][0]}, {names[v][1]}: RMS {value:.3f} px, the median view has {typical:.3f} px: "
-                "blurred, or the board moved between the exposures"
-            )
-    return bad
+def _without_images(
+    observations: Observations, pairs: PairsJudged, names: Sequence[tuple[str, str]]
+) -> tuple[Observations, PairsJudged, dict[int, str], list[str]]:
+    """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
+    model, apart, rejected, warnings = pairs.model, dict(pairs.apart), {}, []
+    R, t = model.R_left_board.copy(), model.t_left_board.copy()
+    for (view, camera), reason in pairs.bad_images.items():
+        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly"
+        observations = observations[(observations.view != view) | (observations.camera != camera)]
+        apart.pop(view, None)
+        if camera == 0 and view in pairs.right_poses:
+            R[view], t[view] = pairs.right_poses[view]
+        if np.any(observations.view == view):
+            warnings.append(f"view {view} is used in the {CAMERA_NAMES[1 - camera]} camera only: {text}")
+        else:
+            rejected[view] = text
+    pairs = replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart, bad_images={})
+    return observations, pairs, rejected, warnings
 
 
-def _odd_images(refinement: Refinement, views: Sequence[int]) -> dict[int, int]:
-    """{view: camera} of pairs whose images disagree while the other camera's image fits the rest, with its own pose."""
-    o = refinement.observations
-    every = [refinement.rms(o.view == v) for v in np.unique(o.view)]
-    limit = MAX_VIEW_RATIO * float(np.nanmedian(every))
-    odd = {}
-    for v in views:
-        alone = []
-        for camera in (0, 1):
-            image = o[(o.view == v) & (o.camera == camera)]
-            if len(image) >= MIN_POINTS:
-                model = fit_poses(image, refinement.model, max(refinement.unexplained_sigma, 1e-3))
-                square = np.sum((image.pixels - predict_pixels(model, image)) ** 2, axis=-1)
-                alone.append((float(np.sqrt(np.mean(square))), camera))
-        if len(alone) == 2 and min(alone)[0] < limit:
-            odd[v] = 1 - min(alone)[1]
-    return odd
+def _told_apart(apart: dict[int, str], names: Sequence[tuple[str, str]], wide: bool) -> list[str]:
+    """A warning about pairs whose images are used each for its own camera."""
+    if not apart:
+        return []
+    shown = [f"view {v} ({names[v][0]}, {names[v][1]}: {why})" for v, why in list(apart.items())[:3]]
+    more = f" and {len(apart) - 3} more" if len(apart) > 3 else ""
+    return [
+        f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "
+        f"exposures, or they are not a pair{', or the lens is wider than the model' if wide else ''}. Each image is "
+        "used for its own camera, none of them for how the cameras stand to each other"
+    ]
 
 
 __all__ = [

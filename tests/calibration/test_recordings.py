@@ -48,10 +48,9 @@ def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     # the reference's own sigma of the baseline is 0.036 mm, and its corners are other ones
     assert abs(1e3 * found.rig.baseline - reference["converged_ba_win5"]["free_board"]["baseline_mm"]) < 0.1
     assert len(found.rejected_corners()) < 0.05 * len(found.refinement.kept)
-    # left08: over half of its corners lie 0.2-0.3 px to one side of where the other 25 images put them; right08 stays
+    # left08 too, although half of its corners lie 0.2-0.3 px to one side of where the other 25 images put them
     assert not found.rejected_views
-    seen = np.isfinite(found.rms_per_view_px)
-    assert np.argwhere(~seen).tolist() == [[7, 0]]
+    assert np.isfinite(found.rms_per_view_px).all()
 
 
 def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):

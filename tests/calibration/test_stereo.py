@@ -14,11 +14,13 @@ from calibration import (
     Camera,
     CornerView,
     StereoModel,
+    Terms,
     calibrate_from_corners,
     calibrate_stereo,
+    refine_stereo,
 )
 from calibration.camera import rotation_from_vector, triangulate
-from calibration.pairs import readmitted
+from calibration.pairs import judge_pairs, pairs_that_agree
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.table_frame import table_pose
 from calibration.tolerances import BoardTolerances
@@ -170,14 +172,21 @@ def test_wrong_counts_are_an_error_that_asks_for_inner_corners(drawn):
         calibrate_stereo(left, right, Board((8, 5), 9e-3))
 
 
-def test_exchanged_images_are_found_out(scene_maker, rng):
+def test_exchanged_images_are_found_out(scene_maker, rng, tmp_path):
     scene = small_scene(scene_maker, n_views=10)
     left, right = corner_views(scene, rng)
     right[2], right[7] = right[7], right[2]
     found = calibrate_from_corners(left, right, BOARD, FLAT)
-    assert list(found.rejected_views) == [2, 7]
-    assert "not a pair" in found.rejected_views[2]
+    assert found.apart == (2, 7)
+    assert any("not a pair" in text and "view 2 " in text and "view 7 " in text for text in found.warnings)
+    assert not found.rejected_views  # each image still says all that it can of its own camera
+    assert found.assessment.pairs == 8
     assert found.rms_px < 0.05
+    assert np.isfinite(found.rms_per_view_px).all()
+    write_rig(tmp_path / "rig.h5", found)
+    record = read_rig_file(tmp_path / "rig.h5").record
+    assert record.apart == (2, 7)
+    assert record.R_left_board.shape == (12, 3, 3)
     with pytest.raises(CalibrationError, match="table view 2 cannot be used"):
         calibrate_from_corners(left, right, BOARD, FLAT, table_view=2)
 
@@ -187,10 +196,18 @@ def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng)
     left, right = corner_views(scene, rng)
     right[4] = replace(right[4], points=right[4].points + np.array([1.5, -1.0]))
     found = calibrate_from_corners(left, right, BOARD, FLAT)
-    assert not found.rejected_views  # one of its images says all that it can of its own camera
+    assert not found.rejected_views
+    assert found.apart == (4,)
     assert found.assessment.pairs == 9
-    assert any(text.startswith("view 4 is used in the ") and "moved" in text for text in found.warnings)
+    assert any(text.startswith("view 4 (left 4, right 4: ") and "moved" in text for text in found.warnings)
     assert found.rms_px < 0.05
+    # as if the pair had been left out for how the cameras stand, and not for the cameras
+    left[4] = right[4] = BoardNotFound("left out")
+    without = calibrate_from_corners(left, right, BOARD, FLAT)
+    sigma = np.sqrt(np.diag(without.rig.covariance))[:9]
+    change = found.rig.left.parameters - without.rig.left.parameters
+    assert np.abs(change[sigma > 0] / sigma[sigma > 0]).max() < 2
+    assert found.rig.covariance[0, 0] < without.rig.covariance[0, 0]
 
 
 def unsynchronised(scene, rng, step):
@@ -226,19 +243,28 @@ def test_the_sigma_of_the_baseline_is_honest_where_pairs_were_not_synchronised(s
     assert 0.3 < np.mean(np.square(z)) < 2.2  # chi-square of 16 at two sigma, and what 16 views know of their scatter
 
 
-def test_views_that_a_rough_pose_puts_elsewhere_are_used_after_all(scene_maker, rng):
+def test_pairs_that_a_rough_pose_puts_elsewhere_are_used_after_all(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=10)
-    observations = scene.observations(0.02, rng)
+    observations, m = scene.observations(0.02, rng), scene.model
     agrees = np.ones(10, bool)
     agrees[[2, 6]] = False  # as if each camera alone had put these boards degrees off
-    start, usable = readmitted(observations, scene.model, BOARD.points, agrees, 5.0)
-    assert usable.all()
+    poses = {v: (rotation_from_vector(np.array([0.1, 0, 0])) @ m.R_left_board[v], m.t_left_board[v]) for v in range(10)}
+    assert not pairs_that_agree(observations, m, BOARD.points, agrees, poses).apart
     right = (observations.view == 6) & (observations.camera == 1)
     pixels = observations.pixels.copy()
     pixels[right] += [3.0, -2.0]
-    _, usable = readmitted(replace(observations, pixels=pixels), start, BOARD.points, agrees, 5.0)
-    assert usable[2]
-    assert not usable[6]
+    moved = replace(observations, pixels=pixels)
+    assert list(pairs_that_agree(moved, m, BOARD.points, agrees, poses).apart) == [6]
+
+
+def test_so_few_pairs_that_none_can_judge_another_are_all_used(scene_maker, rng):
+    scene = small_scene(scene_maker, n_views=3)
+    observations = scene.observations(0.02, rng)
+    pixels = observations.pixels.copy()
+    pixels[(observations.view == 1) & (observations.camera == 1)] += [3.0, -2.0]
+    moved = replace(observations, pixels=pixels)
+    fit = refine_stereo(moved, scene.model, BOARD.points, Terms("k1"))
+    assert not judge_pairs(moved, fit, []).apart
 
 
 def test_parallel_views_are_warned_of(scene_maker, rng):
@@ -255,8 +281,10 @@ def test_parallel_views_are_warned_of(scene_maker, rng):
     assert found.assessment.tilt_spread_deg < 1
     assert any("normals differ" in w for w in found.warnings)
     assert not any("normals differ" in w for w in many.warnings)
-    # and the covariance says the same as the warning
-    assert found.rig.covariance[0, 0] > 4 * many.rig.covariance[0, 0]
+    # and the covariance says the same as the warning, although square pixels are known beforehand
+    assert found.rig.covariance[0, 0] > many.rig.covariance[0, 0]
+    error = found.rig.left.parameters[:4] - m.cameras[0].parameters[:4]
+    assert np.abs(error / np.sqrt(np.diag(found.rig.covariance)[:4])).max() < 4
 
 
 @pytest.mark.parametrize("counts", [(7, 5), (6, 4), (5, 5), (4, 4)])
