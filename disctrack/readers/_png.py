@@ -7,18 +7,13 @@ interlaced, fewer than 8 bits) are left to OpenCV.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.compiled import njit
-
-try:
-    import deflate  # libdeflate: 0.4 of zlib's time
-except ImportError:  # no wheel for this machine
-    deflate = None  # type: ignore[assignment]
+from disctrack.readers._inflate import inflated
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ def decode_plain_grey(content: bytes, header: PngHeader, out: NDArray | None) ->
     """
     view = memoryview(content)
     stride = header.width * header.bit_depth // 8
-    raw = _inflated(b"".join([view[a:b] for a, b in header.data]), (stride + 1) * header.height)
+    raw = inflated(b"".join([view[a:b] for a, b in header.data]), (stride + 1) * header.height)
     if raw is None:
         return None
     dtype = np.uint8 if header.bit_depth == 8 else np.uint16
@@ -66,30 +61,6 @@ def prepare() -> None:
     """Compile what undoes the row filters, or load it."""
     for raw in (bytes(2), bytearray(2)):  # what zlib gives, and libdeflate
         _undo_filters(np.frombuffer(raw, np.uint8).reshape(1, 2), 1, np.empty((1, 1), np.uint8))
-
-
-def _inflated(stream: bytes, size: int) -> bytes | bytearray | None:
-    """The `size` bytes that a zlib stream holds, never more; None where it holds another number or is damaged."""
-    if deflate is not None:
-        try:
-            whole: bytearray = deflate.zlib_decompress(stream, size)
-        except deflate.DeflateError:
-            return None
-        return whole if len(whole) == size else None
-    try:
-        inflater = zlib.decompressobj()
-        raw = inflater.decompress(stream, size)
-    except zlib.error:
-        return None
-    return raw if len(raw) == size and (inflater.eof or _ends_here(inflater)) else None
-
-
-def _ends_here(inflater: zlib._Decompress) -> bool:
-    """True if nothing but the stream's checksum was left when the output was full, and it is right."""
-    try:
-        return not inflater.decompress(inflater.unconsumed_tail, 1) and inflater.eof
-    except zlib.error:
-        return False
 
 
 @njit(nogil=True, cache=True)

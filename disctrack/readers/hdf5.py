@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import threading
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import numpy as np
 
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
+from disctrack.readers._inflate import inflated
 from disctrack.readers.base import FrameReader
 from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 
@@ -240,14 +240,13 @@ class Hdf5Frames:
 
     def _inflate(self, content: bytes, image: Image, where: str) -> None:
         """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
-        inflater = zlib.decompressobj()
-        try:
-            raw = np.frombuffer(inflater.decompress(content, image.nbytes), np.uint8)  # never more than announced
-            inflater.decompress(inflater.unconsumed_tail, 1)
-        except zlib.error as error:
-            raise RecordingError(f"{where}: damaged ({error}). Copy the file again.") from error
-        if raw.nbytes != image.nbytes or not inflater.eof:
-            raise RecordingError(f"{where}: damaged ({raw.nbytes} of {image.nbytes} bytes). Copy the file again.")
+        whole = inflated(content, image.nbytes)
+        if whole is None:
+            raise RecordingError(
+                f"{where}: damaged (its {len(content)} compressed bytes do not hold the {image.nbytes} of an image). "
+                "Copy the file again."
+            )
+        raw = np.frombuffer(whole, np.uint8)
         if self._shuffled and self.dtype.itemsize > 1:
             raw = np.ascontiguousarray(raw.reshape(self.dtype.itemsize, -1).T).reshape(-1)
         image[...] = raw.view(self._stack.dtype).reshape(image.shape)
