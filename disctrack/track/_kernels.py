@@ -52,9 +52,16 @@ _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
 _CLIP_SIGMA = 5.0
-# Semi-minor axis in blurs: below, the two long edges melt into one another and the centre errs by more than its sigma.
-_MIN_SEMI_MINOR = 3.7
-_MIN_SEMI_MINOR_PX = 3.5  # in fewer pixels the edge distance itself is too coarse, however sharp the image
+# Semi-minor axis in blurs, or in pixels: below, the two long edges melt into one another and what one edge looks like
+# errs by more than the centre's sigma; the whole blurred ellipse is the template then, 10 to 20 times as slow.
+_MIN_SEMI_MINOR, _MIN_SEMI_MINOR_PX = 4.5, 4.5
+_LEAST_SEMI_MINOR, _LEAST_SEMI_MINOR_PX = 1.0, 1.0  # below even that one fails: nothing but a blot is left
+_RADIUS_PRIOR = 0.1  # relative standard deviation: a blot's size, darkness and blur cannot be told apart
+_NODES = 64  # at most, over the length of an ellipse
+# What the blurred ellipse is made of: pixel of the centre from that of the window [px], plane -> pixel (2, 2), unit
+# vector of the long axis in the image, semi-axes over the radius.
+_EX, _EY, _I00, _I01, _I10, _I11, _AXIS_X, _AXIS_Y, _LONG, _SHORT = range(10)
+_ELLIPSE = 10
 _ATTITUDE_TOLERANCE = 1.5e-3  # [rad] farther from the expected attitude a pair is looked at once more
 
 # numba takes a literal for double precision, and with it all that it touches
@@ -243,7 +250,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
             pixels[_X, i] - shift_x, pixels[_Y, i] - shift_y, radius, g00, g01, g10, g11, _0
         )
         pixels[_WEIGHT, i], pixels[_JACOBIAN, i] = d, inv_g
-    kept = 0
+    kept, well_inside = 0, min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0, 0.0, 0
     for i in range(n):
         d = pixels[_WEIGHT, i]
@@ -261,7 +268,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
         for row in range(_JACOBIAN):
             pixels[row, kept] = pixels[row, i]
         kept += 1
-        if d < -1.2 * p[SIGMA]:
+        if d < -well_inside:
             inside_sum += grey
             inside_n += 1
         elif d > 1.2 * p[SIGMA]:
@@ -321,8 +328,114 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
 
 @_part
-def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work):
+def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit, ellipse):
+    """Fill `ellipse` (_ELLIPSE,): the image of a dot as an ellipse about its own centroid, to second order of the map.
+
+    reach: pixels over which the map's second derivatives are taken.
+    """
+    iu, iv = int(u0 + 0.5), int(v0 + 0.5)
+    i00, i01, i10, i11 = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
+    c00, c01, c11 = i00 * i00 + i01 * i01, i00 * i10 + i01 * i11, i10 * i10 + i11 * i11
+    half_sum, half_difference = 0.5 * (c00 + c11), 0.5 * (c00 - c11)
+    spread = math.hypot(half_difference, c01)
+    angle = 0.5 * math.atan2(c01, half_difference)
+    longer = math.sqrt(half_sum + spread)
+    ellipse[_I00], ellipse[_I01], ellipse[_I10], ellipse[_I11] = i00, i01, i10, i11
+    ellipse[_AXIS_X], ellipse[_AXIS_Y] = math.cos(angle), math.sin(angle)
+    ellipse[_LONG], ellipse[_SHORT] = longer, 1.0 / (abs(det) * longer)
+    # second derivatives of pixel -> plane, in the pixel's own frame: q = - G^-1 d2 plane
+    uu_x, uu_y, vv_x, vv_y, uv_x, uv_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for du in range(-1, 2):
+        for dv in range(-1, 2):
+            x, y = map_x[iv + reach * dv, iu + reach * du], map_y[iv + reach * dv, iu + reach * du]
+            w = unit * (P[2, 0] * x + P[2, 1] * y + P[2, 2])
+            a, b = (P[0, 0] * x + P[0, 1] * y + P[0, 2]) / w, (P[1, 0] * x + P[1, 1] * y + P[1, 2]) / w
+            uu, vv, uv = (1.0 if du != 0 else -2.0), (1.0 if dv != 0 else -2.0), 0.25 * du * dv
+            uu, vv = (uu if dv == 0 else 0.0), (vv if du == 0 else 0.0)
+            uu_x, uu_y, vv_x, vv_y = uu_x + uu * a, uu_y + uu * b, vv_x + vv * a, vv_y + vv * b
+            uv_x, uv_y = uv_x + uv * a, uv_y + uv * b
+    scale = -1.0 / (reach * reach)
+    s_uu, t_uu = scale * (i00 * uu_x + i01 * uu_y), scale * (i10 * uu_x + i11 * uu_y)
+    s_vv, t_vv = scale * (i00 * vv_x + i01 * vv_y), scale * (i10 * vv_x + i11 * vv_y)
+    s_uv, t_uv = scale * (i00 * uv_x + i01 * uv_y), scale * (i10 * uv_x + i11 * uv_y)
+    # the dot's points x = x0 + s(x0): their mean is <s> + <x0 div s>, with the ellipse's second moments r^2 c / 4
+    quarter = 0.25 * radius * radius
+    div_u, div_v = s_uu + t_uv, s_uv + t_vv
+    shift_u = quarter * (0.5 * (s_uu * c00 + s_vv * c11) + s_uv * c01 + c00 * div_u + c01 * div_v)
+    shift_v = quarter * (0.5 * (t_uu * c00 + t_vv * c11) + t_uv * c01 + c01 * div_u + c11 * div_v)
+    ellipse[_EX], ellipse[_EY] = start[3] - u0 + shift_u, start[4] - v0 + shift_v
+
+
+@_part
+def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
+    """As `_whitened_model` by the integral of the Gaussian over the whole ellipse; nodes (3, _NODES) is scratch.
+
+    Along the long axis x = a sin t, where the trapezoidal rule converges exponentially; across it the error function.
+    """
+    in_sigma = 1.0 / p[SIGMA]
+    a, b = p[RADIUS] * ellipse[_LONG] * in_sigma, p[RADIUS] * ellipse[_SHORT] * in_sigma
+    n_nodes = min(int(3.2 * a) + 8, _NODES)
+    every = math.pi / n_nodes
+    for k in range(n_nodes):
+        t = (k + 0.5) * every - 0.5 * math.pi
+        nodes[0, k], nodes[1, k], nodes[2, k] = a * math.sin(t), b * math.cos(t), a * every * math.cos(t)
+    round_edge = _f(a * b * every)
+    A_px, B_px = p[A], p[B]
+    from_x = _f(ellipse[_EX] + ellipse[_I00] * A_px + ellipse[_I01] * B_px)
+    from_y = _f(ellipse[_EY] + ellipse[_I10] * A_px + ellipse[_I11] * B_px)
+    along_x, along_y = _f(ellipse[_AXIS_X] * in_sigma), _f(ellipse[_AXIS_Y] * in_sigma)
+    A_along = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I00] + ellipse[_AXIS_Y] * ellipse[_I10]))
+    A_across = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I10] - ellipse[_AXIS_Y] * ellipse[_I00]))
+    B_along = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I01] + ellipse[_AXIS_Y] * ellipse[_I11]))
+    B_across = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I11] - ellipse[_AXIS_Y] * ellipse[_I01]))
+    inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
+    contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
+    limit = _f(clip)
+    chi2, n_clipped = _0, _0
+    for i in range(n):
+        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
+        from_u, from_v = ten * x - from_x, ten * y - from_y
+        along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
+        covered, d_along, d_across, edge = _0, _0, _0, _0
+        for k in range(n_nodes):
+            beside = along - nodes[0, k]
+            if beside * beside > _Z2_MAX:
+                continue
+            _, bell = _edge_profile(beside)
+            above, bell_above = _edge_profile(-across - nodes[1, k])
+            below, bell_below = _edge_profile(nodes[1, k] - across)
+            column = nodes[2, k] * bell
+            covered += column * (above - below)
+            d_along -= beside * column * (above - below)
+            d_across += column * (bell_above - bell_below)
+            edge += bell * (bell_above + bell_below)
+        edge *= round_edge
+        light = level + slope_x * x + slope_y * y
+        weight = pixels[_WEIGHT, i]
+        r = weight * (pixels[_GREY, i] - light * (_1 - contrast * covered))
+        squared = r * r
+        fits = _1 if squared <= limit else _0
+        chi2 += min(squared, limit)
+        n_clipped += _1 - fits
+        weight *= fits
+        seen = (_1 - contrast * covered) * weight
+        dark = light * contrast * weight
+        pixels[_JACOBIAN + A, i] = dark * (d_along * A_along + d_across * A_across)
+        pixels[_JACOBIAN + B, i] = dark * (d_along * B_along + d_across * B_across)
+        pixels[_JACOBIAN + RADIUS, i] = -dark * edge * inv_radius
+        pixels[_JACOBIAN + SIGMA, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
+        pixels[_JACOBIAN + LEVEL, i] = seen
+        pixels[_JACOBIAN + SLOPE_X, i], pixels[_JACOBIAN + SLOPE_Y, i] = seen * x, seen * y
+        pixels[_JACOBIAN + CONTRAST, i] = -light * covered * weight
+        pixels[_RESIDUAL, i] = r * fits
+    return float(chi2), float(n_clipped)
+
+
+@_part
+def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ellipse, nodes):
     """Levenberg-Marquardt on the eight template parameters; returns converged, chi-square, clipped.
+
+    blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
 
     On convergence the first rows of work hold the Cholesky factor of J^T W J at the minimum.
     """
@@ -333,7 +446,11 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work):
     for i in range(8):
         previous[i] = p[i]
     for _ in range(_MAX_ITERATIONS + 1):
-        chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
+        if blurred:
+            chi2, n_clipped = _whitened_ellipse(pixels, n, p, ellipse, nodes, clip)
+            chi2 += ((p[RADIUS] / radius - 1.0) / _RADIUS_PRIOR) ** 2
+        else:
+            chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
         if converged:
             return True, chi2, n_clipped
         # the Jacobian leaves out how the curvature moves, so chi-square may creep by a trifle at the minimum
@@ -353,6 +470,9 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work):
                 for i in range(n):
                     total += pixels[_JACOBIAN + j, i] * pixels[_JACOBIAN + k, i]
                 work[j, k] = total
+        if blurred:
+            M[RADIUS, RADIUS] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
+            rhs[RADIUS] += (radius - p[RADIUS]) / (_RADIUS_PRIOR * radius) ** 2
         for i in range(8):
             previous[i], step[i] = p[i], rhs[i]
             M[i, i] *= 1.0 + damping
@@ -390,7 +510,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
     height, width = image.shape
-    G = np.empty((3, 2))
+    G, ellipse = np.empty((3, 2)), np.empty(_ELLIPSE)
+    nodes = np.empty((3, _NODES), np.float32)
     u0, v0, radius, unit = start[3], start[4], start[2], 0.0
     for i in range(8):
         p[i] = 0.0
@@ -412,8 +533,9 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
-        if radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], _MIN_SEMI_MINOR_PX):
+        if radius / largest < max(_LEAST_SEMI_MINOR * p[SIGMA], _LEAST_SEMI_MINOR_PX):
             return BLURRED
+        blurred = radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], _MIN_SEMI_MINOR_PX)
         band = 3.0 * p[SIGMA] + 1.0
         extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
         extent_y = radius * math.hypot(G[0, 0], G[1, 0]) / abs(det) + band
@@ -431,6 +553,9 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         n, inside, outside = _select_pixels(
             image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
         )
+        if blurred:
+            reach = max(1, int(0.5 * min(extent_x, extent_y)))
+            _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit, ellipse)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
@@ -450,7 +575,9 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             pixels[_GREY, i] *= in_light  # a product in double precision, rounded once
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
-            converged, chi2, n_clipped = _descend(pixels, n, p, G, det, largest / abs(det), radius, limit, work)
+            converged, chi2, n_clipped = _descend(
+                pixels, n, p, G, det, largest / abs(det), radius, limit, work, blurred, ellipse, nodes
+            )
             if not converged:
                 return NOT_CONVERGED
             if limit < np.inf:
@@ -461,6 +588,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             u0 += moved_u
             v0 += moved_v
             settled = math.hypot(moved_u, moved_v) < 0.7
+            if not blurred and radius / largest < _MIN_SEMI_MINOR * p[SIGMA]:
+                settled = False  # more blurred than expected: once more, by the other template
             if not settled and selection < _MAX_SELECTIONS - 1:
                 break
             # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows

@@ -15,7 +15,7 @@ printed too large, or motion blur, costs no accuracy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,9 @@ def typical_noise(image: Image) -> NoiseModel:
     """Noise of an ordinary camera (50 electrons per grey value of 8 bits), where nothing was measured."""
     grey = full_scale(image) / 255.0
     return NoiseModel(grey**2, 0.02 * grey, float(level_step(image)))
+
+
+LESS_THAN_FLAT = 0.9  # share of the noise of flat parts, from which on down what fits leave is believed instead
 
 
 @dataclass(frozen=True)
@@ -263,6 +266,19 @@ def measure_noise(
         return NoiseModel(float(np.average(variance[keep], weights=weight[keep])), 0.0, step)
     # a negative intercept is a clipped black level: keep the law above it, `variance` holds the floor
     return NoiseModel(float(read), float(gain), step)
+
+
+def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: Array) -> NoiseModel:
+    """The law found in flat parts, unless dots leave less than it says: then there were no flat parts.
+
+    Dots that are small beside their blur, or beside one another, have none. results (k, N_RESULT) of fits that took the
+    noise as `assumed`; what they leave is noise and misfit, and so never less than the noise.
+    """
+    middle = results[:, kernels.FIT_LEVEL] * (1.0 - 0.5 * results[:, kernels.FIT_CONTRAST])
+    left = float(np.median(results[:, kernels.CHI_SQUARE] * assumed.variance(middle) / flat.variance(middle)))
+    if left > LESS_THAN_FLAT:  # within the scatter of both
+        return flat
+    return replace(flat, read=flat.read * left, gain=flat.gain * left)
 
 
 def _dot_windows(

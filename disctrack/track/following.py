@@ -28,6 +28,7 @@ from disctrack.track.dots import (
     dot_centres,
     face_edge,
     measure_noise,
+    no_more_than_left,
     typical_noise,
 )
 from disctrack.track.motion_span import StillScene
@@ -459,7 +460,8 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
     for blur_known in (False, True):  # the second time with the blur of the first
         law = Law((noise[0], noise[1]), (blur[0], blur[1]))
         trial = empty_rows(n, m)
-        done, _ = run(setup, law, heading, images[:n], readable[:n], trial)
+        limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf)
+        done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
         if done == 0 or not _enough(trial.status[:1]):
             follower.law = law  # how the noise was taken to be tells why the dots are refused
             return
@@ -471,7 +473,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             if not blur_known:
                 continue
             sample = range(0, done, NOISE_STEP)
-            noise[camera] = measure_noise(
+            flat = measure_noise(
                 [images[k, camera] for k in sample],
                 setup.rig.cameras[camera],
                 [(R_cw @ trial.R[k], R_cw @ trial.t[k] + t_cw) for k in sample],
@@ -479,6 +481,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
                 (setup.maps_x[camera], setup.maps_y[camera]),
                 blur[camera],
             )
+            noise[camera] = no_more_than_left(flat, noise[camera], trial.results[:done, camera][good])
     follower.saturated = (
         _saturated(images[:done, 0], trial.results[:done, 0], noise[0]),
         _saturated(images[:done, 1], trial.results[:done, 1], noise[1]),

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack import frames
-from disctrack.render import expected_disc, render_disc
+from disctrack.render import expected_disc, render_disc, rig_of
+from disctrack.scene.description import Scene
 from disctrack.track import _kernels as kernels
 from disctrack.track.dots import (
     NoiseModel,
@@ -17,6 +18,7 @@ from disctrack.track.dots import (
     normalised_maps,
 )
 from disctrack.trajectory import MarkerStatus
+from tests.disctrack.conftest import RenderedPairs, disc_on_table
 
 SENSOR_NOISE = NoiseModel(0.64 + 1 / 12, 0.02)  # of the default scene: read noise, rounding, 50 electrons per grey
 
@@ -29,7 +31,7 @@ def poses_in_camera(pairs, index, camera, turned=0.0, moved=0.0, rng=None):
     return R_cw @ R, R_cw @ t + t_cw
 
 
-def locate_all(pairs, images, noise, rng=None, turned=0.0, moved=0.0, disc=None):
+def locate_all(pairs, images, noise, rng=None, turned=0.0, moved=0.0, disc=None, **known):
     maps = [normalised_maps(camera) for camera in pairs.rig.cameras]
     found = []
     for index in range(len(images)):
@@ -37,7 +39,9 @@ def locate_all(pairs, images, noise, rng=None, turned=0.0, moved=0.0, disc=None)
             R, t = poses_in_camera(pairs, index, camera, turned, moved, rng)
             view = pairs.rig.cameras[camera]
             found.append(
-                locate_on_disc(images[index, camera], view, R, t, disc or pairs.disc, maps=maps[camera], noise=noise)
+                locate_on_disc(
+                    images[index, camera], view, R, t, disc or pairs.disc, maps=maps[camera], noise=noise, **known
+                )
             )
     centres = np.stack([dots.pixels for dots in found]).reshape(len(images), 2, -1, 2)
     covariance = np.stack([dots.covariance_px2 for dots in found]).reshape(*centres.shape, 2)
@@ -87,6 +91,48 @@ def test_the_centre_of_the_ellipse_would_have_been_biased(rendered_pairs):
             centroid = np.array([np.sum((x + after_x) * cross), np.sum((y + after_y) * cross)]) / (3 * cross.sum())
             offsets.append(np.linalg.norm(centroid - true[0, dot]))
     assert 0.01 < np.median(offsets) < 0.13
+
+
+@pytest.mark.parametrize(
+    ("mm_per_px", "blur_px", "thinnest"),
+    [(0.8, 0.6, 1.0), (1.1, 0.3, 1.0), (0.4, 2.5, 2.5)],
+    ids=["dots of 9 px", "dots of 6 px", "2.5 px of blur"],
+)
+def test_dots_that_are_all_edge_have_no_bias(mm_per_px, blur_px, thinnest):
+    """Half axes down to that of the blur (with the pixel): the whole blurred ellipse is the template."""
+    size = int(110 / mm_per_px)
+    scene = Scene()
+    scene = replace(
+        scene,
+        cameras=replace(scene.cameras, image_size=(size, size), exposure_s=0.0),
+        rig=replace(scene.rig, mm_per_px=mm_per_px),
+        optics=replace(scene.optics, blur_px=(blur_px, blur_px)),
+    )
+    disc, rig = scene.declared_disc, rig_of(scene)
+    q = disc_on_table(np.radians([3.0, 20.0, 30.0, 40.0]), np.random.default_rng(4), disc)
+    q[:, :2] = [0.032, 0.02]
+    R = frames.rotation_from_euler(*q[:, 3:].T)
+    pairs = RenderedPairs(expected_disc(q, rig, disc, scene), q, R, rig, disc, scene)
+    sensor = NoiseModel(0.64 * 256**2, 0.02 * 256)
+    centres, covariance, found = locate_all(pairs, (256 * pairs.images).astype(np.uint16), sensor, blur_px=blur_px)
+    status = np.stack([dots.status for dots in found]).reshape(len(q), 2, -1)
+    half_axes = _shortest_half_axes(pairs)
+    assert np.all(status[half_axes > 1.3 * thinnest] == MarkerStatus.MEASURED)
+    assert np.any(half_axes < 2 * thinnest)
+    assert np.all((status == MarkerStatus.MEASURED) | (status == MarkerStatus.BLURRED))
+    seen = status == MarkerStatus.MEASURED
+    error, sigma = (centres - pairs.true_pixels)[seen], np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))[seen]
+    assert np.sqrt(np.mean(error**2)) < 4e-3  # largest where the half axis is the blur itself; sigma is 0.01 to 0.02
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 0.5  # a sharp image of 6 px shows the pixels as squares
+
+
+def _shortest_half_axes(pairs):
+    """(n, 2, m) [px] of the dots' images, by the homography of their neighbourhood."""
+    step, radius = 1e-5, 0.5 * pairs.disc.marker_diameter
+    arms = [pairs.disc.marker_centres_body + step * np.eye(3)[axis] for axis in (0, 1)]
+    ends = [pairs.rig.project(arm @ np.swapaxes(pairs.R, 1, 2) + pairs.q[:, None, :3]) for arm in arms]
+    gradient = np.stack([(end - pairs.true_pixels) / step * radius for end in ends], axis=-1)
+    return np.linalg.svd(gradient, compute_uv=False)[..., 1]
 
 
 def test_scatter_equals_the_predicted_covariance(rendered_pairs, rng):
