@@ -40,6 +40,7 @@ class Code(IntEnum):
     SAMPLES = 277
     ROWS_PER_STRIP = 278
     STRIP_COUNTS = 279
+    PREDICTOR = 317
     TILE_WIDTH = 322
     TILE_HEIGHT = 323
     TILE_OFFSETS = 324
@@ -178,7 +179,7 @@ def chain(tiff: Tiff) -> Iterator[tuple[int, dict[int, Tag]]]:
         offset = following
 
 
-def assembled(order: str, fields: Mapping[int, Field], pieces: Sequence[bytes]) -> bytes:
+def assembled(order: str, fields: Mapping[int, Field], pieces: Sequence[bytes | bytearray]) -> bytes:
     """A small TIFF file: header, one directory with the fields and the places of the strips, values, strips."""
     n = len(pieces)
     sizes = struct.pack(f"{order}{n}I", *map(len, pieces))
