@@ -88,7 +88,7 @@ def warnings_of(
         warnings.append(
             f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
             "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
-            "is, or the cameras moved together since the table view"
+            "is, the cameras moved together since the table view, or a long exposure is not declared (exposure_us)"
         )
     gap = _table_gap(trajectory)
     if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:
