@@ -71,7 +71,7 @@ class Instant:
     """Geometry and rates at one state."""
 
     def __init__(self, disc, state):
-        self.O, self.v, self.omega = state[:3], state[7:10], state[10:13]
+        self.O, self.v, self.omega, self.phi = state[:3], state[7:10], state[10:13], state[14]
         self.R = matrix_of(state[3:7])
         d = self.R[:, 2]
         d_rate = np.cross(self.omega, d)

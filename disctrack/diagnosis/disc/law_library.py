@@ -150,12 +150,13 @@ def _gates(q: Array, time: Array) -> Iterator[Family]:
     s = np.sin(q[:, 4])
     for share in np.linspace(0.05, 0.95, 13):
         edge = float(np.quantile(s, share))
-        shape = {"edge": edge, "softness": 0.03 * edge}
-        step = "(0.5 - 0.5 * sign(sin_theta - {edge}, {softness}))"
+        shape = {"edge": edge, "softness": max(0.03 * edge, 1e-3)}
+        # its tails end within some widths: one that falls as a power acts everywhere, and moves the edge
+        step = "1.0 / (1.0 + exp((sin_theta - {edge}) / {softness}))"
         for axis in MOMENTS:
             for words, law in (("", "1.0"), (" over sin theta", "1.0 / sin_theta")):
-                title = f"a moment M_{axis}{words} that acts below a nutation"
-                yield Family(title, ({f"M_{axis}": f"{step} * {law}"},), shape, "below a nutation")
+                title = f"a moment M_{axis} by the load{words} that acts below a nutation"
+                yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "below a nutation")
     span = float(time[-1] - time[0])
     for share in np.linspace(0.03, 0.97, 32):
         at = float(time[0] + share * span)
@@ -178,8 +179,8 @@ def _gates(q: Array, time: Array) -> Iterator[Family]:
             step = f"(0.5 + 0.5 * sign({place} - {{edge}}, 1e-3))"
             shape = {"direction": float(angle), "edge": edge}
             for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
-                title = f"a moment M_{axis} on a part of the table"
-                yield Family(title, ({f"M_{axis}": f"{step} * {law}"},), shape, "part of the table")
+                title = f"a moment M_{axis} by the load on a part of the table"
+                yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "part of the table")
 
 
 def _bumps() -> Iterator[Family]:
@@ -187,14 +188,18 @@ def _bumps() -> Iterator[Family]:
     for angle, words in (("phi", "a spot of the rim"), ("psi", "a direction of the table")):
         for width in (0.08, 0.2, 0.5):
             for at in np.arange(0, 2 * np.pi, max(width, 0.15)):
-                bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}}))"
+                # over its width: what a dent does in all hardly depends on how wide it is
+                bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}})) / {{width}}"
                 shape = {"angle": float(at), "width": width}
                 for axis in ("m", "n"):
-                    title = f"a moment M_{axis} when {words} touches"
-                    yield Family(title, ({f"M_{axis}": bell},), shape, f"bump {angle}")
-                slope = f"sin({angle} - {{angle}}) / {{width}} * {bell}"
+                    title = f"a moment M_{axis} by the load when {words} touches"
+                    yield Family(title, ({f"load_{axis}": bell},), shape, f"bump {angle}")
+                slope = f"sin({angle} - {{angle}}) / ({{width}} * {{width}}) * {bell}"
                 yield Family(
-                    f"a moment M_m up and down when {words} touches", ({"M_m": slope},), shape, f"bump {angle}"
+                    f"a moment M_m by the load, up and down, when {words} touches",
+                    ({"load_m": slope},),
+                    shape,
+                    f"bump {angle}",
                 )
 
 
@@ -208,4 +213,5 @@ def _hums(time: Array, frame_rate: float) -> Iterator[Family]:
             yield Family(f"a moment M_{axis} that swings", tuple({f"M_{axis}": w} for w in waves), shape, "hum M")
         level = tuple(along(w) for along in (along_x, along_y) for w in waves)
         upright = tuple({"X_z": w} for w in waves)
+        yield Family("a vertical force that swings, as of a table that vibrates", upright, shape, "hum Z")
         yield Family("a force that swings, as of a table that vibrates", (*level, *upright), shape, "hum X")

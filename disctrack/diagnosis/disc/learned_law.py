@@ -22,8 +22,10 @@ from disctrack.diagnosis.disc.motion import STATE_SCALES, state_of
 from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, fit, prior_rows, triangle
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
+from disctrack.diagnosis.engine.shape import profiled
+from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
-from disctrack.rolling import Model
+from disctrack.rolling import Model, simulate
 from disctrack.rolling.effects import Effect, EffectParameter, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics
 from disctrack.rolling.responses import COMPONENTS, Responses, responses
@@ -38,6 +40,7 @@ MAX_TERMS = 3
 REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 MAX_ITERATIONS = 15  # of a law that describes the data; others wander
+WIDTHS = ("width", "softness")  # shapes of a law that go with its amount
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the residual is large
 ALIKE = 10.0  # chi-square with its price, by which two laws differ that both describe the residual
@@ -82,7 +85,7 @@ class LearnedLaw:
     def locked(self) -> bool:
         """To an angle of the body or of the table?"""
         parts = [f for family in self.families if family.kind != "place" for p in family.terms for f in p.items()]
-        return any(c.startswith("M") and mark in f for c, f in parts for mark in _LOCKED)
+        return any(c[0] in "Ml" and mark in f for c, f in parts for mark in _LOCKED)
 
 
 @dataclass(frozen=True)
@@ -218,6 +221,9 @@ class _Scan:
         space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
         space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
         self._space, self._courses = space, dict[str, Array]()
+        # what a law adds to the load changes its own moment in second order
+        followed = simulate(system.model_with(fit_.values), state_of(fit_.values), times=self.motion.time)
+        self._load = followed.contact_force[:, 2]
 
     def _course(self, formula: str) -> Array:
         if formula not in self._courses:
@@ -244,7 +250,10 @@ class _Scan:
         terms = [parts for family in chunk for parts in family.formulas()]
         for column, parts in enumerate(terms):
             for component, formula in parts.items():
-                courses[:, COMPONENTS.index(component), column] = self._course(formula)
+                kind, _, axis = component.partition("_")
+                factor = self._load if kind == "load" else 1.0
+                course = factor * self._course(formula)
+                courses[:, COMPONENTS.index(f"M_{axis}" if kind == "load" else component), column] += course
         g = self.motion.of(courses)[self._frames]
         seen = self._normal @ g
         taken = np.tensordot(self._absorbed, g, axes=([0, 2], [0, 1]))
@@ -296,9 +305,8 @@ def learn(system: DiscSystem, base: Fit, noise: float) -> LearnedLaw | None:
         if not trials or min(lengths) >= length:
             break
         best = int(np.argmin(lengths))
-        alike = tuple(
-            one.title for (one, _), other in zip(trials, lengths, strict=True) if 0 < other - lengths[best] < ALIKE
-        )
+        near = [one.title for (one, _), other in zip(trials, lengths, strict=True) if other - lengths[best] < ALIKE]
+        alike = tuple(title for title in dict.fromkeys(near) if title != trials[best][0].title)
         (law, current), length = trials[best], lengths[best]
     if law is None:
         return None
@@ -336,8 +344,22 @@ def _refitted(
     values = [current.values[n] for n in law.candidate.names] if law else []
     enlarged = _law((*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]), name)
     start = replace(enlarged, values=current.values)
-    fitted = with_law(system.knowing(enlarged.effect), base, start)
+    known = system.knowing(enlarged.effect)
+    fitted = with_law(known, base, start)
+    if not fitted.converged:
+        fitted = min(fitted, _one_by_one(known, base, start), key=lambda f: (not f.converged, f.cost))
     return replace(enlarged, values=fitted.values), fitted
+
+
+def _one_by_one(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    """The law's fit with its widths found along their profiles: in a short time a blow's width hardly shows."""
+    values = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    widths = [q for q in law.candidate.quantities if q.name.partition(".")[2].partition("_")[0] in WIDTHS]
+    others = [q for q in law.candidate.quantities if q not in widths]
+    fitted = fit(system, (*base.quantities, *others), values, MAX_ITERATIONS)
+    for q in widths:
+        fitted = profiled(system, fitted, q, 0.3 * fitted.values[q.name])
+    return fitted
 
 
 def with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
@@ -390,11 +412,11 @@ def _left(R: Array, columns: Sequence[int]) -> float:
 _SHAPES = {  # smallest and largest value, and a sensible step
     "rate": (0.0, np.inf, 0.1),
     "edge": (-np.inf, np.inf, 1e-4),
-    "softness": (1e-4, 0.1, 1e-4),
+    "softness": (5e-4, 0.1, 1e-4),
     "instant": (-np.inf, np.inf, 1e-3),
     "angle": (-np.inf, np.inf, 0.01),
     "direction": (-np.inf, np.inf, 0.01),
-    "width": (0.02, 2.0, 0.01),
+    "width": (0.04, 2.0, 0.01),
 }
 
 
@@ -439,7 +461,10 @@ def _law(chosen: Sequence[Family], values: Array, name: str) -> LearnedLaw:
 
 
 def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
-    """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same."""
+    """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same.
+
+    Terms that go together may each be open where their family is not: it is judged as a whole, and so are they.
+    """
     kept, values, share = list[Family](), list[float](), list[float]()
     names = iter(law.candidate.quantities)
     for number, family in enumerate(law.families):
@@ -448,8 +473,9 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
         busy = [
             i for i, q in enumerate(amounts) if abs(fitted.values[q.name]) > MIN_SIGMAS * max(fitted.sigma(q.name), 0.0)
         ]
-        if not busy:
+        if not busy and not _acts(fitted, [q.name for q in amounts]):
             continue
+        busy = busy or list(range(len(amounts)))
         share += law.share[number : number + 1]
         kept.append(replace(family, terms=tuple(family.terms[i] for i in busy)))
         values += [fitted.values[amounts[i].name] for i in busy]
@@ -458,6 +484,18 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
         return law
     shorter = _law(kept, np.array(values), law.candidate.name)
     return replace(shorter, values=fitted.values, share=tuple(share), alike=law.alike)
+
+
+def _acts(fitted: Fit, names: Sequence[str]) -> bool:
+    """Are these amounts together more than noise makes them, as surely as a single one of MIN_SIGMAS?"""
+    index = [fitted.names.index(n) for n in names]
+    amounts = np.array([fitted.values[n] for n in names])
+    size = np.sqrt(np.diag(fitted.covariance)[index])
+    if not (size > 0).all():
+        return False
+    correlation = fitted.covariance[np.ix_(index, index)] / np.outer(size, size)
+    gain = float((amounts / size) @ np.linalg.pinv(correlation, hermitian=True) @ (amounts / size))
+    return as_sigmas(gain, len(names)) > MIN_SIGMAS
 
 
 def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:
