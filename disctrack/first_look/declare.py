@@ -235,6 +235,7 @@ def declaration(
         "",
         "[cameras]                       # frame i of the left and of the right must show the same instant",
         line("cameras", "frame_rate_hz", found.frame_rate, "1000.0", rate_remark),
+        _exposure(example),
         _aligned(f"left = {_toml(f.left.pattern)}", found.described),
         f"right = {_toml(f.right.pattern)}",
         "",
@@ -256,6 +257,12 @@ def declaration(
         line("gravity", "g_m_s2", example.get("gravity", {}).get("g_m_s2", 9.81), "9.81", "9.78 (equator) to 9.83"),
     ]  # fmt: skip
     return "\n".join(lines) + "\n", tuple(missing)
+
+
+def _exposure(example: Mapping[str, Any]) -> str:
+    remark = "with it, poses are those of mid exposure; else it is taken as short"
+    given = example.get("cameras", {}).get("exposure_us")
+    return _aligned("# exposure_us = 200.0" if given is None else f"exposure_us = {_toml(given)}", remark)
 
 
 def _calibration_lines(found: FolderContent, line: Any, example: Mapping[str, Any]) -> list[str]:
