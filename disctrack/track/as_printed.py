@@ -159,21 +159,22 @@ def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, fl
 
     shift : (m, 2) [m] refined minus declared places of covariance (2m, 2m); SIZE_FLOOR is added
 
-    The sigma has three parts: of the refinement; of dots that are misplaced at random, as those left by displacement,
-    turn, size, stretch and shear are; and of a pattern whose two sides are off by what stretch and shear show.
+    The sigma has two parts beside the floor: of dots that are misplaced at random, as those left by displacement, turn,
+    size, stretch and shear are, which holds the refinement's errors as well and is no less than these; and of a pattern
+    whose two sides are off by what stretch and shear show.
     """
     d = _from_middle(disc)
     columns = np.stack([d, d * [0.5, -0.5], 0.5 * d[:, ::-1]], axis=-1).reshape(-1, 3)
     columns = np.concatenate([columns, _pattern_motions(disc).reshape(-1, 3)], axis=1)
     inverse = np.linalg.pinv(columns)
     size, stretch, shear = (inverse @ shift.reshape(-1))[:3]
-    C = (inverse @ covariance @ inverse.T)[:3, :3]
+    refined = float((inverse @ covariance @ inverse.T)[0, 0])
     left = shift.reshape(-1) - columns @ (inverse @ shift.reshape(-1))
     freedom = max(len(left) - 6, 1)
     random = float(left @ left) / freedom / float(np.sum(d**2))
     # stretch and shear have the variance 2 v of two sides, the size, their mean, has v / 2
-    drawn = (stretch**2 + shear**2 + C[1, 1] + C[2, 2]) / 8.0
-    return -float(size), float(np.sqrt(C[0, 0] + random + drawn + SIZE_FLOOR**2))
+    drawn = (stretch**2 + shear**2) / 8.0
+    return -float(size), float(np.sqrt(max(random, refined) + drawn + SIZE_FLOOR**2))
 
 
 def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoRig, float]:

@@ -158,7 +158,8 @@ class DiscSystem:
         for name, size, length, of_unit_size, meaning in fields:
             if size > 0:
                 shifts = size * of_unit_size(places, self.used, length, size * per_px)
-                columns.append(np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts).reshape(n, -1, shifts.shape[-1]))
+                whitened = np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts)
+                columns.append(whitened.reshape(n, 4 * m, shifts.shape[-1]))  # perhaps no mode at all is seen
                 belongs_to = ("rig",) if of_unit_size is in_common and sizes.lens_fields else ()
                 quantities += _nuisances(name, shifts.shape[-1], meaning, belongs_to)
         return tuple(quantities), np.concatenate(columns, axis=-1)

@@ -62,6 +62,6 @@ def long_run_variance(x: Array) -> tuple[float, float]:
 
 
 def with_memory(system: System, fit: Fit) -> Fit:
-    """The fit with standard deviations that know the residual's memory; correlations stay."""
-    factors = inflation(system, fit)
+    """The fit with standard deviations that know the residual's size and memory; correlations stay."""
+    factors = inflation(system, fit) * np.sqrt(max(1.0, fit.reduced_chi_square))
     return replace(fit, covariance=fit.covariance * np.outer(factors, factors))

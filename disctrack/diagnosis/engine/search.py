@@ -364,13 +364,14 @@ class _Search:
     def _standing(self, trial: Trial) -> Trial:
         """Without effects that gain no more than a residual with the memory of what is left may give them."""
         while trial.candidates and self.settings.noise is None:
+            left = max(1.0, trial.fit.reduced_chi_square / self.noise)  # what is left counts as noise does
             factors = dict(zip(trial.fit.names, inflation(self.system, trial.fit), strict=True))
             losses = []
             for candidate in trial.candidates:
                 rest = tuple(c for c in trial.candidates if c is not candidate)
                 smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
                 loss = self._cost(smaller) - self._cost(trial.fit)
-                enough = self.threshold(len(candidate.names)) * max(factors[n] for n in candidate.names) ** 2
+                enough = left * self.threshold(len(candidate.names)) * max(factors[n] for n in candidate.names) ** 2
                 if smaller.converged:
                     losses.append((loss / enough, candidate.name, rest, smaller))
             if not losses or min(losses, key=lambda item: item[0])[0] >= 1.0:
