@@ -69,8 +69,9 @@ def stereo_covariance(refinement: Refinement) -> Array:
 
     Errors that are common to a view weigh more in some directions than in others: a board that moves between the two
     exposures spoils the pair's pose, not the focal lengths. The views' shifts, whitened by what noise would make of
-    them, are shrunk towards equal directions as far as they scatter (Ledoit and Wolf 2004, eq. 14). No direction is
-    taken for better known than the mean of all: of two dozen variances by so few views the smallest are so by chance.
+    them, are shrunk towards equal directions as far as so few views scatter (Ledoit and Wolf 2004). No direction is
+    taken for better known than the geometric mean of all: of two dozen variances by so few views the smallest are small
+    by chance. Nothing gets smaller than by the corners' noise.
     """
     problem = refinement.problem
     s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
@@ -81,11 +82,11 @@ def stereo_covariance(refinement: Refinement) -> Array:
     white = np.linalg.solve(root, shift.T)
     seen = white @ white.T
     mean = float(np.trace(seen)) / s1
-    # of the mean of n outer products w w^T n: their scatter about it, over n
-    scatter = float(np.sum(np.sum(white**2, axis=0) ** 2)) - float(np.sum(seen**2)) / views
-    kept = max(0.0, 1.0 - scatter / max(float(np.sum((seen - mean * np.eye(s1)) ** 2)), 1e-300))
+    by_chance = mean**2 * (s1**2 + s1) / views
+    kept = max(0.0, 1.0 - by_chance / max(float(np.sum((seen - mean * np.eye(s1)) ** 2)), 1e-300))
     factor, directions = np.linalg.eigh(kept * seen + (1 - kept) * mean * np.eye(s1))
-    beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, mean) - 1.0, 0.0))
+    least = np.exp(np.mean(np.log(np.maximum(factor, 1e-12 * mean))))
+    beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
     share = s1 / max(float(np.trace(np.linalg.solve(inverse[:s1], expected))), 1e-12)  # noise moves fewer than all
     information = refinement.normal.view_information()[0]
     scale = 1.0 / np.sqrt(np.diag(information.sum(0)))

@@ -1,9 +1,10 @@
 """What is known of a camera before any view was taken; it decides where few views leave something open.
 
 Sensors are etched to better than 1e-5, so pixels are square unless somebody has resized the images, and the lens stands
-over the middle of the sensor to a few percent unless somebody has cropped them: both priors have Cauchy's tails, which
-let go of what the views contradict. A term of the distortion has a normal prior in what it does at the corner of the
-image. With ten good views nothing of this is felt: they know these parameters ten to a thousand times better.
+over the middle of the sensor to a few percent unless somebody has cropped them; a radial term alone does not turn an
+image inside out unless the lens is a very wide one. These priors have Cauchy's tails, which let go of what the views
+contradict. Focal lengths and tangential terms have normal ones. With ten good views nothing of this is felt: they know
+the parameters ten to a thousand times better.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from calibration.stereo_model import N_STEREO, StereoModel
 FOCAL = 0.7  # of the logarithm of the focal length over the image's longer side: 28 to 90 deg across, as lenses are
 ASPECT = 1e-3  # of fx / fy against 1
 CENTRE = 0.03  # of the principal point against the middle of the image, in its diagonals
-RADIAL = 0.3  # of what one radial term does at the image's corner, in its distance from the middle
+RADIAL = 1.0  # of what one radial term does at the image's corner, in its distance from the middle
 TANGENTIAL = 0.01  # the same of a tangential term
 
 
@@ -69,8 +70,9 @@ def camera_priors(model: StereoModel) -> Prior:
         rows[first + 1 : first + 3, column + 2 : column + 4] = np.eye(2) / (CENTRE * diagonal)
         at[first + 1 : first + 3] = 0.5 * (size - 1) / (CENTRE * diagonal)
         radial, tangential = np.array([corner**2, corner**4, corner**6]) / RADIAL, 3 * corner / TANGENTIAL
-        terms = np.array([radial[0], radial[1], tangential, tangential, radial[2]])
-        rows[first + 3 : first + 8, column + 4 : column + 9] = np.diag(terms)
-        heavy += [slice(first, first + 1), slice(first + 1, first + 3)]
+        for place, term in enumerate((4, 5, 8)):  # k1, k2, k3
+            rows[first + 3 + place, column + term] = radial[place]
+        rows[first + 6 : first + 8, column + 6 : column + 8] = tangential * np.eye(2)
+        heavy += [slice(first, first + 1), slice(first + 1, first + 3), slice(first + 3, first + 6)]
     left, right = (float(max(camera.image_size)) for camera in model.cameras)
     return Prior(rows, at, (left, right), tuple(heavy))

@@ -6,6 +6,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calibration import (
     Board,
@@ -15,6 +16,7 @@ from calibration import (
     find_corners,
     triangulate,
 )
+from calibration.assessment import stereo_covariance
 from calibration.rig_file import read_rig_group
 
 
@@ -51,6 +53,32 @@ def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     # left08 too, although half of its corners lie 0.2-0.3 px to one side of where the other 25 images put them
     assert not found.rejected_views
     assert np.isfinite(found.rms_per_view_px).all()
+
+
+@pytest.mark.slow
+def test_halves_of_the_opencv_photographs_agree_within_what_each_states(opencv_photographs):
+    left, right = opencv_photographs[0]
+    settings, order = CalibrationSettings("k1 k2 p1 p2 k3", "free"), np.arange(len(left))
+    ratios = []
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(order)
+        fits = [
+            calibrate_from_corners(
+                [left[v] for v in half], [right[v] for v in half], Board((9, 6), 25e-3), settings
+            ).refinement
+            for half in (np.sort(order[::2]), np.sort(order[1::2]))
+        ]
+        basis = fits[0].problem.stereo_basis
+        (one, R_one), (two, R_two) = (
+            (np.concatenate([*(c.parameters for c in f.model.cameras), np.zeros(3), f.model.t_right_left]), f.model)
+            for f in fits
+        )
+        difference = one - two
+        difference[18:21] = Rotation.from_matrix(R_one.R_right_left @ R_two.R_right_left.T).as_rotvec()
+        difference = basis.T @ difference
+        covariance = sum(stereo_covariance(f) for f in fits)
+        ratios.append(difference @ np.linalg.solve(covariance, difference) / len(difference))
+    assert 0.5 < np.mean(ratios) < 2
 
 
 def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
