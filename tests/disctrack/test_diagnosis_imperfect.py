@@ -60,6 +60,7 @@ def test_a_camera_that_turned_does_not_make_the_motion_look_like_rest():
 
 def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
     found = systematic_of(recording()[0])
+    assert found.left == pytest.approx(1.0, abs=0.1)  # 200 frames of 18 numbers: 2 %, and what bumps miss
     assert 0.008 < found.lens_px < 0.05  # 0.02 px over the whole image; the dots see a part of it
     assert found.beside == ()
     alone = systematic_of(recording(laboratory=Laboratory(), faults=Faults(right_delay_s=2e-4))[0])

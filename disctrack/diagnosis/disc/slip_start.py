@@ -62,6 +62,8 @@ def diagnose_motion(
     stretch = free_stretch(trajectory)
     rolling = DiscSystem(trajectory, model, stretch=stretch)
     systematic = find_systematic(rolling, noise)
+    # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
+    settings = replace(settings, at_noise=settings.at_noise * systematic.left)
     assumed = find_large(as_tracked, model, systematic, faults)
     if assumed is not None:
         return _with_large(assumed, settings)

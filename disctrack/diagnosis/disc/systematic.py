@@ -98,6 +98,7 @@ class Systematic:
     beside_px: float = 0.0  # rms of what they do to the dots about free poses
     amounts: dict[str, float] = field(default_factory=dict)  # of their quantities
     lens_fields: tuple[SmoothField, ...] = ()  # of each camera, where several recordings have them in common
+    left: float = 1.0  # variance beside all that, over the noise, of the numbers that no pose can take
 
     @property
     def present(self) -> bool:
@@ -208,6 +209,10 @@ class Evidence:
         root, known, _, _ = self._solved(sizes)
         return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
 
+    def left(self, sizes: Mapping[str, float]) -> float:
+        """Square of the data beside the most probable columns of these sizes, and of the numbers these have."""
+        return self._power - float(np.sum(self._solved(sizes)[1] ** 2))
+
     def amounts(self, sizes: Mapping[str, float], name: str) -> Array:
         """Most probable numbers of one group's columns, in the units that the columns are given in."""
         root, known, index, scaled = self._solved(sizes)
@@ -301,6 +306,7 @@ def find_systematic(
     data = free(view.residual)[:, 0]
     per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))  # whitened units in a pixel
     rms = float(np.sqrt(np.mean(data**2)))
+    numbers = float(np.sum(system.weights[rows] - 6.0))
     used, places = view.used, view.places
     extent = float(np.max([np.ptp(places[:, c][used[:, c]], axis=0).max() for c in range(2)]))
     faults = {name: whitened(columns) for name, columns in view.faults.items()}
@@ -336,6 +342,7 @@ def find_systematic(
         found = Systematic(
             sizes.get("lens", 0.0), share * extent, sizes.get("dot", 0.0), DOT_LENGTH * extent,
             sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, noise, value - nothing,
+            left=max(1.0, evidence.left(sizes) / numbers),
         )  # fmt: skip
         found = _with_amounts(found, evidence, sizes, (*given, *chosen), view)
         if found.present and found.gain > best.gain + WORTH:
