@@ -143,7 +143,7 @@ def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Lea
     if diagnosis.verdict == "nothing missing" or (diagnosis.verdict == "found" and len(diagnosis.found) < 2):
         return None, ()
     base = diagnosis.before
-    law = learn(system, base, diagnosis.noise)
+    law = learn(system, base, diagnosis.noise, diagnosis.after if diagnosis.verdict == "found" else None)
     if law is None or diagnosis.held_out_before is None:
         return None, ()
     system = system.knowing(law.effect)

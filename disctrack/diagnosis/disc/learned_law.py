@@ -278,11 +278,13 @@ def _proposal(family: Family, gram: Array, before: Array, right: Array) -> GainO
     return GainOfFamily(family, float(np.sum(along**2 / eigenvalues[seen])), values)
 
 
-def learn(system: DiscSystem, base: Fit, noise: float) -> LearnedLaw | None:
+def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None) -> LearnedLaw | None:
     """The law of few terms that describes what is missing; None if none survives, or where the disc slips.
 
     The law is called "learned", or "learned_2" and so on where the model has learned laws already.
     noise : variance of the residual's noise over that stated
+    rival : known effects that describe the data; then only a law of a single term is sought, and only one that may,
+    by its first-order gain, come as near to the data
     """
     name = _free_name(system.model)
     price = float(np.log(np.sum(system.weights)))
@@ -290,7 +292,8 @@ def learn(system: DiscSystem, base: Fit, noise: float) -> LearnedLaw | None:
     law: LearnedLaw | None = None
     current, length, alike = base, base.cost / noise, tuple[str, ...]()
     at_noise = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
-    while law is None or (len(law.families) < MAX_TERMS and current.reduced_chi_square > at_noise):
+    most_terms = MAX_TERMS if rival is None else 1
+    while law is None or (len(law.families) < most_terms and current.reduced_chi_square > at_noise):
         known = system if law is None else system.knowing(law.effect)
         if responding(known, current) is None:
             break
@@ -298,6 +301,8 @@ def learn(system: DiscSystem, base: Fit, noise: float) -> LearnedLaw | None:
         library = list(families(scan.motion.q, scan.motion.time, rate))
         looked = 2.0 * float(np.log(len(library)))
         worth = [p for p in scan.proposals(library) if p.gain / noise > price * p.family.n_numbers + looked]
+        if rival is not None:
+            worth = [p for p in worth if scan.chi_square - p.gain < rival.chi_square + EXACT * scan.chi_square]
         trials = [
             _refitted(system, base, law, current, p, name) for p in _various(worth, scan.chi_square, noise, price)
         ]
