@@ -142,6 +142,18 @@ def _exposures(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
     )
 
 
+def other_exposure(left: FrameReader, right: FrameReader, declared: float | None, declared_in: str) -> tuple[str, ...]:
+    """Warnings where the declared exposure [s] is not that of a camera's header."""
+    headers = zip(CAMERAS, (header_of(left), header_of(right)), strict=True)
+    return tuple(
+        f"{declared_in}: [cameras] exposure_us is {1e6 * declared:g}, the {camera} camera's header says "
+        f"{1e6 * header.exposure:g} us ({header.file}); the declared one is used"
+        for camera, header in headers
+        if declared is not None and header is not None and header.exposure is not None
+        and abs(header.exposure - declared) > SAME_EXPOSURE * max(header.exposure, declared)
+    )  # fmt: skip
+
+
 def _takes(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
     if left.recorded is None or right.recorded is None:
         return ()

@@ -22,7 +22,7 @@ from disctrack.progress import compiling
 from disctrack.readers import open_frames
 from disctrack.readers.base import FrameReader
 from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
-from disctrack.readers.camera_header import check_headers, header_of
+from disctrack.readers.camera_header import check_headers, header_of, other_exposure
 from disctrack.readers.file_numbers import check_same_numbers
 from disctrack.readers.flat_field import flat_fielded, flat_fields
 from disctrack.readers.time_stamps import check_time_stamps, usable_times
@@ -95,6 +95,7 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     ]
     left, right = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
     warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
+    warnings += other_exposure(left, right, recording.exposure, str(recording.file))
     check_pair(left, right)
     stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)
     doubts = (

@@ -106,6 +106,18 @@ def test_poses_and_times_from_cine_are_those_from_png(recording, from_png, bits)
     assert read_findings(found)["camera_headers"]["left"]["first_frame"] == -5
 
 
+def test_a_declared_exposure_that_no_header_confirms_is_told(recording, capsys):
+    for name in ("left", "right"):
+        write_mraw(
+            recording / "raw" / name, grey_values(recording / name), 8, Record_Rate="1000", Shutter_Type2="50000"
+        )
+    use_files(recording, "raw/left.cih", "raw/right.cih")
+    file = recording / "recording.toml"
+    file.write_text(file.read_text().replace("[cameras]", "[cameras]\nexposure_us = 500", 1))
+    assert main(["run", str(recording), *QUICK]) == 0
+    assert "exposure_us is 500, the left camera's header says 50 us" in " ".join(capsys.readouterr().out.split())
+
+
 def test_calibration_views_may_be_frames_of_one_file(short_recording, tmp_path, rig_file):
     """The same views as PNG files and as MRAW give the same rig."""
     text = (short_recording / "recording.toml").read_text()
