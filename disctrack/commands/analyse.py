@@ -39,7 +39,14 @@ def run(arguments: argparse.Namespace) -> int:
         return DONE
     again = arguments.overwrite or told is not None
     with stage("analyse"):
-        outcome = run_analyse(path, folder, arguments.window, arguments.circle, again, arguments.figures)
+        outcome = run_analyse(
+            path,
+            folder,
+            window=arguments.window,
+            circle_duration=arguments.circle,
+            overwrite=again,
+            figures=arguments.figures,
+        )
     lines = outcome.lines()
     page = folder / "motion.html"
     with stage("motion.html"):

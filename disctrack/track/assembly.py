@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -75,21 +76,9 @@ def assemble(
 ) -> Tracking:
     """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds."""
     if any(settings.exposure):  # which frames to trust with the acceleration is known when all have been judged
-        once = {name: np.copy(table) for name, table in vars(tables).items()}
-        blurred = _assembled(followers, Tables(**once), settings, frame_rate, gravity, time, pairs)
+        unmoved = replace(settings, exposure=(0.0, 0.0))
+        blurred = assemble(followers, deepcopy(tables), unmoved, frame_rate, gravity, time, pairs)
         tables.pixels -= shift_by_exposure(blurred.trajectory, settings.exposure)
-    return _assembled(followers, tables, settings, frame_rate, gravity, time, pairs)
-
-
-def _assembled(
-    followers: list[Follower],
-    tables: Tables,
-    settings: TrackingSettings,
-    frame_rate: float,
-    gravity: float,
-    time: Array,
-    pairs: range,
-) -> Tracking:
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
     alone = repeated & ~repeated.all(axis=1, keepdims=True)

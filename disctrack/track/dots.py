@@ -28,6 +28,7 @@ from disctrack.track import _kernels as kernels
 from disctrack.trajectory import MarkerStatus
 
 TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
+LESS_THAN_FLAT = 0.9  # share of the noise of flat parts, from which on down what fits leave is believed instead
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,6 @@ def typical_noise(image: Image) -> NoiseModel:
     """Noise of an ordinary camera (50 electrons per grey value of 8 bits), where nothing was measured."""
     grey = full_scale(image) / 255.0
     return NoiseModel(grey**2, 0.02 * grey, float(level_step(image)))
-
-
-LESS_THAN_FLAT = 0.9  # share of the noise of flat parts, from which on down what fits leave is believed instead
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
+
 import numpy as np
 
 from disctrack.diagnosis.disc.errors import Errors
@@ -67,7 +69,7 @@ def together_text(found: Found, diagnosis: Diagnosis) -> str:
     """What their standard deviations alone do not say; a pair that an earlier effect's text has named is left out."""
     fit = diagnosis.after
     units = {q.name: q.unit for q in fit.quantities}
-    earlier = diagnosis.found[: diagnosis.found.index(found)] if found in diagnosis.found else ()
+    earlier = takewhile(lambda effect: effect is not found, diagnosis.found)
     named = {frozenset((pair.first, pair.second)) for effect in earlier for pair in together(effect, fit)}
     text = ""
     for pair in together(found, fit):
