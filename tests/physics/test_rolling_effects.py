@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, ModelError, State, steady_precession
-from disctrack.rolling.effects import catalogue_table, effect_from_formulas
+from disctrack.rolling.effects import catalogue_table, effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None]
@@ -111,21 +111,14 @@ def test_compiled_law_equals_the_law_in_numpy(name, rng):
     assert np.abs(motion.contact_moment).max() + np.abs(motion.external_force).max() > 0
 
 
-def test_a_new_effect_is_one_small_class():
-    class Magnet(Effect):
+def test_a_new_effect_is_one_small_function():
+    @effect("magnetic brake", "this test", EffectParameter("b", "N m s", 1e-6, "moment per rate", lower=0.0))
+    def test_magnet(p, s, w):
         """Moment about the vertical that falls with the distance from the origin: in no list but this test's."""
-
-        name = "test_magnet"
-        title = "magnetic brake"
-        source = "this test"
-        parameters = (EffectParameter("b", "N m s", 1e-6, "moment per rate", lower=0.0),)
-
-        @staticmethod
-        def law(p, s, w):
-            w.M_z -= p.b * s.omega_z * np.exp(-(s.x * s.x + s.y * s.y) / 1e-4)
+        w.M_z -= p.b * s.omega_z * np.exp(-(s.x * s.x + s.y * s.y) / 1e-4)
 
     try:
-        assert largest_power(Magnet(), np.random.default_rng(1)) <= 0
+        assert largest_power(test_magnet(), np.random.default_rng(1)) <= 0
         model = Model(MA_2014, effects=(CATALOGUE["km"](), CATALOGUE["test_magnet"](b=1e-4)))
         state = steady_precession(np.radians(10), MA_2014, omega3=3.0)
         motion = rolling.simulate(model, state, 0.2)
@@ -255,6 +248,6 @@ def test_spin_drifts_whichever_direction_the_dissipative_moment_has():
 def test_catalogue_table_names_every_effect_with_its_parameters():
     table = catalogue_table().splitlines()
     assert len(table) == len(CATALOGUE) + 2
-    for row, effect in zip(table[2:], CATALOGUE.values(), strict=True):
-        assert row.startswith(f"| `{effect.name}` |")
-        assert all(f"`{p.name}`" in row for p in effect.parameters)
+    for row, kind in zip(table[2:], CATALOGUE.values(), strict=True):
+        assert row.startswith(f"| `{kind.name}` |")
+        assert all(f"`{p.name}`" in row for p in kind.parameters)

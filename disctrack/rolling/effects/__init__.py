@@ -10,6 +10,7 @@ from disctrack.rolling.effects.base import (
     ModelError,
     catalogue,
     catalogue_table,
+    effect,
     effect_class,
 )
 
@@ -25,6 +26,7 @@ __all__ = [
     "ModelError",
     "catalogue",
     "catalogue_table",
+    "effect",
     "effect_class",
     "effect_from_formulas",
 ]

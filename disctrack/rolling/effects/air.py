@@ -4,117 +4,99 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, EffectParameter, magnitude
+from disctrack.rolling.effects.base import EffectParameter, effect, magnitude
 
 AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
 AIR_VISCOSITY = 1.81e-5  # [Pa s]
 
 
-class MoffattAirLayer(Effect):
+@effect(
+    "viscous air layer, M_m = -f (pi mu r^3 / 4) psidot / sin^2 theta",
+    "Moffatt 2000, Nature 404:833; mu = 1.81e-5 Pa s",
+    EffectParameter("f", "1", 1.0, "factor on the lubrication layer", lower=0.0),
+    belongs_to=("air",),
+    density_power=0.0,
+    counter_rotating=True,  # reads psidot, works on phidot
+)
+def air_moffatt(p: Any, s: Any, w: Any) -> None:
     """Viscous air layer under the disc: power pi mu g r^2 / theta^2 on the adiabatic manifold."""
-
-    name = "air_moffatt"
-    title = "viscous air layer, M_m = -f (pi mu r^3 / 4) psidot / sin^2 theta"
-    source = "Moffatt 2000, Nature 404:833; mu = 1.81e-5 Pa s"
-    belongs_to = ("air",)
-    density_power = 0.0
-    parameters = (EffectParameter("f", "1", 1.0, "factor on the lubrication layer", lower=0.0),)
-    counter_rotating = True  # reads psidot, works on phidot
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        layer = 0.25 * np.pi * AIR_VISCOSITY * s.radius * s.radius * s.radius
-        w.M_m -= p.f * layer * s.psidot / (s.sin_theta * s.sin_theta)
+    layer = 0.25 * np.pi * AIR_VISCOSITY * s.radius * s.radius * s.radius
+    w.M_m -= p.f * layer * s.psidot / (s.sin_theta * s.sin_theta)
 
 
-class BildstenAirLayer(Effect):
+@effect(
+    "boundary-layer air drag, M_m = -beta rho sqrt(nu) r^4 |psidot|^(3/2) sgn psidot / sin theta",
+    "Bildsten 2002, Phys. Rev. E 66:056309; rho = 1.2 kg/m^3",
+    EffectParameter("beta", "1", 1.0, "factor of order one", lower=0.0),
+    belongs_to=("air",),
+    density_power=0.5,
+    counter_rotating=True,
+)
+def air_bildsten(p: Any, s: Any, w: Any) -> None:
     """Boundary layers on disc and table that are thinner than the gap: theta above about 0.5 deg."""
-
-    name = "air_bildsten"
-    title = "boundary-layer air drag, M_m = -beta rho sqrt(nu) r^4 |psidot|^(3/2) sgn psidot / sin theta"
-    source = "Bildsten 2002, Phys. Rev. E 66:056309; rho = 1.2 kg/m^3"
-    belongs_to = ("air",)
-    density_power = 0.5
-    parameters = (EffectParameter("beta", "1", 1.0, "factor of order one", lower=0.0),)
-    counter_rotating = True
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        r2 = s.radius * s.radius
-        layer = np.sqrt(AIR_DENSITY * AIR_VISCOSITY) * r2 * r2  # rho sqrt(nu) = sqrt(rho mu)
-        w.M_m -= p.beta * layer * s.psidot * np.sqrt(magnitude(s.psidot)) / s.sin_theta
+    r2 = s.radius * s.radius
+    layer = np.sqrt(AIR_DENSITY * AIR_VISCOSITY) * r2 * r2  # rho sqrt(nu) = sqrt(rho mu)
+    w.M_m -= p.beta * layer * s.psidot * np.sqrt(magnitude(s.psidot)) / s.sin_theta
 
 
-class QuadraticAirDrag(Effect):
+@effect(
+    "quadratic air drag on the rotation, M = -a rho r^5 |Omega| Omega",
+    "dimensional analysis; a about 0.1, rho = 1.2 kg/m^3",
+    EffectParameter("a", "1", 0.1, "drag coefficient", lower=0.0),
+    belongs_to=("air",),
+    density_power=1.0,
+    airborne=True,
+)
+def air_quadratic(p: Any, s: Any, w: Any) -> None:
     """Free-air drag on the rotation, M = -a rho r^5 |Omega| Omega."""
-
-    name = "air_quadratic"
-    title = "quadratic air drag on the rotation, M = -a rho r^5 |Omega| Omega"
-    source = "dimensional analysis; a about 0.1, rho = 1.2 kg/m^3"
-    belongs_to = ("air",)
-    density_power = 1.0
-    parameters = (EffectParameter("a", "1", 0.1, "drag coefficient", lower=0.0),)
-    airborne = True
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        r2 = s.radius * s.radius
-        rolling_m = -s.phidot * s.sin_theta
-        rate = np.sqrt(s.thetadot * s.thetadot + rolling_m * rolling_m + s.omega_z * s.omega_z + 1e-12)
-        drag = p.a * AIR_DENSITY * r2 * r2 * s.radius * rate
-        w.M_n -= drag * s.thetadot
-        w.M_m -= drag * rolling_m
-        w.M_z -= drag * s.omega_z
+    r2 = s.radius * s.radius
+    rolling_m = -s.phidot * s.sin_theta
+    rate = np.sqrt(s.thetadot * s.thetadot + rolling_m * rolling_m + s.omega_z * s.omega_z + 1e-12)
+    drag = p.a * AIR_DENSITY * r2 * r2 * s.radius * rate
+    w.M_n -= drag * s.thetadot
+    w.M_m -= drag * rolling_m
+    w.M_z -= drag * s.omega_z
 
 
-class SpinAirDrag(Effect):
+@effect(
+    "viscous air drag on the spin, M = -a omega3 e3",
+    "Jalali, Sarebangholi and Alam 2015, Phys. Rev. E 92:032913",
+    EffectParameter("a", "N m s", 1e-7, "moment per spin rate", lower=0.0),
+    belongs_to=("air", "disc"),
+    density_power=0.0,
+    airborne=True,
+)
+def air_spin(p: Any, s: Any, w: Any) -> None:
     """Moment -a omega3 e3."""
-
-    name = "air_spin"
-    title = "viscous air drag on the spin, M = -a omega3 e3"
-    source = "Jalali, Sarebangholi and Alam 2015, Phys. Rev. E 92:032913"
-    belongs_to = ("air", "disc")
-    density_power = 0.0
-    parameters = (EffectParameter("a", "N m s", 1e-7, "moment per spin rate", lower=0.0),)
-    airborne = True
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        w.M_m += p.a * s.omega3 * s.sin_theta  # e3 = -sin(theta) m0 + cos(theta) k
-        w.M_z -= p.a * s.omega3 * s.cos_theta
+    w.M_m += p.a * s.omega3 * s.sin_theta  # e3 = -sin(theta) m0 + cos(theta) k
+    w.M_z -= p.a * s.omega3 * s.cos_theta
 
 
-class RotationDrag(Effect):
+@effect(
+    "linear drag on the rotation of the whole disc, M = -c Omega",
+    "viscous drag of a fluid at rest, Stokes' law for rotation",
+    EffectParameter("c", "N m s", 1e-6, "moment per angular velocity", lower=0.0),
+    belongs_to=("air", "disc"),
+    density_power=0.0,
+    airborne=True,
+)
+def drag_rotation(p: Any, s: Any, w: Any) -> None:
     """Moment -c Omega on the whole disc."""
-
-    name = "drag_rotation"
-    title = "linear drag on the rotation of the whole disc, M = -c Omega"
-    source = "viscous drag of a fluid at rest, Stokes' law for rotation"
-    belongs_to = ("air", "disc")
-    density_power = 0.0
-    parameters = (EffectParameter("c", "N m s", 1e-6, "moment per angular velocity", lower=0.0),)
-    airborne = True
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        w.M_n -= p.c * s.thetadot
-        w.M_m += p.c * s.phidot * s.sin_theta
-        w.M_z -= p.c * s.omega_z
+    w.M_n -= p.c * s.thetadot
+    w.M_m += p.c * s.phidot * s.sin_theta
+    w.M_z -= p.c * s.omega_z
 
 
-class LinearDrag(Effect):
+@effect(
+    "linear drag of the whole disc, X = -c v_O",
+    "Stokes' law; an eddy-current brake or a draught at rest has the same form",
+    EffectParameter("c", "N s/m", 1e-4, "force per velocity of the centre", lower=0.0),
+    belongs_to=("air", "disc"),
+    density_power=0.0,
+    airborne=True,
+)
+def drag_linear(p: Any, s: Any, w: Any) -> None:
     """Force -c v_O on the disc as a whole."""
-
-    name = "drag_linear"
-    title = "linear drag of the whole disc, X = -c v_O"
-    source = "Stokes' law; an eddy-current brake or a draught at rest has the same form"
-    belongs_to = ("air", "disc")
-    density_power = 0.0
-    parameters = (EffectParameter("c", "N s/m", 1e-4, "force per velocity of the centre", lower=0.0),)
-    airborne = True
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        w.X_n -= p.c * s.v_n
-        w.X_m -= p.c * s.v_m
-        w.X_z -= p.c * s.v_z
+    w.X_n -= p.c * s.v_n
+    w.X_m -= p.c * s.v_m
+    w.X_z -= p.c * s.v_z

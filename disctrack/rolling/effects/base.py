@@ -1,15 +1,15 @@
 """What an effect is: a named part with parameters that is added to the ideal rolling disc.
 
-To add one, write a class in a module of this package: a name, its parameters, where it comes from, and either
+To add one, write a function with its name in a module of this package, under `@effect(title, source, parameters ...)`:
 
-    law(p, s, w)         adds to the wrench `w` a moment, a load lever or a force (records.WRENCH), from parameters
+    name(p, s, w)        adds to the wrench `w` a moment, a load lever or a force (records.WRENCH), from parameters
                          `p.<name>` and kinematics `s.<name>` (records.KINEMATICS). One expression for numbers, arrays
                          and complex numbers alike: no `if`, no `abs`; use `magnitude`, `sign`, `np.sqrt`, `np.exp`.
-    adjust(body, p)      changes the body's constants (records.BODY) before the motion starts
+    name(body, p)        changes the body's constants (records.BODY) before the motion starts
 
-or both. Defining the class enters it into CATALOGUE, from where simulation, fitting and diagnosis take it (a law by
-formula is no part of it: a model that may use one carries it, Model.laws). A compiled law is
-kept as long as its own file does not change; who changes `magnitude` or `sign` touches the laws' files too.
+It becomes a class of effects in CATALOGUE, from where simulation, fitting and diagnosis take it (a law by formula is no
+part of it: a model that may use one carries it, Model.laws). A compiled law is kept as long as its own file and the
+helpers' do not change.
 
 Signs: M is the moment of the table on the disc at the contact, in (n0, m0, k). Its power is
 M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O, and for a passive effect it is never positive.
@@ -17,7 +17,7 @@ M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O, and for a passive 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -26,6 +26,7 @@ import numpy as np
 from disctrack.errors import ModelError
 
 CATALOGUE: dict[str, type[Effect]] = {}
+SLOWEST_ROLLING = 1e-3  # [rad/s] rolling rate below which its direction is smoothed; the disc's is above 1
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,13 @@ def sign(x: Any, width: float) -> Any:
     return x / np.sqrt(x * x + width * width)
 
 
-HELPERS = (magnitude, sign)
+def rolling_rates(s: Any) -> Any:
+    """Horizontal angular velocity along n0 and m0, and its size, smoothed where the disc hardly rolls [rad/s]."""
+    roll_n, roll_m = s.thetadot, -s.phidot * s.sin_theta
+    return roll_n, roll_m, np.sqrt(roll_n * roll_n + roll_m * roll_m + SLOWEST_ROLLING * SLOWEST_ROLLING)
+
+
+HELPERS = (magnitude, sign, rolling_rates)
 
 
 class Effect:
@@ -77,10 +84,10 @@ class Effect:
     def __init_subclass__(cls) -> None:
         if cls.formulas is not None:  # what one recording taught is no candidate for the next one
             return
-        if cls.name in CATALOGUE and CATALOGUE[cls.name].__qualname__ != cls.__qualname__:
-            raise ModelError(
-                f"two effects are called '{cls.name}': {CATALOGUE[cls.name].__qualname__}, {cls.__qualname__}"
-            )
+        if cls.name in CATALOGUE:
+            places = [f"{kind.__module__}.{kind.__qualname__}" for kind in (CATALOGUE[cls.name], cls)]
+            if places[0] != places[1]:
+                raise ModelError(f"two effects are called '{cls.name}': {', '.join(places)}")
         CATALOGUE[cls.name] = cls
 
     def __init__(self, **values: float) -> None:
@@ -95,11 +102,7 @@ class Effect:
             if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
                 raise ModelError(
                     f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
-                    + (
-                        ": a passive effect cannot feed the disc with energy"
-                        if self.passive and value < p.lower
-                        else ""
-                    )
+                    + (": a passive effect cannot feed the disc with energy" * (self.passive and value < p.lower))
                 )
 
     @property
@@ -124,6 +127,25 @@ class Effect:
         return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self._values.items())})"
 
 
+def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any) -> Callable[[Any], type[Effect]]:
+    """Make a law (p, s, w) or an adjustment (body, p) an effect of the catalogue; traits: fields of `Effect`."""
+
+    def entered(function: Any) -> type[Effect]:
+        adjusts = function.__code__.co_argcount == 2
+        members = {
+            "name": function.__name__,
+            "title": title,
+            "source": source,
+            "parameters": parameters,
+            "passive": not adjusts,
+            "adjust" if adjusts else "law": staticmethod(function),
+        }
+        own = {"__doc__": function.__doc__, "__module__": function.__module__}
+        return type(function.__name__, (Effect,), own | members | traits)
+
+    return entered
+
+
 def effect_class(name: str) -> type[Effect]:
     """Class of the catalogue's effect of this name; raises ModelError naming what there is."""
     if name not in CATALOGUE:
@@ -139,9 +161,9 @@ def catalogue() -> Iterator[type[Effect]]:
 def catalogue_table() -> str:
     """The catalogue as a Markdown table: name, law, parameters with unit and nominal value, source."""
     rows = ["| effect | law | parameters (nominal) | source |", "|---|---|---|---|"]
-    for effect in catalogue():
+    for kind in catalogue():
         numbers = "; ".join(
-            f"`{p.name}` {p.nominal:g} {p.unit if p.unit != '1' else ''}".strip() for p in effect.parameters
+            f"`{p.name}` {p.nominal:g} {p.unit if p.unit != '1' else ''}".strip() for p in kind.parameters
         )
-        rows.append(f"| `{effect.name}` | {effect.title.replace('|', chr(92) + '|')} | {numbers} | {effect.source} |")
+        rows.append(f"| `{kind.name}` | {kind.title.replace('|', chr(92) + '|')} | {numbers} | {kind.source} |")
     return "\n".join(rows) + "\n"

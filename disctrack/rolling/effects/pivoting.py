@@ -4,58 +4,43 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, EffectParameter, sign
+from disctrack.rolling.effects.base import EffectParameter, effect, sign
 
 
-class PivotingFriction(Effect):
+@effect(
+    "pivoting friction, M_z = -k_z F_z sgn omega_z",
+    "Ma et al. 2014, (5.2); Coulomb-Contensou: k_z = 2/3 mu a of a contact of radius a",
+    EffectParameter("k_z", "m", 1e-5, "lever arm", lower=0.0),
+    EffectParameter(
+        "omega_s", "rad/s", 1e-2, "pivoting rate below which it is not full", lower=1e-4, upper=10.0, is_shape=True
+    ),
+)
+def kz(p: Any, s: Any, w: Any) -> None:
     """M_z = -k_z F_z sgn(omega_z), the sign softened by creep: what the contact gives before it turns as a whole.
 
     How soft it is matters where the pivoting dies out: omega_s = 0.01 in place of 0.001 rad/s moves k_z by 0.2 %.
     """
-
-    name = "kz"
-    title = "pivoting friction, M_z = -k_z F_z sgn omega_z"
-    source = "Ma et al. 2014, (5.2); Coulomb-Contensou: k_z = 2/3 mu a of a contact of radius a"
-    parameters = (
-        EffectParameter("k_z", "m", 1e-5, "lever arm", lower=0.0),
-        EffectParameter(
-            "omega_s", "rad/s", 1e-2, "pivoting rate below which it is not full", lower=1e-4, upper=10.0, is_shape=True
-        ),
-    )
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        w.load_z -= p.k_z * sign(s.omega_z, p.omega_s)
+    w.load_z -= p.k_z * sign(s.omega_z, p.omega_s)
 
 
-class ViscousPivotingFriction(Effect):
+@effect(
+    "viscous pivoting friction, M_z = -k F_z omega_z",
+    "Coulomb-Contensou friction linearised in the pivoting rate, Leine and Glocker 2003",
+    EffectParameter("k", "m s", 1e-5, "lever arm per pivoting rate", lower=0.0),
+)
+def pivoting_viscous(p: Any, s: Any, w: Any) -> None:
     """M_z = -k F_z omega_z: pivoting superposed on slip or creep."""
-
-    name = "pivoting_viscous"
-    title = "viscous pivoting friction, M_z = -k F_z omega_z"
-    source = "Coulomb-Contensou friction linearised in the pivoting rate, Leine and Glocker 2003"
-    parameters = (EffectParameter("k", "m s", 1e-5, "lever arm per pivoting rate", lower=0.0),)
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        w.load_z -= p.k * s.omega_z
+    w.load_z -= p.k * s.omega_z
 
 
-class ContensouPivotingFriction(Effect):
+@effect(
+    "Coulomb-Contensou pivoting friction, M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2)",
+    "Leine and Glocker 2003, Eur. J. Mech. A 22:193 (smooth approximation of the Contensou coupling)",
+    EffectParameter("k", "m", 1e-5, "lever arm of full pivoting", lower=0.0),
+    EffectParameter("omega_s", "rad/s", 1.0, "pivoting rate below which creep dominates", lower=1e-2, is_shape=True),
+    EffectParameter("a", "m", 75e-6, "radius of the contact", lower=1e-7, is_shape=True),
+)
+def pivoting_contensou(p: Any, s: Any, w: Any) -> None:
     """M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2): at most k F_z, softened by creep and slip."""
-
-    name = "pivoting_contensou"
-    title = "Coulomb-Contensou pivoting friction, M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2)"
-    source = "Leine and Glocker 2003, Eur. J. Mech. A 22:193 (smooth approximation of the Contensou coupling)"
-    parameters = (
-        EffectParameter("k", "m", 1e-5, "lever arm of full pivoting", lower=0.0),
-        EffectParameter(
-            "omega_s", "rad/s", 1.0, "pivoting rate below which creep dominates", lower=1e-2, is_shape=True
-        ),
-        EffectParameter("a", "m", 75e-6, "radius of the contact", lower=1e-7, is_shape=True),
-    )
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        slip2 = (s.slip_n * s.slip_n + s.slip_m * s.slip_m) / (p.a * p.a)
-        w.load_z -= p.k * s.omega_z / np.sqrt(s.omega_z * s.omega_z + p.omega_s * p.omega_s + slip2)
+    slip2 = (s.slip_n * s.slip_n + s.slip_m * s.slip_m) / (p.a * p.a)
+    w.load_z -= p.k * s.omega_z / np.sqrt(s.omega_z * s.omega_z + p.omega_s * p.omega_s + slip2)

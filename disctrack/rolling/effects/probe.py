@@ -4,31 +4,26 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, EffectParameter
+from disctrack.rolling.effects.base import EffectParameter, effect
 
 
-class WrenchProbe(Effect):
+@effect(
+    "moment (M_n, M_m, M_z) and force (X_n, X_m, X_z) times exp(-(t - t_0)^2 / (2 width^2))",
+    "tool: a residual motion, resolved into probes at successive t_0, is the moment that a model lacks",
+    *(EffectParameter(f"M_{a}", "N m", 1e-5, f"moment along {a}") for a in ("n", "m", "z")),
+    *(EffectParameter(f"X_{a}", "N", 1e-3, f"force on the centre along {a}") for a in ("n", "m", "z")),
+    EffectParameter("t_0", "s", 0.1, "middle of the probe", is_shape=True),
+    EffectParameter("width", "s", 0.01, "standard deviation of its course", lower=1e-3, is_shape=True),
+    passive=False,
+    candidate=False,
+)
+def wrench_probe(p: Any, s: Any, w: Any) -> None:
     """Contact moment and force with a Gaussian course in time; its sensitivities are the motion's impulse response."""
-
-    name = "wrench_probe"
-    title = "moment (M_n, M_m, M_z) and force (X_n, X_m, X_z) times exp(-(t - t_0)^2 / (2 width^2))"
-    source = "tool: a residual motion, resolved into probes at successive t_0, is the moment that a model lacks"
-    parameters = (
-        *(EffectParameter(f"M_{a}", "N m", 1e-5, f"moment along {a}") for a in ("n", "m", "z")),
-        *(EffectParameter(f"X_{a}", "N", 1e-3, f"force on the centre along {a}") for a in ("n", "m", "z")),
-        EffectParameter("t_0", "s", 0.1, "middle of the probe", is_shape=True),
-        EffectParameter("width", "s", 0.01, "standard deviation of its course", lower=1e-3, is_shape=True),
-    )
-    passive = False
-    candidate = False
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        u = (s.time - p.t_0) / p.width
-        course = np.exp(-0.5 * u * u)
-        w.M_n += p.M_n * course
-        w.M_m += p.M_m * course
-        w.M_z += p.M_z * course
-        w.X_n += p.X_n * course
-        w.X_m += p.X_m * course
-        w.X_z += p.X_z * course
+    u = (s.time - p.t_0) / p.width
+    course = np.exp(-0.5 * u * u)
+    w.M_n += p.M_n * course
+    w.M_m += p.M_m * course
+    w.M_z += p.M_z * course
+    w.X_n += p.X_n * course
+    w.X_m += p.X_m * course
+    w.X_z += p.X_z * course

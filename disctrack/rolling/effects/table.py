@@ -4,55 +4,45 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.rolling.effects.base import Effect, EffectParameter
+from disctrack.rolling.effects.base import EffectParameter, effect
 
 
-class Spring(Effect):
+@effect(
+    "force towards the point (F_x, F_y) / k of the table, X = F - k (x, y)",
+    "Hooke's law; a thread, a magnet below the table, and nearly a hollow of the table have this form",
+    EffectParameter("k", "N/m", 0.05, "force per distance"),
+    EffectParameter("F_x", "N", 1e-3, "force at the origin along i: k times the x of the point"),
+    EffectParameter("F_y", "N", 1e-3, "force at the origin along j: k times the y of the point"),
+    belongs_to=("rig", "surface"),
+    passive=False,  # a potential: it gives back what it takes
+    airborne=True,
+)
+def spring(p: Any, s: Any, w: Any) -> None:
     """A force towards a point of the table, in proportion to the distance: X = F - k (x, y), towards F / k."""
-
-    name = "spring"
-    title = "force towards the point (F_x, F_y) / k of the table, X = F - k (x, y)"
-    source = "Hooke's law; a thread, a magnet below the table, and nearly a hollow of the table have this form"
-    belongs_to = ("rig", "surface")
-    parameters = (
-        EffectParameter("k", "N/m", 0.05, "force per distance"),
-        EffectParameter("F_x", "N", 1e-3, "force at the origin along i: k times the x of the point"),
-        EffectParameter("F_y", "N", 1e-3, "force at the origin along j: k times the y of the point"),
-    )
-    passive = False  # a potential: it gives back what it takes
-    airborne = True
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        X_x, X_y = p.F_x - p.k * s.x, p.F_y - p.k * s.y
-        w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
-        w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
+    X_x, X_y = p.F_x - p.k * s.x, p.F_y - p.k * s.y
+    w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
+    w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
 
 
-class TableVibration(Effect):
+@effect(
+    "table and cameras vibrate: X = -m (a_cos cos 2 pi f t + a_sin sin 2 pi f t)",
+    "inertial force in an accelerated frame",
+    *(EffectParameter(f"a_cos_{a}", "m/s^2", 0.1, f"acceleration of the table along {a} at t = 0") for a in "xyz"),
+    *(EffectParameter(f"a_sin_{a}", "m/s^2", 0.1, f"along {a}, a quarter of a period later") for a in "xyz"),
+    EffectParameter("frequency", "Hz", 50.0, "of the vibration", lower=0.1, upper=1e4, is_shape=True),
+    belongs_to=(),
+    passive=False,
+    airborne=True,
+    candidate=False,
+)
+def table_vibration(p: Any, s: Any, w: Any) -> None:
     """The table swings with one frequency, and the cameras with it: in their axes an inertial force on the disc.
 
     In a diagnosis it is found without being named beforehand, with its frequency, as a force that swings.
     """
-
-    name = "table_vibration"
-    title = "table and cameras vibrate: X = -m (a_cos cos 2 pi f t + a_sin sin 2 pi f t)"
-    source = "inertial force in an accelerated frame"
-    belongs_to = ()
-    parameters = (
-        *(EffectParameter(f"a_cos_{a}", "m/s^2", 0.1, f"acceleration of the table along {a} at t = 0") for a in "xyz"),
-        *(EffectParameter(f"a_sin_{a}", "m/s^2", 0.1, f"along {a}, a quarter of a period later") for a in "xyz"),
-        EffectParameter("frequency", "Hz", 50.0, "of the vibration", lower=0.1, upper=1e4, is_shape=True),
-    )
-    passive = False
-    airborne = True
-    candidate = False
-
-    @staticmethod
-    def law(p: Any, s: Any, w: Any) -> None:
-        c, d = np.cos(2 * np.pi * p.frequency * s.time), np.sin(2 * np.pi * p.frequency * s.time)
-        X_x = -s.mass * (p.a_cos_x * c + p.a_sin_x * d)
-        X_y = -s.mass * (p.a_cos_y * c + p.a_sin_y * d)
-        w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
-        w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
-        w.X_z -= s.mass * (p.a_cos_z * c + p.a_sin_z * d)
+    c, d = np.cos(2 * np.pi * p.frequency * s.time), np.sin(2 * np.pi * p.frequency * s.time)
+    X_x = -s.mass * (p.a_cos_x * c + p.a_sin_x * d)
+    X_y = -s.mass * (p.a_cos_y * c + p.a_sin_y * d)
+    w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
+    w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
+    w.X_z -= s.mass * (p.a_cos_z * c + p.a_sin_z * d)
