@@ -91,7 +91,8 @@ def add_track(parser: argparse.ArgumentParser) -> None:
 
 def add_analyse(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack analyse`."""
-    parser.add_argument("trajectory", type=Path, help="file written by disctrack track; it gets four more groups")
+    what = "file written by disctrack track, or a recording's folder; the file gets four more groups"
+    parser.add_argument("trajectory", type=_trajectory, help=what)
     parser.add_argument(
         "-o", "--output", type=Path, help="folder for the report (default: NAME_analysis beside the file)"
     )
@@ -128,8 +129,8 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
 
 def add_diagnose(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack diagnose`."""
-    files = "trajectory file; the group diagnosis is added to it. Several files are diagnosed together: one answer"
-    parser.add_argument("trajectory", type=Path, nargs="+", help=files)
+    files = "trajectory file, or a recording's folder; the group diagnosis is added to it. Several: one answer"
+    parser.add_argument("trajectory", type=_trajectory, nargs="+", help=files)
     models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
     parser.add_argument("--model", default="paper", help=models)
     where = "folder for the results (default: NAME_diagnosis beside it; of several: together_diagnosis)"
@@ -242,6 +243,19 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, help="of the first recording; the others count up from it")
     parser.add_argument("--quiet", action="store_true", help="do not tell of every step")
+
+
+def _trajectory(text: str) -> Path:
+    """A folder stands for the trajectory in it, or in its results."""
+    path = Path(text)
+    if not path.is_dir():
+        return path
+    for file in (path / "trajectory.h5", path / "results" / "trajectory.h5"):
+        if file.is_file():
+            return file
+    raise argparse.ArgumentTypeError(
+        f"{path}: no results/trajectory.h5 in this folder; 'disctrack run {path}' makes it"
+    )
 
 
 def _corners(text: str) -> tuple[int, int]:

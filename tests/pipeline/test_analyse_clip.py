@@ -21,7 +21,7 @@ def analysed_clip(sample_clip, tmp_path_factory) -> Path:
         main(["track", str(sample_clip), "--rig", str(rig), "-o", str(trajectory), "--no-figures", "--no-video"]) == 0
     )
     with contextlib.redirect_stdout(io.StringIO()) as said:
-        assert main(["analyse", str(trajectory), "-o", str(folder / "report")]) == 0
+        assert main(["analyse", str(folder), "-o", str(folder / "report")]) == 0  # the folder's trajectory.h5
     (folder / "said.txt").write_text(said.getvalue())
     return trajectory
 

@@ -48,6 +48,13 @@ def test_a_folder_that_is_not_there(tmp_path, capsys):
     assert "no such folder" in failure(capsys, "run", tmp_path / "nowhere")
 
 
+def test_a_folder_without_a_trajectory(recording, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["analyse", str(recording)])
+    assert ended.value.code == 2
+    assert f"no results/trajectory.h5 in this folder; 'disctrack run {recording}' makes it" in capsys.readouterr().err
+
+
 def test_a_misspelt_key(recording, capsys):
     edit(recording, "frame_rate_hz", "framerate_hz")
     assert "Did you mean 'frame_rate_hz'?" in failure(capsys, "run", recording)
