@@ -15,10 +15,11 @@ from disctrack.analyse.power_laws import (
     Exponent,
 )
 from disctrack.analyse.propagation import DerivedSeries, shared_sigma
-from disctrack.errors import AnalysisError, OutputError
+from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.trajectory_file import Group, read_provenance, read_setup, read_trajectory, write_groups
+from disctrack.files.whole import refuse_existing
 from disctrack.frames import euler_jacobian
 
 
@@ -78,10 +79,7 @@ def run_analyse(
     path = Path(path)
     keep(path)
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_analysis"
-    if (folder / "report.html").exists() and not overwrite:
-        raise OutputError(
-            f"{folder / 'report.html'}: exists. Choose another folder with -o, or replace with --overwrite."
-        )
+    refuse_existing(folder / "report.html", overwrite)
     trajectory, provenance = read_trajectory(path), read_provenance(path)
     try:
         analysis = analyse(trajectory, window, circle_duration)

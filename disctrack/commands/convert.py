@@ -14,6 +14,7 @@ from disctrack.files.exchange.c3d import write_c3d
 from disctrack.files.exchange.matlab import write_mat
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.trajectory_file import read_trajectory, write_csv
+from disctrack.files.whole import refuse_existing
 
 TRAJECTORY = (".csv", ".mat", ".c3d")
 OPENCV = (".yml", ".yaml", ".xml")
@@ -24,8 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     target: Path = arguments.target
     for source in arguments.source:
         keep(source)
-    if target.exists() and not arguments.overwrite:
-        raise OutputError(f"{target}: exists. Choose another name, or replace it with --overwrite.")
+    refuse_existing(target, arguments.overwrite)
     refuse_input(target)
     if target.suffix in TRAJECTORY:
         written = [_trajectory(arguments)]
@@ -82,8 +82,7 @@ def _own_rig(arguments: argparse.Namespace) -> list[Path]:
     elif target.suffix == ".cameramodel":
         sides = [target.with_name(f"{target.stem}-{side}.cameramodel") for side in ("left", "right")]
         for side in sides:
-            if side.exists() and not arguments.overwrite:
-                raise OutputError(f"{side}: exists. Choose another name, or replace it with --overwrite.")
+            refuse_existing(side, arguments.overwrite)
         export_mrcal((sides[0], sides[1]), rig)
         return sides
     else:

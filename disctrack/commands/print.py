@@ -7,7 +7,7 @@ import argparse
 from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.disc import MA_2014
-from disctrack.errors import OutputError
+from disctrack.files.whole import refuse_existing
 from disctrack.first_look.targets import board_figure, dots_figure, write_sheet
 from disctrack.recording.declaration import read_recording
 
@@ -22,8 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
             corners, square_mm = recording.chessboard.inner_corners, 1e3 * recording.chessboard.square
     dots, board = arguments.output / "dots.pdf", arguments.output / "board.pdf"
     for path in (dots, board):
-        if path.exists() and not arguments.overwrite:
-            raise OutputError(f"{path}: exists. Choose another folder with -o, or replace with --overwrite.")
+        refuse_existing(path, arguments.overwrite)
     sheets = {
         dots: dots_figure(disc, arguments.paper, dark=not arguments.light_dots),
         board: board_figure(corners, square_mm, arguments.paper),

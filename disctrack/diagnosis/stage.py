@@ -26,11 +26,11 @@ from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import law_text, sentence
-from disctrack.errors import AnalysisError, OutputError
+from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
 
 
@@ -200,8 +200,7 @@ def run_diagnose(
     keep(Path(model))
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"
     report = folder / "diagnosis.json"
-    if report.exists() and not overwrite:
-        raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
+    refuse_existing(report, overwrite)
     for name in (report.name, "model.toml"):
         refuse_input(folder / name)
     provenance = read_provenance(path)

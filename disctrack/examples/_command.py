@@ -11,9 +11,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from disctrack.errors import DiscTrackError, OutputError
+from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.pages.figures import save_figure
 
 
@@ -38,9 +38,8 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
     given = parser.parse_args(words)
     try:
-        earlier = given.output / "diagnosis.json" if given.output is not None else None
-        if earlier is not None and earlier.exists() and not given.overwrite:
-            raise OutputError(f"{earlier}: exists. Choose another folder with -o, or replace with --overwrite.")
+        if given.output is not None:
+            refuse_existing(given.output / "diagnosis.json", given.overwrite)
         outcome = diagnose() if data is None else diagnose(given.folder)
         print(outcome.table)
         if given.output is not None:

@@ -25,10 +25,10 @@ from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from calibration.rig_file import beyond_model, read_beyond_model
 from disctrack.disc import Disc
-from disctrack.errors import OutputError, TrajectoryFileError
+from disctrack.errors import TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
 from disctrack.files.software import software_version
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -74,12 +74,11 @@ def write_trajectory(
 
     findings : what the run found out on the way (blur, noise, warnings, ...), of JSON's types; see `read_findings`
     """
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists. Choose another name with -o, or replace it with --overwrite.")
+    refuse_existing(path, overwrite)
     buffer = io.BytesIO()  # a disk that fills up fails in one plain write, not inside the HDF5 library
     with h5py.File(buffer, "w", track_order=True) as file:
         write_variables(file, _root_variables(trajectory), _axes(trajectory))
-        for name, variables in (("markers", _markers(trajectory)), ("disc", _disc(trajectory.disc))):
+        for name, variables in (("markers", _variables(trajectory, "markers")), ("disc", _disc(trajectory.disc))):
             write_variables(file.create_group(name, track_order=True), variables)
         file["disc"].attrs.update(_disc_attributes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
@@ -188,7 +187,7 @@ def read_setup(path: Path) -> FilmedSetup:
         return FilmedSetup(
             time=read_variables(file, names=("time",))["time"],
             disc=_read_disc(file["disc"]),
-            rig=_rig(file["calibration"], read_variables(file["calibration"], names=_RIG_VARIABLES)),
+            rig=_rig(file["calibration"], read_variables(file["calibration"], names=(*_CAMERA_LAYOUT, *_RIG_LAYOUT))),
             gravity=float(file.attrs["gravity_m_s2"]),
             fingerprint=str(file.attrs["fingerprint"]),
         )
@@ -200,8 +199,7 @@ def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> No
     Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
     calibration.
     """
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists. Choose another name with -o, or replace it with --overwrite.")
+    refuse_existing(path, overwrite)
     scale = np.array([1e3, 1e3, 1e3, *np.degrees([1.0, 1.0, 1.0])])
     units = ["mm"] * 3 + ["deg"] * 3
     names = [f"{name}_{unit}" for name, unit in zip(COORDINATES, units, strict=True)]
@@ -229,7 +227,7 @@ def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> No
 
 def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, Variable]]:
     """Variables of the file's root, of its group `markers`, and the axes of both."""
-    return _root_variables(trajectory), _markers(trajectory), _axes(trajectory)
+    return _root_variables(trajectory), _variables(trajectory, "markers"), _axes(trajectory)
 
 
 def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str, Any]:
@@ -256,29 +254,60 @@ def _version(package: str) -> str:
         return "unknown"
 
 
-def _axes(trajectory: Trajectory) -> dict[str, Variable]:
-    def names(axis: str, values: tuple[str, ...], what: str) -> Variable:
-        return Variable(np.array(values), (axis,), "1", what)
-
-    markers = np.arange(trajectory.disc.n_markers)
-    return {
-        "time": Variable(trajectory.time, ("time",), "s", "mid exposure, from the recording's first frame"),
-        "camera": names("camera", CAMERAS, "camera"),
-        "marker": Variable(markers, ("marker",), "1", "dot on the upper face, in the order of recording.toml"),
-        "axis": names("axis", ("x", "y"), "pixel axis: x right, y down"),
-        "axis_2": names("axis_2", ("x", "y"), "pixel axis"),
-        "space_axis": names("space_axis", ("x", "y", "z"), "axis of space"),
-        "space_axis_2": names("space_axis_2", ("x", "y", "z"), "axis of space"),
-        "quaternion_component": names("quaternion_component", ("w", "x", "y", "z"), "quaternion component"),
-        "pose_component": names("pose_component", POSE_COMPONENTS, "position, and rotation vector in world axes"),
-        "pose_component_2": names("pose_component_2", POSE_COMPONENTS, "position, and rotation vector in world axes"),
-        "rig_parameter": names("rig_parameter", RIG_PARAMETERS, "parameter of the stereo rig"),
-        "rig_parameter_2": names("rig_parameter_2", RIG_PARAMETERS, "parameter of the stereo rig"),
-        "distortion_coefficient": names("distortion_coefficient", _DISTORTION, "Brown's coefficients as OpenCV's"),
-    }
-
-
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+# The file's layout. Of every array of a Trajectory: its dataset (in a group or at the root), axes, unit and meaning.
+_POSE2 = ("time", "pose_component", "pose_component_2")
+_DOTS = ("time", "camera", "marker", "axis")
+_MIXED = "m and rad: m2, m rad, rad2"
+_LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str, Mapping[str, Any]]] = {
+    "frame": ("frame", ("time",), "1", "number of the frame in its sequence", {}),
+    "quaternion": (
+        "quaternion", ("time", "quaternion_component"), "1", "orientation, body to world, continuous", {},
+    ),
+    "pose_covariance": (
+        "pose_covariance", _POSE2, _MIXED, "covariance of the pose, noise of this frame; calibration not included", {},
+    ),
+    "systematic_covariance": (
+        "systematic_covariance", _POSE2, _MIXED,
+        "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise", {},
+    ),
+    "reprojection_rms_px": (
+        "reprojection_rms_px", ("time", "camera"), "px", "root mean square of observed - projected dots", {},
+    ),
+    "reduced_chi_square": (
+        "reduced_chi_square", ("time",), "1", "squared residuals over their predicted variance", {},
+    ),
+    "frame_status": ("status", ("time",), "1", "why there is a pose, or none", flags(FrameStatus)),
+    "markers_px": (
+        "markers/centre_px", _DOTS, "px",
+        "image of the dot's centre (not the ellipse's), corrected by the lens field of the rig if it has one", {},
+    ),
+    "markers_covariance_px2": (
+        "markers/centre_covariance_px2", (*_DOTS, "axis_2"), "px2", "covariance of centre_px", {},
+    ),
+    "markers_residual_px": ("markers/residual_px", _DOTS, "px", "observed - projected", {}),
+    "marker_status": (
+        "markers/status", _DOTS[:3], "1", "why a dot has a centre, or none", flags(MarkerStatus),
+    ),
+    "calibration_sensitivity": (
+        "calibration/sensitivity", ("time", "pose_component", "rig_parameter"), "m or rad per unit of the parameter",
+        "d pose / d rig parameter at fixed pixels", {},
+    ),
+}  # fmt: skip
+_CAMERA_LAYOUT = {
+    "camera_matrix": (("camera", "space_axis", "space_axis_2"), "px", "pinhole matrix K"),
+    "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
+    "image_size_px": (("camera", "axis"), "px", "width, height"),
+}
+_RIG_LAYOUT: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "R_right_left": (("space_axis", "space_axis_2"), "1", "rotation, left camera axes to right camera axes"),
+    "t_right_left": (("space_axis",), "m", "points_right = R_right_left @ points_left + t"),
+    "R_left_world": (("space_axis", "space_axis_2"), "1", "rotation, world axes to left camera axes"),
+    "t_left_world": (("space_axis",), "m", "points_left = R_left_world @ points_world + t"),
+    "covariance": (
+        ("rig_parameter", "rig_parameter_2"), "px, m, rad and products",
+        "covariance of the rig's parameters; common to all frames",
+    ),
+}  # fmt: skip
 _LONG_NAMES = {
     "x": "position of the disc's centre along i",
     "y": "position of the disc's centre along j",
@@ -287,12 +316,43 @@ _LONG_NAMES = {
     "theta": "nutation angle",
     "phi": "spin angle, unwrapped",
 }
+_NAMED_AXES = {
+    "camera": (CAMERAS, "camera"),
+    "axis": (("x", "y"), "pixel axis: x right, y down"),
+    "axis_2": (("x", "y"), "pixel axis"),
+    "space_axis": (("x", "y", "z"), "axis of space"),
+    "space_axis_2": (("x", "y", "z"), "axis of space"),
+    "quaternion_component": (("w", "x", "y", "z"), "quaternion component"),
+    "pose_component": (POSE_COMPONENTS, "position, and rotation vector in world axes"),
+    "pose_component_2": (POSE_COMPONENTS, "position, and rotation vector in world axes"),
+    "rig_parameter": (RIG_PARAMETERS, "parameter of the stereo rig"),
+    "rig_parameter_2": (RIG_PARAMETERS, "parameter of the stereo rig"),
+    "distortion_coefficient": (("k1", "k2", "p1", "p2", "k3"), "Brown's coefficients as OpenCV's"),
+}
+
+
+def _axes(trajectory: Trajectory) -> dict[str, Variable]:
+    markers = np.arange(trajectory.disc.n_markers)
+    return {
+        "time": Variable(trajectory.time, ("time",), "s", "mid exposure, from the recording's first frame"),
+        "marker": Variable(markers, ("marker",), "1", "dot on the upper face, in the order of recording.toml"),
+        **{name: Variable(np.array(values), (name,), "1", what) for name, (values, what) in _NAMED_AXES.items()},
+    }
+
+
+def _variables(trajectory: Trajectory, group: str = "") -> dict[str, Variable]:
+    """Those of one group, or of the root, as the layout has them."""
+    found = {}
+    for attribute, (place, dims, units, told, attributes) in _LAYOUT.items():
+        home, _, name = place.rpartition("/")
+        if home == group:
+            found[name] = Variable(getattr(trajectory, attribute), dims, units, told, attributes)
+    return found
 
 
 def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
-    units = ("m",) * 3 + ("rad",) * 3
-    variables = {"frame": Variable(trajectory.frame, ("time",), "1", "number of the frame in its sequence")}
-    parts = (
+    coordinates = {}
+    for ending, what, values in (
         ("", "", trajectory.q),
         ("_sigma", "standard deviation, noise of this frame: ", trajectory.coordinate_sigma),
         (
@@ -300,54 +360,12 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
             "standard deviation shared by frames, calibration and systematic: ",
             trajectory.calibration_sigma,
         ),
-    )
-    for ending, what, values in parts:
+    ):
         for i, name in enumerate(COORDINATES):
-            variables[name + ending] = Variable(values[:, i], ("time",), units[i], what + _LONG_NAMES[name])
-    mixed = "m and rad: m2, m rad, rad2"
-    return variables | {
-        "quaternion": Variable(
-            trajectory.quaternion, ("time", "quaternion_component"), "1", "orientation, body to world, continuous"
-        ),
-        "pose_covariance": Variable(
-            trajectory.pose_covariance,
-            ("time", "pose_component", "pose_component_2"),
-            mixed,
-            "covariance of the pose, noise of this frame; calibration not included",
-        ),
-        "systematic_covariance": Variable(
-            trajectory.systematic_covariance,
-            ("time", "pose_component", "pose_component_2"),
-            mixed,
-            "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise",
-        ),
-        "reprojection_rms_px": Variable(
-            trajectory.reprojection_rms_px, ("time", "camera"), "px", "root mean square of observed - projected dots"
-        ),
-        "reduced_chi_square": Variable(
-            trajectory.reduced_chi_square, ("time",), "1", "squared residuals over their predicted variance"
-        ),
-        "status": Variable(trajectory.frame_status, ("time",), "1", "why there is a pose, or none", flags(FrameStatus)),
-    }
-
-
-def _markers(trajectory: Trajectory) -> dict[str, Variable]:
-    dims = ("time", "camera", "marker", "axis")
-    return {
-        "centre_px": Variable(
-            trajectory.markers_px,
-            dims,
-            "px",
-            "image of the dot's centre (not the ellipse's), corrected by the lens field of the rig if it has one",
-        ),
-        "centre_covariance_px2": Variable(
-            trajectory.markers_covariance_px2, (*dims, "axis_2"), "px2", "covariance of centre_px"
-        ),
-        "residual_px": Variable(trajectory.markers_residual_px, dims, "px", "observed - projected"),
-        "status": Variable(
-            trajectory.marker_status, dims[:3], "1", "why a dot has a centre, or none", flags(MarkerStatus)
-        ),
-    }
+            unit = "m" if i < 3 else "rad"
+            coordinates[name + ending] = Variable(values[:, i], ("time",), unit, what + _LONG_NAMES[name])
+    found = _variables(trajectory)
+    return {"frame": found.pop("frame"), **coordinates, **found}
 
 
 def _disc(disc: Disc) -> dict[str, Variable]:
@@ -374,45 +392,18 @@ def _disc_attributes(disc: Disc) -> dict[str, float]:
 
 def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     rig = trajectory.rig
-    matrix, vector = ("space_axis", "space_axis_2"), ("space_axis",)
-    write_variables(
-        group,
-        {
-            "camera_matrix": Variable(
-                [camera.camera_matrix for camera in rig.cameras], ("camera", *matrix), "px", "pinhole matrix K"
-            ),
-            "distortion": Variable(
-                [camera.distortion for camera in rig.cameras],
-                ("camera", "distortion_coefficient"),
-                "1",
-                "Brown distortion on normalised coordinates",
-            ),
-            "image_size_px": Variable(
-                [camera.image_size for camera in rig.cameras], ("camera", "axis"), "px", "width, height"
-            ),
-            "R_right_left": Variable(rig.R_right_left, matrix, "1", "rotation, left camera axes to right camera axes"),
-            "t_right_left": Variable(rig.t_right_left, vector, "m", "points_right = R_right_left @ points_left + t"),
-            "R_left_world": Variable(rig.R_left_world, matrix, "1", "rotation, world axes to left camera axes"),
-            "t_left_world": Variable(rig.t_left_world, vector, "m", "points_left = R_left_world @ points_world + t"),
-            "covariance": Variable(
-                rig.covariance,
-                ("rig_parameter", "rig_parameter_2"),
-                "px, m, rad and products",
-                "covariance of the rig's parameters; common to all frames",
-            ),
-            "sensitivity": Variable(
-                trajectory.calibration_sensitivity,
-                ("time", "pose_component", "rig_parameter"),
-                "m or rad per unit of the parameter",
-                "d pose / d rig parameter at fixed pixels",
-            ),
-        },
-    )
+    cameras = [(camera.camera_matrix, camera.distortion, camera.image_size) for camera in rig.cameras]
+    variables = {
+        name: Variable(values, *described)
+        for (name, described), values in zip(_CAMERA_LAYOUT.items(), map(list, zip(*cameras, strict=True)), strict=True)
+    }
+    variables |= {name: Variable(getattr(rig, name), *described) for name, described in _RIG_LAYOUT.items()}
+    write_variables(group, variables | _variables(trajectory, "calibration"))
     axes = {"allowances": ("allowance", "rig_parameter"), "lens_field": ("camera", "axis", "spline_y", "spline_x")}
-    for name, (values, units, told, attributes) in beyond_model(rig).items():
+    for name, (data, units, told, attributes) in beyond_model(rig).items():
         dims = axes.get(name, ())
-        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(values), strict=True)}
-        write_variables(group, {name: Variable(values, dims, units, told, attributes)}, scales)
+        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(data), strict=True)}
+        write_variables(group, {name: Variable(data, dims, units, told, attributes)}, scales)
     group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
     group.attrs["baseline_m"] = rig.baseline
 
@@ -464,30 +455,29 @@ class _Reading:
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
-    root, markers = read_variables(file, text=False), read_variables(file["markers"])
-    calibration = read_variables(file["calibration"])
+    groups = {"": read_variables(file, text=False)}
+    groups |= {name: read_variables(file[name]) for name in ("markers", "calibration")}
+    root, disc = groups[""], _read_disc(file["disc"])
+    # files of earlier versions counted it as noise of single frames
+    root.setdefault("systematic_covariance", np.zeros_like(root["pose_covariance"]))
+    lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
+    lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
+    found = {}
+    for attribute, (place, dims, *_) in _LAYOUT.items():
+        group, _, name = place.rpartition("/")
+        found[attribute] = groups[group][name]
+        expected = tuple(lengths[axis] for axis in dims)
+        if found[attribute].shape != expected:
+            raise TrajectoryFileError(f"{attribute} has shape {found[attribute].shape}; expected {expected}")
     trajectory = Trajectory(
         time=root["time"],
-        frame=root["frame"],
         q=np.column_stack([root[name] for name in COORDINATES]),
-        pose_covariance=root["pose_covariance"],
-        calibration_sensitivity=calibration["sensitivity"],
-        # files of earlier versions counted it as noise of single frames
-        systematic_covariance=root.get("systematic_covariance", np.zeros_like(root["pose_covariance"])),
-        quaternion=root["quaternion"],
-        frame_status=root["status"],
-        reprojection_rms_px=root["reprojection_rms_px"],
-        reduced_chi_square=root["reduced_chi_square"],
-        markers_px=markers["centre_px"],
-        markers_covariance_px2=markers["centre_covariance_px2"],
-        markers_residual_px=markers["residual_px"],
-        marker_status=markers["status"],
-        disc=_read_disc(file["disc"]),
-        rig=_rig(file["calibration"], calibration),
+        disc=disc,
+        rig=_rig(file["calibration"], groups["calibration"]),
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
+        **found,
     )
-    _check_shapes(trajectory)
     _check_values(trajectory)
     return trajectory
 
@@ -504,66 +494,15 @@ def _read_disc(group: h5py.Group) -> Disc:
     )
 
 
-_RIG_VARIABLES = (
-    "camera_matrix",
-    "distortion",
-    "image_size_px",
-    "R_right_left",
-    "t_right_left",
-    "R_left_world",
-    "t_left_world",
-    "covariance",
-)
-
-
 def _rig(group: h5py.Group, values: Mapping[str, NDArray]) -> StereoRig:
-    cameras = [
-        Camera(
-            float(K[0, 0]),
-            float(K[1, 1]),
-            float(K[0, 2]),
-            float(K[1, 2]),
-            tuple(float(k) for k in distortion),  # type: ignore[arg-type]
-            (int(size[0]), int(size[1])),
+    left, right = (
+        Camera.from_parameters(
+            np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion]), (int(size[0]), int(size[1]))
         )
-        for K, distortion, size in zip(
-            values["camera_matrix"], values["distortion"], values["image_size_px"], strict=True
-        )
-    ]
-    left, right = cameras
-    return StereoRig(
-        left,
-        right,
-        R_right_left=values["R_right_left"],
-        t_right_left=values["t_right_left"],
-        R_left_world=values["R_left_world"],
-        t_left_world=values["t_left_world"],
-        covariance=values["covariance"],
-        world_is_table=bool(group.attrs["world_is_table"]),
-        **read_beyond_model(group),
+        for K, distortion, size in zip(*(values[name] for name in _CAMERA_LAYOUT), strict=True)
     )
-
-
-def _check_shapes(trajectory: Trajectory) -> None:
-    n, m = len(trajectory.time), trajectory.disc.n_markers
-    expected = {
-        "frame": (n,),
-        "q": (n, 6),
-        "pose_covariance": (n, 6, 6),
-        "systematic_covariance": (n, 6, 6),
-        "calibration_sensitivity": (n, 6, len(RIG_PARAMETERS)),
-        "quaternion": (n, 4),
-        "frame_status": (n,),
-        "reprojection_rms_px": (n, 2),
-        "reduced_chi_square": (n,),
-        "markers_px": (n, 2, m, 2),
-        "markers_covariance_px2": (n, 2, m, 2, 2),
-        "markers_residual_px": (n, 2, m, 2),
-        "marker_status": (n, 2, m),
-    }
-    for name, shape in expected.items():
-        if getattr(trajectory, name).shape != shape:
-            raise TrajectoryFileError(f"{name} has shape {getattr(trajectory, name).shape}; expected {shape}")
+    placed: dict[str, Any] = {name: values[name] for name in _RIG_LAYOUT} | read_beyond_model(group)
+    return StereoRig(left, right, **placed, world_is_table=bool(group.attrs["world_is_table"]))
 
 
 _MOST_METRES, _MOST_RADIANS = 1e3, 1e6  # beyond, no disc was filmed and squares lose all digits

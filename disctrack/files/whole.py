@@ -58,6 +58,12 @@ def write_whole(path: Path, content: bytes | memoryview, adds_to_input: bool = F
         stream.write(content)
 
 
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise OutputError where there is something already that may not be replaced."""
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists. Choose another name or folder, or replace it with --overwrite.")
+
+
 def make_folder(folder: Path) -> None:
     """Create the folder and its parents. Raises OutputError."""
     try:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from disctrack.errors import OutputError, SceneError
+from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion, Regime
 from disctrack.rolling.simulate import simulate
@@ -62,8 +63,7 @@ def run_simulate(
             f'{scene_path}: motion.kind is "{scene.motion.kind}"; simulate needs kind = "rolling" and, if wanted, '
             "[motion.rolling] with its start and effects"
         )
-    if output.exists() and not overwrite:
-        raise OutputError(f"{output}: exists. Choose another name with -o, or replace it with --overwrite.")
+    refuse_existing(output, overwrite)
     rate = scene.cameras.frame_rate_hz if rate is None else rate
     duration = max(scene.cameras.n_frames - 1, 1) / scene.cameras.frame_rate_hz if duration is None else duration
     motion = simulate(rolling_model(scene), rolling_start(scene), duration, rate=rate)
@@ -102,7 +102,6 @@ def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None =
 
     import disctrack
     from disctrack.files.labelled_arrays import Variable, write_variables
-    from disctrack.files.whole import write_whole
 
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:

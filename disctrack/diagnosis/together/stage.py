@@ -10,12 +10,12 @@ from pathlib import Path
 from disctrack.diagnosis.disc.model_file import PAPER
 from disctrack.diagnosis.together.loop import TogetherDiagnosis, diagnose_together
 from disctrack.diagnosis.together.recordings import Recorded, read_recorded
-from disctrack.errors import AnalysisError, OutputError
+from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.reuse import origin_of, remember, reusable
 from disctrack.files.trajectory_file import read_setup
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 
 FOLDER = "together_diagnosis"
 
@@ -64,8 +64,7 @@ def run_together(
     told = reusable(folder, origin) if reuse else None
     if told is not None:
         return TogetherOutcome(None, (report, folder / "diagnosis.html"), tuple(told))
-    if report.exists() and not overwrite:
-        raise OutputError(f"{report}: exists. Choose another folder with -o, or replace with --overwrite.")
+    refuse_existing(report, overwrite)
     refuse_input(report)
     recordings = _told_apart([read_recorded(p) for p in paths], paths)
     result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle)

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from disctrack.errors import OutputError
-from disctrack.files.whole import whole_file
+from disctrack.files.whole import refuse_existing, whole_file
 from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import Trajectory
 
@@ -20,8 +20,7 @@ def write_c3d(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Pa
     program builds the rigid body; a point's residual is its one-sigma in mm, -1 in frames without a pose. C3D keeps
     single precision: 1e-4 mm at 1 m. Raises OutputError, also where ezc3d is not installed.
     """
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists. Choose another name, or replace it with --overwrite.")
+    refuse_existing(path, overwrite)
     try:
         import ezc3d
     except ImportError as error:

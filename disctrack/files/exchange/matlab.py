@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from disctrack.errors import OutputError
 from disctrack.files.trajectory_file import labelled
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -21,8 +20,7 @@ def write_mat(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Pa
     disctrack.q (n, 6) with disctrack.q_names, q_sigma (this frame's noise), q_sigma_calibration (common to all frames);
     disctrack.units tells the unit of every field. Raises OutputError.
     """
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists. Choose another name, or replace it with --overwrite.")
+    refuse_existing(path, overwrite)
     root, markers, _ = labelled(trajectory)
     fields = {name: np.asarray(item.data) for name, item in root.items()}
     fields |= {f"marker_{name}": np.asarray(item.data) for name, item in markers.items()}
