@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
+from calibration.board import plane_symmetries
 from calibration.camera import Camera, rotation_from_vector
 from calibration.errors import CalibrationError
 from calibration.stereo_model import Observations, StereoModel
@@ -73,6 +77,52 @@ def common_pair(rotations: Array, translations: Array) -> tuple[int, Mask]:
     return best, agree[best]
 
 
+def pairs_by_order(
+    poses: Sequence[Mapping[int, tuple[Array, Array]]],
+    nominal: Array,
+    orders: Sequence[NDArray[np.intp]],
+    mirrored: bool = False,
+) -> tuple[Array, Array]:
+    """Stereo pose by each of n views that both see, with the right points in each of k orders: (n, k, 3, 3), (n, k, 3).
+
+    poses : of the left and of the right camera, by view; orders : point orders[k][i] takes place i
+    mirrored : the right images show the world in a mirror, and the orders mirror the points
+    """
+    views, middle = sorted(poses[0].keys() & poses[1].keys()), nominal.mean(0)
+    left, right = ((np.stack([side[v][0] for v in views]), np.stack([side[v][1] for v in views])) for side in poses)
+    d, image = nominal - middle, np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0])
+    rotations, translations = [], []
+    for order in orders:
+        U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])
+        turn = np.eye(3)
+        turn[:2, :2] = U @ Vt  # the order turns the points by this about their middle
+        R = right[0] @ turn
+        t = right[1] + right[0] @ middle - R @ middle
+        rotations.append(image @ R @ np.swapaxes(left[0], 1, 2))
+        translations.append(t @ image - np.einsum("nij,nj->ni", rotations[-1], left[1]))
+    return np.stack(rotations, axis=1), np.stack(translations, axis=1)
+
+
+def agreeing(rotations: Array, translations: Array) -> Mask:
+    """Which stereo poses (n, k) agree with the one that most do; see `common_pair`."""
+    agree = common_pair(rotations.reshape(-1, 3, 3), translations.reshape(-1, 3))[1]
+    return agree.reshape(rotations.shape[:2])
+
+
+def _refuse_mirrored(poses: Sequence[Mapping[int, tuple[Array, Array]]], nominal: Array, agree: Mask) -> None:
+    """Raise CalibrationError where the pairs agree if one camera sees in a mirror, and else do not."""
+    orders = plane_symmetries(nominal[:, :2], mirrored=True)
+    if 2 * agree.sum() >= len(agree) or not orders:
+        return
+    n = int(agreeing(*pairs_by_order(poses, nominal, orders, mirrored=True)).any(axis=1).sum())
+    if n >= max(MIN_VIEWS, 0.5 * len(agree), 2 * agree.sum()):
+        raise CalibrationError(
+            f"the images of one of the two cameras are mirrored: if they are, {n} of {len(agree)} pairs tell of one "
+            f"place of the cameras, as stored {agree.sum()}. Switch the mirroring off where that camera's images are "
+            "exported, or flip all of them, those of the motion too; so, too, if it looks through a mirror"
+        )
+
+
 def start_stereo(
     observations: Observations, nominal: Array, image_sizes: tuple[tuple[int, int], tuple[int, int]], n_views: int
 ) -> tuple[StereoModel, Mask, dict[int, tuple[Array, Array]]]:
@@ -85,9 +135,10 @@ def start_stereo(
     both = sorted(left_poses.keys() & right_poses.keys())
     if not both:
         raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
-    rotations = np.stack([right_poses[v][0] @ left_poses[v][0].T for v in both])
-    translations = np.stack([right_poses[v][1] - R @ left_poses[v][1] for v, R in zip(both, rotations, strict=True)])
+    as_stored = pairs_by_order((left_poses, right_poses), nominal, [np.arange(len(nominal))])
+    rotations, translations = as_stored[0][:, 0], as_stored[1][:, 0]
     best, agree = common_pair(rotations, translations)
+    _refuse_mirrored((left_poses, right_poses), nominal, agree)
     R_pair, t_pair = rotations[best], np.median(translations[agree], axis=0)
     usable = np.ones(n_views, bool)
     usable[[v for v, ok in zip(both, agree, strict=True) if not ok]] = False

@@ -26,7 +26,7 @@ from calibration.lens_field import FieldFit, fit_lens_field
 from calibration.model_choice import TermsTried, choose_terms
 from calibration.pairs import PairsJudged, judge_pairs, motion_between_exposures, own_places, pairs_that_agree
 from calibration.refinement import Refinement
-from calibration.start import MIN_VIEWS, common_pair, start_camera, start_stereo
+from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
@@ -389,40 +389,18 @@ def _agree_on_order(
     sizes = [next(v.image_size for v in side if isinstance(v, CornerView)) for side in views]
     poses = [start_camera(observations, c, board.points, sizes[c])[1] for c in (0, 1)]
     both = sorted(poses[0].keys() & poses[1].keys())
-    centre = board.points.mean(0)
-    rotations, translations = [], []
-    for v in both:
-        R, t = poses[1][v]
-        for k in range(len(orders)):
-            # corner orders[k][i] takes place i: the board turns by k steps about its own centre
-            turn = _turn_of_order(orders[k], board)
-            R_turned = R @ turn
-            t_turned = t + R @ centre - R_turned @ centre
-            R_pair = R_turned @ poses[0][v][0].T
-            rotations.append(R_pair)
-            translations.append(t_turned - R_pair @ poses[0][v][1])
-    _, agree = common_pair(np.array(rotations), np.array(translations))
-    agree_per_view = agree.reshape(len(both), len(orders))
+    agree = agreeing(*pairs_by_order(poses, board.points, orders))
     right = list(views[1])
-    for v, agreeing in zip(both, agree_per_view, strict=True):
+    for v, fits in zip(both, agree, strict=True):
         view = right[v]
-        if agreeing.any() and isinstance(view, CornerView):
-            right[v] = view.reordered(orders[int(np.argmax(agreeing))])
+        if fits.any() and isinstance(view, CornerView):
+            right[v] = view.reordered(orders[int(np.argmax(fits))])
     note = (
         f"{board} looks the same after a turn: the two cameras were made to agree, but which corner is the lab "
         "frame's origin is a choice (i points to the right in the left image). "
         + ("An odd by an even count leaves no choice." if isinstance(board, Board) else "A ChArUco board has none.")
     )
     return (views[0], right), note
-
-
-def _turn_of_order(order: NDArray[np.intp], board: Target) -> Array:
-    """Rotation (3, 3) with points[order] - centre = (points - centre) @ R.T."""
-    d = board.points - board.points.mean(0)
-    U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])
-    R = np.eye(3)
-    R[:2, :2] = U @ Vt
-    return R
 
 
 def _without_images(

@@ -24,6 +24,7 @@ from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.first_look.declare import board_size, evenly, some_images
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import CalibrationViews, Recording, read_recording
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
@@ -148,11 +149,12 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
     assert declared is not None
     assert table is not None
     try:
-        views = find_views(declared.left, declared.right, recording.folder)
+        fields = flat_fields(recording.folder, recording.sensors)
+        views = find_views(declared.left, declared.right, recording.folder, fields)
         if table.view >= len(views):
             raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
         chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table.view})
-        some = TargetImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen))
+        some = TargetImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen), fields)
         settings = CalibrationSettings()
         found, problems = calibrate_views(
             some, declared.target, chosen.index(table.view), table.board_thickness, settings
