@@ -6,15 +6,17 @@ through the Schur complement of the views' 6 x 6 blocks.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration._normal_kernel import N_COLUMNS, accumulate
 from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.priors import Prior
-from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved, predict_poses
+from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved
 
 
 @dataclass(frozen=True)
@@ -169,45 +171,27 @@ class Problem:
         o = self.observations
         if np.any(np.diff(o.view) < 0):
             raise ValueError("observations must be sorted by view")
-        pixels, d_stereo, d_pose, R = predict_poses(model, o)
-        residuals = o.pixels - pixels
-        m, s1, s2 = len(o), self.stereo_basis.shape[1], self.shape_basis.shape[-1]
-        n = len(self.shape_basis)
-        block = np.empty((m, 2, s1 + 7))  # derivatives by stereo parameters and pose, then the residual
-        if s1:
-            block[..., :s1] = (d_stereo.reshape(2 * m, N_STEREO) @ self.stereo_basis).reshape(m, 2, s1)
-        block[..., s1:-1] = d_pose
-        block[..., -1] = residuals
-        mahalanobis = np.sqrt(quadratic(self.weights, residuals))
-        cost, factor = _huber(mahalanobis, self.huber)
+        s1, s2, n = self.stereo_basis.shape[1], self.shape_basis.shape[-1], len(self.shape_basis)
         V = self.n_views + (self.prior is not None)
-        costs = np.bincount(o.view, cost, V).astype(np.float64)
-        weights = self.weights * factor[:, None, None]
-        block = _whitened(block, weights)
-        squares = np.zeros((V, s1 + 7, s1 + 7))
-        bounds = np.searchsorted(o.view, np.arange(V + 1))
-        for v in range(V):
-            rows = block[bounds[v] : bounds[v + 1]].reshape(-1, s1 + 7)
-            squares[v] = rows.T @ rows
+        full, costs = np.zeros((V, N_COLUMNS, N_COLUMNS)), np.zeros(V)
+        of_point, point = (np.zeros((V, n if s2 else 0, 3, columns)) for columns in (N_COLUMNS, 3))
+        cameras = np.stack([camera.parameters for camera in model.cameras])
+        given = (o.pixels, self.weights, cameras, model.R_right_left, model.t_right_left)
+        boards = (model.R_left_board, model.t_left_board, model.points)
+        if not _accumulated((o.view, o.camera, o.point), self.huber, (*given, *boards), full, of_point, point, costs):
+            costs[...] = np.inf
+        free = np.zeros((N_COLUMNS, s1 + 7))
+        free[:N_STEREO, :s1], free[N_STEREO:, s1:] = self.stereo_basis, np.eye(7)
+        squares = free.T @ full @ free
         if self.prior is not None:
             information, towards, costs[-1] = self.prior.normal(model)
             squares[-1, :s1, :s1] = self.stereo_basis.T @ information @ self.stereo_basis
             squares[-1, :s1, -1] = self.stereo_basis.T @ towards
         pose = squares[:, s1:-1, s1:-1]
-        pose[bounds[1:] == bounds[:-1]] = np.eye(6)
-        stereo_point, point = np.zeros((V, s1, 0)), np.zeros((V, 0, 3, 3))
-        shape, of_shape = np.zeros((0, 0)), np.zeros((V, 0, 7))
+        pose[np.bincount(o.view, minlength=V) == 0] = np.eye(6)
+        stereo_point, shape, of_shape = np.zeros((V, s1, 0)), np.zeros((0, 0)), np.zeros((V, 0, 7))
         if s2:
-            d_point = _whitened(d_pose[..., 3:] @ R, weights)
-            of_point = np.zeros((V, n, 3, s1 + 7))  # a view sees a point twice at most, once per camera
-            point = np.zeros((V, n, 3, 3))
-            turned = np.swapaxes(d_point, 1, 2)
-            by_others, by_itself = turned @ block, turned @ d_point
-            for camera in (0, 1):
-                seen = o.camera == camera
-                of_point[o.view[seen], o.point[seen]] += by_others[seen]
-                point[o.view[seen], o.point[seen]] += by_itself[seen]
-            flat = of_point.reshape(V, 3 * n, s1 + 7)
+            flat = of_point.reshape(V, 3 * n, N_COLUMNS) @ free
             stereo_point = np.swapaxes(flat[..., :s1], 1, 2)
             shape = self.shape_basis.reshape(3 * n, s2)
             of_shape = shape.T @ flat[..., s1:]  # (V, s2, 7)
@@ -230,14 +214,17 @@ class Problem:
         return moved(model, self.stereo_basis @ shared[:s1], poses[: self.n_views], self.shape_basis @ shared[s1:])
 
 
-def _whitened(block: Array, weights: Array) -> Array:
-    """L^T block for weights = L L^T; block (m, 2, k), weights (m, 2, 2)."""
-    a = np.sqrt(weights[:, 0, 0])
-    b = weights[:, 0, 1] / np.where(a > 0, a, 1.0)
-    c = np.sqrt(np.maximum(weights[:, 1, 1] - b * b, 0.0))
-    white = block * np.stack([a, c], axis=-1)[..., None]
-    white[:, 0] += b[:, None] * block[:, 1]
-    return white
+def _accumulated(indices: Sequence[NDArray[np.intp]], huber: float, values: Sequence[Array], *sums: Array) -> bool:
+    """The kernel, given what it is compiled for."""
+    whole = [np.ascontiguousarray(index, np.int64) for index in indices]
+    return bool(accumulate(*whole, float(huber), *(np.ascontiguousarray(value, np.float64) for value in values), *sums))
+
+
+def prepare() -> None:
+    """Compile the kernel, or load it: once per installation some tenths of a second, then nothing."""
+    values = [np.zeros(shape) for shape in ((0, 2), (0, 2, 2), (2, 9), (3, 3), (3,), (0, 3, 3), (0, 3), (0, 3))]
+    sums = [np.zeros(shape) for shape in ((0, 1, 1), (0, 0, 3, 1), (0, 0, 3, 3), (0,))]
+    _accumulated([np.zeros(0, np.int64)] * 3, np.inf, values, *sums)
 
 
 def quadratic(matrix: Array, vector: Array) -> Array:
@@ -253,16 +240,6 @@ def inverse_covariance(covariance: Array, extra: float) -> Array:
     inverse = np.stack([np.stack([c, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)
     result: Array = inverse / (a * c - b * b)[:, None, None]
     return result
-
-
-def _huber(mahalanobis: Array, limit: float) -> tuple[Array, Array]:
-    """Huber's terms (squares below the limit) and the factor on each weight; inf and 0 where a prediction failed."""
-    if not np.isfinite(mahalanobis).all():
-        return np.full_like(mahalanobis, np.inf), np.zeros_like(mahalanobis)
-    if not (mahalanobis > limit).any():
-        return mahalanobis**2, np.ones_like(mahalanobis)
-    within = np.minimum(mahalanobis, limit)
-    return within * (2 * mahalanobis - within), within / np.maximum(mahalanobis, 1e-300)
 
 
 @dataclass(frozen=True)

@@ -125,12 +125,6 @@ def board_basis(nominal: Array, board: str) -> Array:
     return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(n, 3, N_WARP)
 
 
-def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
-    """Pixels (m, 2) and derivatives: d/d stereo (m, 2, 24), d/d view pose (m, 2, 6), d/d target point (m, 2, 3)."""
-    pixels, d_stereo, d_pose, R = predict_poses(model, observations)
-    return pixels, d_stereo, d_pose, d_pose[..., 3:] @ R
-
-
 def predict_pixels(model: StereoModel, observations: Observations) -> Array:
     """Pixels (m, 2) alone."""
     _, arm, t = _arms(model, observations)
@@ -144,8 +138,8 @@ def predict_pixels(model: StereoModel, observations: Observations) -> Array:
     return pixels
 
 
-def predict_poses(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
-    """As `predict`, but the board's rotation (m, 3, 3) for the derivatives by its points, which few fits ask for."""
+def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
+    """Pixels (m, 2) and derivatives: d/d stereo (m, 2, 24), d/d view pose (m, 2, 6), d/d target point (m, 2, 3)."""
     m = len(observations)
     R, arm, t = _arms(model, observations)
     points_left = arm + t
@@ -166,7 +160,7 @@ def predict_poses(model: StereoModel, observations: Observations) -> tuple[Array
         d_stereo[seen, :, 2 * N_INTRINSIC + 3 :] = d_right
         d_left[seen] = d_right @ model.R_right_left
     d_pose[..., :3] = _crossed(arm, d_left)
-    return pixels, d_stereo, d_pose, R
+    return pixels, d_stereo, d_pose, d_left @ R
 
 
 def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:

@@ -13,13 +13,14 @@ import numba.core.codegen as codegen
 import numba.core.event as event
 import numpy as np
 
-from calibration import _corner_kernel, compiled, corner_fit
+from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, normal_equations
 from disctrack.readers import _png
 from disctrack.rolling import integrate
 from disctrack.track import _kernels, following
 
 PREPARED = (
     (_corner_kernel.fit_corners, corner_fit.prepare),
+    (_normal_kernel.accumulate, normal_equations.prepare),
     (_png._undo_filters, _png.prepare),
     (_kernels.track_frames, lambda: following.prepare(np.uint8)),
     (_kernels.track_frames, lambda: following.prepare(np.uint16)),

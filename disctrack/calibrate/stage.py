@@ -11,9 +11,8 @@ from typing import Any
 
 import h5py
 
-from calibration import CalibrationSettings, StereoCalibration, StereoRig
+from calibration import CalibrationSettings, StereoCalibration, StereoRig, corner_fit, normal_equations
 from calibration.board import Board, Target
-from calibration.corner_fit import prepare
 from calibration.rig_file import read_rig, write_rig
 from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
@@ -157,7 +156,8 @@ def _reusable(path: Path, provenance: Provenance) -> list[str] | None:
 
 def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:
     with compiling("corners", "1 to 8"):
-        prepare()
+        corner_fit.prepare()
+        normal_equations.prepare()
     with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
         done = 0
 

@@ -6,7 +6,7 @@ import argparse
 
 import numpy as np
 
-from calibration import corner_fit
+from calibration import corner_fit, normal_equations
 from disctrack.commands import DONE
 from disctrack.progress import compiling
 from disctrack.readers import _png as png
@@ -21,6 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
         png.prepare()
     with compiling("corners", "1 to 8"):
         corner_fit.prepare()
+        normal_equations.prepare()
     with compiling("tracking, 8 bit", "5 to 20"):
         prepare(np.uint8)
     with compiling("tracking, 16 bit", "5 to 20"):

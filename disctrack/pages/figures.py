@@ -89,8 +89,11 @@ def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure whole; the format follows from the name. Raises OutputError."""
     FigureCanvasAgg(figure)
     kind = path.suffix[1:]
+    # a file a tenth larger than by the default level, in half the time
+    pillow = {"compress_level": 2} if kind == "png" else None
+    metadata = {"CreationDate": None} if kind == "pdf" else None
     with whole_file(path) as part:
-        figure.savefig(part, format=kind, dpi=DPI, metadata={"CreationDate": None} if kind == "pdf" else None)
+        figure.savefig(part, format=kind, dpi=DPI, metadata=metadata, pil_kwargs=pillow)
     return path
 
 

@@ -40,6 +40,8 @@ def coordinates_figure(trajectory: Trajectory) -> Figure:
         _sigmas(below, trajectory, i, sigma[:, i], shared[:, i])
         axes.tick_params(labelbottom=False)
         below.tick_params(labelbottom=row == 2)
+        axes.xaxis.set_major_locator(MaxNLocator(4))  # shared by both; ticks are what takes longest to draw
+        axes.yaxis.set_major_locator(MaxNLocator(5))
         if row == 2:
             below.set_xlabel("time (s)")
     lost = int(np.sum(~trajectory.measured))
@@ -123,41 +125,45 @@ def reprojection_figure(trajectory: Trajectory) -> Figure:
 
 
 def dots_figure(trajectory: Trajectory) -> Figure:
-    """Residual (observed - projected) of every dot in each camera: cloud, mean and its standard error, in px."""
+    """Residual [px] (observed - projected) of every dot, a row per camera: cloud, mean and its standard error."""
     residuals, m = trajectory.markers_residual_px, trajectory.disc.n_markers
-    figure = Figure(figsize=(2.0 * m + 0.8, 4.8))
-    lay_out(figure, (2, m), gaps=(0.15, 0.15))
-    grid = figure.subplots(2, m, sharex=True, sharey=True, squeeze=False)
+    figure = Figure(figsize=(1.75 * m + 1.0, 5.0))
+    lay_out(figure, (2, 1), gaps=(0.0, 0.3))
     finite = np.abs(residuals[np.isfinite(residuals)])
     reach = float(np.percentile(finite, 99.5)) * 1.3 if finite.size else 1.0
-    for camera, name in enumerate(CAMERAS):
+    for row, name in enumerate(CAMERAS):
+        # one pair of axes for all dots, each in a cell of its own: axes and their ticks cost more than what is in them
+        axes = figure.add_subplot(2, 1, row + 1)
+        axes.axhline(0, color=MUTED, linewidth=0.6)
         for marker in range(m):
-            _dot(grid[camera, marker], residuals[:, camera, marker], COLOURS[name], reach)
-            grid[0, marker].set_title(f"dot {marker}", fontsize=9)
-        grid[camera, 0].set_ylabel(f"{name}: y (px)")
-    for axes in grid[1]:
-        axes.set_xlabel("x (px)")
-    grid[0, 0].xaxis.set_major_locator(MaxNLocator(3))  # shared by all
-    figure.suptitle("Observed minus projected, per dot and camera (cross: mean ± 3 standard errors)", fontsize=10)
+            _dot(axes, residuals[:, row, marker], COLOURS[name], reach, 2 * reach * marker)
+        axes.set_xlim(-reach, (2 * m - 1) * reach)
+        axes.set_ylim(-reach, reach)
+        axes.set_aspect("equal")
+        axes.set_xticks(2 * reach * np.arange(m), [f"dot {marker}" for marker in range(m)])
+        axes.yaxis.set_major_locator(MaxNLocator(5))
+        axes.tick_params(labelsize=8)
+        axes.set_ylabel(f"{name}: y (px)")
+    title = "Observed minus projected, per dot and camera; x at the scale of y (cross: mean ± 3 standard errors)"
+    figure.suptitle(title, fontsize=10)
     return figure
 
 
-def _dot(axes: Axes, residuals: Array, colour: str, reach: float) -> None:
-    good = residuals[np.isfinite(residuals).all(axis=1)]
-    axes.axhline(0, color=MUTED, linewidth=0.6)
-    axes.axvline(0, color=MUTED, linewidth=0.6)
-    axes.plot(good[:, 0], good[:, 1], ".", color=colour, markersize=2, alpha=0.35)
-    if len(good) > 1:
-        mean, error = good.mean(axis=0), 3 * good.std(axis=0) / np.sqrt(len(good))
-        axes.errorbar(mean[0], mean[1], error[1], error[0], color=INK, linewidth=1.2)
-        rms = np.sqrt(np.mean(good**2))
-        axes.text(0.03, 0.97, f"n {len(good)}\nrms {rms:.4f}", transform=axes.transAxes, fontsize=7, va="top")
+def _dot(axes: Axes, residuals: Array, colour: str, reach: float, middle: float) -> None:
+    """One dot's cloud about x = middle, in a cell of twice the reach."""
+    good = residuals[(np.abs(residuals) <= reach).all(axis=1)]
+    n = int(np.isfinite(residuals).all(axis=1).sum())
+    axes.axvline(middle, color=MUTED, linewidth=0.6)
+    axes.axvline(middle + reach, color=INK, linewidth=0.8)
+    if n > 1:
+        axes.plot(middle + good[:, 0], good[:, 1], ".", color=colour, markersize=2, alpha=0.35)
+        seen = residuals[np.isfinite(residuals).all(axis=1)]
+        mean, error = seen.mean(axis=0), 3 * seen.std(axis=0) / np.sqrt(n)
+        axes.errorbar(middle + mean[0], mean[1], error[1], error[0], color=INK, linewidth=1.2)
+        text = f"n {n}\nrms {np.sqrt(np.mean(seen**2)):.4f}"
     else:
-        axes.text(0.5, 0.5, "not seen", transform=axes.transAxes, fontsize=8, ha="center")
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=7)
+        text = "not seen"
+    axes.text(middle - 0.94 * reach, 0.94 * reach, text, fontsize=7, va="top")
 
 
 FIGURES: dict[str, Callable[[Trajectory], Figure]] = {

@@ -21,12 +21,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc
 
 from calibration.arrays import Array
 from calibration.camera import N_RIG, Allowance, StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
+from disctrack.track.least_squares import chance_beyond
 from disctrack.track.pose import PoseFits
 
 SOURCES = ("both", "board", "disc")
@@ -112,7 +112,7 @@ def table_from_disc(
         told_sigma,
         told_board,
         applied,
-        float(chdtrc(3, difference)),
+        float(chance_beyond(difference, 3)),
         scatter,
         n,
     )

@@ -11,6 +11,7 @@ from calibration import CalibrationError, Terms, refine_stereo
 from calibration.assessment import consistency_factor, half_set_differences
 from calibration.camera import N_RIG
 from calibration.model_choice import choose_terms
+from calibration.normal_equations import Problem
 from calibration.start import start_stereo
 from calibration.stereo_model import board_basis, moved, predict
 from calibration.table_frame import rig_with_covariance, table_pose
@@ -94,6 +95,41 @@ def test_derivatives_agree_with_central_differences(scene_maker, rng):
         numeric = (shifted(2, (5, i), 1e-6) - shifted(2, (5, i), -1e-6)) / 2e-6
         of_point = (o.point == 5)[:, None]
         assert_allclose(np.where(of_point, d_point[:, :, i], 0), numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("board", ["flat", "free"])
+def test_the_compiled_sums_are_those_of_the_derivatives(scene_maker, rng, board):
+    scene = scene_maker(n_views=3, inner_corners=(4, 3))
+    o = scene.observations(0.3, rng)
+    m, nominal = scene.model, scene.board.points
+    terms, shape = Terms(board=board), board_basis(nominal, board).reshape(nominal.size, -1)
+    covariance = o.covariance + np.array([[0.02, 0.01], [0.01, 0.03]])
+    problem = Problem(o, np.linalg.inv(covariance), terms.stereo_basis(), board_basis(nominal, board), 3, huber=1.5)
+    normal = problem.linearise(m)
+    pixels, d_stereo, d_pose, d_point = predict(m, o)
+    J = np.zeros((len(o), 2, 24 + 18 + nominal.size))
+    J[..., :24] = d_stereo
+    for i, (view, point) in enumerate(zip(o.view, o.point, strict=True)):
+        J[i, :, 24 + 6 * view : 30 + 6 * view] = d_pose[i]
+        J[i, :, 42 + 3 * point : 45 + 3 * point] = d_point[i]
+    J = np.concatenate([J[..., :24] @ terms.stereo_basis(), J[..., 42:] @ shape, J[..., 24:42]], axis=-1)
+    r = o.pixels - pixels
+    distance = np.sqrt(np.einsum("mi,mij,mj->m", r, problem.weights, r))
+    within = np.minimum(distance, 1.5)
+    assert 0.1 < np.mean(distance > 1.5) < 0.9  # both of Huber's branches
+    W = problem.weights * (within / distance)[:, None, None]
+    H, g = np.einsum("mik,mij,mjl->kl", J, W, J), np.einsum("mik,mij,mj->k", J, W, r)
+    s = len(normal.shared)
+    scale = np.sqrt(np.diag(H))
+    dense = np.block([[normal.shared, *normal.cross], [np.concatenate(normal.cross, axis=1).T, np.zeros((18, 18))]])
+    for view in range(3):
+        dense[s + 6 * view : s + 6 * view + 6, s + 6 * view : s + 6 * view + 6] = normal.pose[view]
+    assert_allclose(dense / np.outer(scale, scale), H / np.outer(scale, scale), atol=1e-12)
+    gradient = np.concatenate([normal.gradient.sum(0), normal.pose_gradient.ravel()])
+    assert_allclose(gradient / scale, g / scale, rtol=1e-9, atol=1e-9)
+    assert_allclose(normal.cost, np.sum(within * (2 * distance - within)), rtol=1e-12)
+    behind = replace(m, t_left_board=m.t_left_board * [1, 1, -1])
+    assert np.isinf(problem.linearise(behind).cost)
 
 
 def test_exact_corners_give_back_the_exact_rig(scene_maker, rng):

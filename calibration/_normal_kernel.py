@@ -1,0 +1,119 @@
+"""Compiled inner loop of `normal_equations`: predictions, their derivatives, and their products summed over each view.
+
+numba, because a calibration linearises some 400 times: 0.3 ms for 18 views compiled, 5 ms as arrays of NumPy.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calibration.compiled import njit
+
+# Columns: nine intrinsics of the left camera, nine of the right, turn and shift between them, turn and shift of the
+# board, residual. A left observation has the first nine and the last seven, a right one all but the first nine.
+N_COLUMNS = 31
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_left, t_right_left, R_board,
+               t_board, points, squares, of_point, by_itself, costs):  # fmt: skip
+    """Sum the products of all whitened rows: Huber's with residuals beyond `limit` sigmas counted linearly.
+
+    view, camera, point (m,); pixels (m, 2); weights (m, 2, 2) [1/px^2]; cameras (2, 9); R_board (V, 3, 3), t_board
+    (V, 3), points (n, 3). Added to: squares (V, 31, 31), costs (V,); and, where it has room for all points, of_point
+    (V, n, 3, 31), the products of the points' columns with the others, and by_itself (V, n, 3, 3), among themselves.
+    Returns False where a point lies behind its camera; the sums are then not to be used.
+    """
+    row, d = np.empty((2, N_COLUMNS - 9)), np.empty((2, 3))
+    arm, left, turned, X = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    d_left, by_point = np.empty((2, 3)), np.empty((2, 3))
+    for i in range(len(view)):
+        v, p, right = view[i], point[i], camera[i] == 1
+        for j in range(3):
+            arm[j] = R_board[v, j, 0] * points[p, 0] + R_board[v, j, 1] * points[p, 1] + R_board[v, j, 2] * points[p, 2]
+            left[j] = arm[j] + t_board[v, j]
+            X[j] = left[j]
+        if right:
+            for j in range(3):
+                turned[j] = R_right_left[j, 0] * left[0] + R_right_left[j, 1] * left[1] + R_right_left[j, 2] * left[2]
+                X[j] = turned[j] + t_right_left[j]
+        if not X[2] > 0.0:
+            return False
+        c = cameras[camera[i]]
+        fx, fy, p1, p2 = c[0], c[1], c[6], c[7]
+        iz = 1.0 / X[2]
+        a, b = X[0] * iz, X[1] * iz
+        r2 = a * a + b * b
+        radial = 1.0 + r2 * (c[4] + r2 * (c[5] + r2 * c[8]))
+        slope = c[4] + r2 * (2.0 * c[5] + 3.0 * c[8] * r2)
+        xd = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
+        yd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
+        xd_a = radial + 2.0 * a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
+        xd_b = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+        yd_b = radial + 2.0 * b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+        d[0, 0], d[0, 1], d[0, 2] = fx * xd_a * iz, fx * xd_b * iz, -fx * (xd_a * a + xd_b * b) * iz
+        d[1, 0], d[1, 1], d[1, 2] = fy * xd_b * iz, fy * yd_b * iz, -fy * (xd_b * a + yd_b * b) * iz
+        row[0, 0], row[0, 1], row[0, 2], row[0, 3] = xd, 0.0, 1.0, 0.0
+        row[1, 0], row[1, 1], row[1, 2], row[1, 3] = 0.0, yd, 0.0, 1.0
+        row[0, 4], row[0, 5], row[0, 8] = fx * a * r2, fx * a * r2 * r2, fx * a * r2 * r2 * r2
+        row[1, 4], row[1, 5], row[1, 8] = fy * b * r2, fy * b * r2 * r2, fy * b * r2 * r2 * r2
+        row[0, 6], row[0, 7] = fx * 2.0 * a * b, fx * (r2 + 2.0 * a * a)
+        row[1, 6], row[1, 7] = fy * (r2 + 2.0 * b * b), fy * 2.0 * a * b
+        k = 9
+        for axis in range(2):
+            x, y, z = d[axis, 0], d[axis, 1], d[axis, 2]
+            d_left[axis, 0], d_left[axis, 1], d_left[axis, 2] = x, y, z
+            if right:
+                k = 15
+                row[axis, 9] = turned[1] * z - turned[2] * y
+                row[axis, 10] = turned[2] * x - turned[0] * z
+                row[axis, 11] = turned[0] * y - turned[1] * x
+                row[axis, 12], row[axis, 13], row[axis, 14] = x, y, z
+                for j in range(3):
+                    d_left[axis, j] = x * R_right_left[0, j] + y * R_right_left[1, j] + z * R_right_left[2, j]
+            x, y, z = d_left[axis, 0], d_left[axis, 1], d_left[axis, 2]
+            row[axis, k] = arm[1] * z - arm[2] * y
+            row[axis, k + 1] = arm[2] * x - arm[0] * z
+            row[axis, k + 2] = arm[0] * y - arm[1] * x
+            row[axis, k + 3], row[axis, k + 4], row[axis, k + 5] = x, y, z
+        row[0, k + 6] = pixels[i, 0] - (fx * xd + c[2])
+        row[1, k + 6] = pixels[i, 1] - (fy * yd + c[3])
+        k += 7
+        x, y = row[0, k - 1], row[1, k - 1]
+        sigmas = math.sqrt(weights[i, 0, 0] * x * x + 2.0 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)
+        if not math.isfinite(sigmas):
+            return False
+        within = min(sigmas, limit)
+        costs[v] += within * (2.0 * sigmas - within)
+        factor = math.sqrt(within / sigmas) if sigmas > limit else 1.0
+        # the rows by L^T, L L^T the weights
+        w0 = math.sqrt(weights[i, 0, 0])
+        w1 = weights[i, 0, 1] / w0 if w0 > 0.0 else 0.0
+        w2 = factor * math.sqrt(max(weights[i, 1, 1] - w1 * w1, 0.0))
+        w0, w1 = factor * w0, factor * w1
+        for j in range(k):
+            row[0, j], row[1, j] = w0 * row[0, j] + w1 * row[1, j], w2 * row[1, j]
+        skip, rest = (9, 9) if right else (0, 15)  # of the columns, before the ninth of the row and from it on
+        for j in range(k):
+            into = j + (skip if j < 9 else rest)
+            x, y = row[0, j], row[1, j]
+            for q in range(9):
+                squares[v, into, q + skip] += x * row[0, q] + y * row[1, q]
+            for q in range(9, k):
+                squares[v, into, q + rest] += x * row[0, q] + y * row[1, q]
+        if of_point.shape[1]:
+            for axis in range(2):
+                x, y, z = row[axis, k - 4], row[axis, k - 3], row[axis, k - 2]
+                for j in range(3):
+                    by_point[axis, j] = x * R_board[v, 0, j] + y * R_board[v, 1, j] + z * R_board[v, 2, j]
+            for j in range(3):
+                x, y = by_point[0, j], by_point[1, j]
+                for q in range(9):
+                    of_point[v, p, j, q + skip] += x * row[0, q] + y * row[1, q]
+                for q in range(9, k):
+                    of_point[v, p, j, q + rest] += x * row[0, q] + y * row[1, q]
+                for q in range(3):
+                    by_itself[v, p, j, q] += x * by_point[0, q] + y * by_point[1, q]
+    return True
