@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import disctrack
 from disctrack.diagnosis.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, terms
@@ -274,6 +275,33 @@ def test_what_no_term_describes_is_unexplained():
     )[0]  # fmt: skip
     answer = diagnose(OSCILLATOR, Run(TIME, {"x": pushed + noise}, sigma=SIGMA), FIVE)
     assert answer.verdict == "unexplained"
+
+
+def test_sigmas_hold_where_what_is_left_lasts_as_long_as_the_run():
+    """Two turns with a slow force that no term describes: one block of residual says nothing about its own scatter."""
+    time, pulls = np.arange(0, 1.2, 0.005), []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        force = CubicSpline(np.arange(-2, 4, 0.4), 8 * np.cumsum(rng.standard_normal(15)))
+        mean = force(time).mean()
+        x = motion(lambda t, y, f=force, m=mean: [y[1], -110 * y[0] - 0.4 * y[1] + f(t) - m], [1.0, 0.0], time)[0]
+        equations = Equations({"x": "v", "v": "-k*x - 2*beta*v"}, {"k": 110.0, "beta": 0.2})
+        run = Run(time, {"x": x + 2e-3 * rng.standard_normal(len(time))}, sigma=2e-3)
+        answer = diagnose(equations, run, [terms.coulomb("v")])
+        assert answer.verdict == "unexplained"
+        pulls.append((answer.values["k"] - 110) / answer.sigmas["k"])
+    assert np.sqrt(np.mean(np.square(pulls))) < 2.2  # of four standard normals: exceeded once in 1400; 4e5 when written
+
+
+def test_the_noise_told_is_that_of_what_is_left():
+    """Nine samples a turn: differences of the data hold much of the motion, those of the residual none."""
+    time = np.arange(500) * 0.06
+    x = motion(lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1]], [1.0, 0.0], time)[0]
+    noisy = x + 1e-4 * np.random.default_rng(5).standard_normal(len(time))
+    assert fast_part([noisy]) > 3e-4
+    answer = diagnose(OSCILLATOR, Run(time, {"x": noisy}), [terms.coulomb("v")])
+    assert answer.verdict == "nothing missing"
+    assert answer.after["x"].noise == pytest.approx(1e-4, rel=0.2)
 
 
 def test_a_forecast_goes_on_from_the_fitted_state(with_friction):

@@ -27,7 +27,7 @@ class ChannelErrors:
 
     rms: float  # over all that was fitted
     held_out: float  # free run over the last part of every stretch, from a fit to the first
-    noise: float  # as stated or found in the data
+    noise: float  # as found in what the model leaves
 
 
 def diagnose(
@@ -132,6 +132,8 @@ class Answer:
                 free.append((s.data - seen)[~fitted_rows(s)])
             ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
         noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
+        if self.asked.memory is None:  # the fast part of the data holds some of the motion, that of the residual less
+            noise = noise * np.sqrt(self.diagnosis.noise)
         both = zip(names, rms, ahead, noise, strict=True)
         return {name: ChannelErrors(float(r), float(a), float(n)) for name, r, a, n in both}
 

@@ -34,6 +34,7 @@ REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below
 MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
+ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
@@ -324,7 +325,9 @@ def _wald(names: Sequence[str], fitted: Fit) -> float:
 def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
     """The fit with the covariance that its own residual brings about, errors within `block` [s] taken together.
 
-    The sandwich of Huber and White over blocks: what is left need be neither white nor as large as stated.
+    The sandwich of Huber and White over blocks: what is left need be neither white nor as large as stated. The fit
+    bends as many sums over blocks to nought as it has numbers: data that hold too few blocks are cut into shorter ones,
+    which are then taken as wholly alike for as long as an error lasts (the largest that their sum can be).
     """
     names = fitted.names
     residual, derivative = system.linearise(fitted.values, names)
@@ -332,16 +335,19 @@ def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
     scale = np.where(length > 0, length, 1.0)
     J = derivative / scale
     normal = np.einsum("nwi,nwj->ij", J, J)
+    duration = sum(float(np.ptp(system.time[rows])) for rows in system.rows)
+    cut = min(block, duration / (ENOUGH * len(names)))
     scores = []
     for rows in system.rows:
-        number = (system.time[rows] / block).astype(int)
+        number = ((system.time[rows] - system.time[rows.start]) / cut).astype(int)
         for b in np.unique(number):
             here = np.flatnonzero(number == b) + rows.start
             scores.append(np.einsum("nwi,nw->i", J[here], residual[here]))
     S = np.array(scores)
-    few = len(S) / max(len(S) - len(names), 1)  # blocks that the fit has bent towards nought
+    few = len(S) / max(len(S) - len(names), 1)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    spread = few * inverse @ (S.T @ S) @ inverse / np.outer(scale, scale)
+    alike = min(block, duration) / cut
+    spread = few * alike * inverse @ (S.T @ S) @ inverse / np.outer(scale, scale)
     free = np.diag(fitted.covariance) > 0
     return replace(fitted, covariance=np.where(np.outer(free, free), spread, 0.0))
 
