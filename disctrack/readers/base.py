@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
 
 from calibration.arrays import Array, Image
+from disctrack.errors import RecordingError
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
@@ -44,6 +48,60 @@ class FrameReader(Protocol):
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 (hex) of what frames start..stop-1 were made from; equal if and only if the input is the same."""
         ...
+
+
+class Frames:
+    """What readers have in common (see FrameReader); each says in which file a frame lies, and decodes it."""
+
+    random_access = True
+    timestamps: Array | None = None
+    frame_rate: float | None = None
+    camera: str
+    image_size: tuple[int, int]
+    dtype: np.dtype
+    bit_depth: int
+
+    def _place(self, index: int) -> str:
+        raise NotImplementedError
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        raise NotImplementedError  # in `out` or anywhere else; RecordingErrors begin with `where`
+
+    def read(self, index: int, out: Image | None = None) -> Image:
+        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
+        where = f"{self._place(index)} ({self.camera} camera, frame {index})"
+        image = self._decoded(index, out, where)
+        if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
+            width, height = self.image_size
+            raise RecordingError(
+                f"{where}: {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit, but the first frame has "
+                f"{width} x {height} px of {8 * self.dtype.itemsize} bit. Export it again."
+            )
+        if out is None or image is out:
+            return image
+        out[...] = image
+        return out
+
+    def _buffer(self, out: Image | None) -> Image:
+        """`out` where a frame can be decoded straight into it; another array of a frame's size and type otherwise."""
+        shape = self.image_size[::-1]
+        if out is not None and out.shape == shape and out.dtype == self.dtype and out.flags.c_contiguous:
+            return out
+        return np.empty(shape, self.dtype)
+
+
+_T = TypeVar("_T")
+
+
+def first_readable(n: int, camera: str, decoded: Callable[[int], _T]) -> _T:
+    """What `decoded` gives of the first of n frames that it can decode. Raises RecordingError if there is none."""
+    problem: RecordingError | None = None
+    for index in range(n):
+        try:
+            return decoded(index)
+        except RecordingError as error:
+            problem = problem or error
+    raise RecordingError(f"none of the {n} {camera} frames can be read; the first: {problem}")
 
 
 def split_member(pattern: str) -> tuple[str, str]:

@@ -96,27 +96,18 @@ class CameraFrames(RawFrames):
         self.frame_bytes = layout.frame_bytes
         self._scratch = threading.local()
 
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
-        file, offset = self.files[0], int(self.offsets[index])
-        where = f"{file.path} ({self.camera} camera, frame {index})"
-        if offset < 0:
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        if self.offsets[index] < 0:
             raise RecordingError(f"{where}: there is no image of the right size where the file says. Copy it again.")
         if self.layout.is_plain:
-            return super().read(index, out)
+            return super()._decoded(index, out, where)
         stored = getattr(self._scratch, "stored", None)
         if stored is None:
             stored = self._scratch.stored = np.empty(self.frame_bytes, np.uint8)
-        file.read_into(stored, offset, where)
-        shape = self.image_size[::-1]
-        image = out
-        if image is None or image.shape != shape or image.dtype != self.dtype or not image.flags.c_contiguous:
-            image = np.empty(shape, self.dtype)
+        self.files[0].read_into(stored, int(self.offsets[index]), where)
+        image = self._buffer(out)
         self.layout.decode(stored, image)
-        if out is None or image is out:
-            return image
-        out[...] = image
-        return out
+        return image
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of how the pixels lie and of the bytes of frames start..stop-1."""

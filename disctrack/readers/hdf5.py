@@ -20,7 +20,7 @@ import numpy as np
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.readers._inflate import inflated
-from disctrack.readers.base import FrameReader
+from disctrack.readers.base import FrameReader, Frames
 from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
@@ -166,7 +166,7 @@ def _timestamps(stack: Any, n: int, where: str) -> Array | None:
     return values.astype(np.float64)
 
 
-class Hdf5Frames:
+class Hdf5Frames(Frames):
     """A data set in chunks, with or without compression; see FrameReader.
 
     The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are, it delivers
@@ -209,15 +209,13 @@ class Hdf5Frames:
 
     def describe(self, index: int) -> str:
         """File, data set and frame."""
-        return f"{self.file}:{self._stack.name}, frame {index}"
+        return f"{self._place(index)}, frame {index}"
 
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
-        where = f"{self.file}:{self._stack.name} ({self.camera} camera, frame {index})"
-        image = out
-        if image is None or image.dtype != self.dtype or not image.flags.c_contiguous:
-            image = np.empty(self.image_size[::-1], self.dtype)
-        content = None
+    def _place(self, index: int) -> str:
+        return f"{self.file}:{self._stack.name}"
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        image, content = self._buffer(out), None
         with self._lock:
             try:
                 size = self._stored_size(index)
@@ -233,10 +231,7 @@ class Hdf5Frames:
         if content is not None:
             self._inflate(content, image, where)
         self._digests[index] = hashlib.sha256(image.data).digest()
-        if out is None or image is out:
-            return image
-        out[...] = image
-        return out
+        return image
 
     def _inflate(self, content: bytes, image: Image, where: str) -> None:
         """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Image
+from calibration.arrays import Image
 from calibration.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
-from disctrack.readers.base import FrameReader
+from disctrack.readers.base import FrameReader, Frames, first_readable
 from disctrack.readers.decoding import as_grey, decode
 from disctrack.readers.file_numbers import NumberedFiles, check_continuation, number_files
 from disctrack.readers.tiff import is_stack, open_stack
@@ -35,16 +35,16 @@ def open_image_sequence(numbered: NumberedFiles, camera: str) -> ImageSequence:
     Size and depth are those of the first frame that can be read. Raises RecordingError if there is none.
     """
     files = [file for file in numbered.slots if file is not None]
-    first, stored, problem = None, None, ""
-    for file in files:
+
+    def decoded(index: int) -> tuple[NDArray, Image]:
+        file = files[index]
         try:
             stored = decode(file.read_bytes(), str(file))
-            first = as_grey(stored, str(file))
-            break
-        except (RecordingError, OSError) as error:
-            problem = problem or str(error)
-    if first is None or stored is None:
-        raise RecordingError(f"none of the {len(files)} {camera} images can be read; the first: {problem}")
+        except OSError as error:
+            raise RecordingError(str(error)) from error
+        return stored, as_grey(stored, str(file))
+
+    stored, first = first_readable(len(files), camera, decoded)
     notes = [f"{camera} camera: {note}" for note in (*numbered.notes, *_depth_notes(stored, first))]
     size = first.shape[1], first.shape[0]
     return ImageSequence(numbered, camera, size, first.dtype, tuple(notes))
@@ -61,12 +61,8 @@ def _depth_notes(stored: NDArray, grey: Image) -> list[str]:
     return notes
 
 
-class ImageSequence:
+class ImageSequence(Frames):
     """One file per frame; see FrameReader. Files are opened when a frame is read, and never written."""
-
-    timestamps: Array | None = None
-    frame_rate: float | None = None
-    random_access = True
 
     def __init__(
         self,
@@ -94,22 +90,12 @@ class ImageSequence:
         file = self.files[index]
         return f"missing file of {self.camera} frame {index}" if file is None else str(file)
 
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
-        where = f"{self.describe(index)} ({self.camera} camera, frame {index})"
+    _place = describe
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         content = self._content(index, where)
         self._digests[index] = hashlib.sha256(content).digest()
-        image = as_grey(decode(content, where, out), where)
-        if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
-            width, height = self.image_size
-            raise RecordingError(
-                f"{where}: {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit, but the sequence has "
-                f"{width} x {height} px of {self.bit_depth} bit. Export this frame again."
-            )
-        if out is None or image is out:
-            return image
-        out[...] = image
-        return out
+        return as_grey(decode(content, where, out), where)
 
     def _content(self, index: int, where: str) -> bytes:
         file = self.files[index]

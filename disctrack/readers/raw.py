@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
+from disctrack.readers.base import Frames
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
@@ -92,10 +93,8 @@ class RawFile:
             digest.update(piece.data)
 
 
-class RawFrames:
+class RawFrames(Frames):
     """Frames of equal size at known places in one or several files; see FrameReader."""
-
-    random_access = True
 
     def __init__(
         self,
@@ -125,23 +124,17 @@ class RawFrames:
 
     def describe(self, index: int) -> str:
         """File, frame and the byte where it begins."""
-        return f"{self.files[self.file_of_frame[index]].path}, frame {index} at byte {self.offsets[index]}"
+        return f"{self._place(index)}, frame {index} at byte {self.offsets[index]}"
 
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
-        shape = self.image_size[::-1]
-        image = out
-        if image is None or image.shape != shape or image.dtype != self.dtype or not image.flags.c_contiguous:
-            image = np.empty(shape, self.dtype)
-        file = self.files[self.file_of_frame[index]]
-        where = f"{file.path} ({self.camera} camera, frame {index})"
+    def _place(self, index: int) -> str:
+        return str(self.files[self.file_of_frame[index]].path)
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        image, file = self._buffer(out), self.files[self.file_of_frame[index]]
         file.read_into(image.reshape(-1).view(np.uint8), int(self.offsets[index]), where)
         if self.stored != self.dtype:
             image.byteswap(inplace=True)
-        if out is None or image is out:
-            return image
-        out[...] = image
-        return out
+        return image
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of size, type and bytes of frames start..stop-1."""

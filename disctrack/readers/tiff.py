@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.readers._inflate import inflated
-from disctrack.readers.base import FrameReader
+from disctrack.readers.base import FrameReader, Frames, first_readable
 from disctrack.readers.decoding import as_grey, decode
 from disctrack.readers.raw import MOST_PIXELS, RawFile, RawFrames, check_frame_size
 from disctrack.readers.tiff_directories import Code, Tag, Tiff, assembled, chain
@@ -94,10 +94,8 @@ class _Page:
         return self.width, self.height, self.bits, self.order
 
 
-class TiffPages:
+class TiffPages(Frames):
     """Pages that are compressed, or otherwise not plain; see FrameReader."""
-
-    random_access = True
 
     def __init__(
         self,
@@ -110,7 +108,7 @@ class TiffPages:
     ) -> None:
         self._tiffs, self._pages, self.camera = list(tiffs), list(pages), camera
         self.timestamps, self.frame_rate, self.notes = timestamps, frame_rate, notes
-        first = self._first_readable()
+        first = first_readable(len(pages), camera, lambda index: self._decoded(index, None, self._place(index)))
         self.image_size, self.dtype = first.shape[::-1], first.dtype
         self.bit_depth = 8 * first.itemsize
 
@@ -119,23 +117,7 @@ class TiffPages:
 
     def describe(self, index: int) -> str:
         """File and page."""
-        page = self._pages[index]
-        return f"{self._tiffs[page.file].file.path}, frame {index} (directory at byte {page.directory})"
-
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
-        where = f"{self._where(index)} ({self.camera} camera, frame {index})"
-        image = self._decoded(index, where)
-        if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
-            width, height = self.image_size
-            raise RecordingError(
-                f"{where}: {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit, but the file began with "
-                f"{width} x {height} px of {self.bit_depth} bit. Export it again."
-            )
-        if out is None:
-            return image
-        out[...] = image
-        return out
+        return f"{self._place(index)}, frame {index} (directory at byte {self._pages[index].directory})"
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of the pages of frames start..stop-1, as they are stored."""
@@ -150,10 +132,10 @@ class TiffPages:
                 total.update(b"unreadable")
         return total.hexdigest()
 
-    def _where(self, index: int) -> str:
+    def _place(self, index: int) -> str:
         return str(self._tiffs[self._pages[index].file].file.path)
 
-    def _decoded(self, index: int, where: str) -> Image:
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         page = self._pages[index]
         check_frame_size(page.width, page.height, where)
         try:
@@ -161,15 +143,6 @@ class TiffPages:
         except RecordingError as error:
             text = str(error)
             raise RecordingError(text if text.startswith(where) else f"{where}: {text}") from error
-
-    def _first_readable(self) -> Image:
-        problem: RecordingError | None = None
-        for index in range(len(self._pages)):
-            try:
-                return self._decoded(index, self._where(index))
-            except RecordingError as error:
-                problem = problem or error
-        raise RecordingError(f"none of the {len(self._pages)} {self.camera} frames can be read; the first: {problem}")
 
 
 def _decoded_page(tiff: Tiff, offset: int, where: str) -> NDArray:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Image
+from calibration.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.readers._ffv1 import checksums_hold
+from disctrack.readers.base import Frames, first_readable
 from disctrack.readers.decoding import as_grey
 from disctrack.readers.raw import MOST_PIXELS, check_frame_size
 
@@ -36,16 +37,14 @@ def open_video(files: Sequence[Path], camera: str) -> VideoFile:
     return VideoFile(files[0], camera)
 
 
-class VideoFile:
+class VideoFile(Frames):
     """Frames of a video in order of presentation; see FrameReader. Best read forwards, by one thread.
 
     Grey values are the luma plane as it is stored, not stretched from limited to full range. Frames are found by their
     time in the container: going back starts at the key frame before.
     """
 
-    timestamps: Array | None = None  # those of the container are a player's, not the camera's
-    frame_rate: float | None = None
-    random_access = False
+    random_access = False  # and without time stamps: those of the container are a player's, not the camera's
 
     def __init__(self, file: Path, camera: str) -> None:
         self.file, self.camera = file, camera
@@ -57,10 +56,14 @@ class VideoFile:
             check_frame_size(codec.width, codec.height, str(file))
             codec_name = str(codec.name)
             self._index = _index(container, codec_name, file)
-        first, notes = self._first_readable()
-        self.image_size = first.shape[1], first.shape[0]
-        self.dtype = first.dtype
-        self.bit_depth = self._bit_depth
+
+        def looked_at(index: int) -> tuple[Any, Image]:
+            frame = self._frame(index, self.describe(index))
+            return frame, _luma(frame, self.describe(index))
+
+        frame, first = first_readable(len(self), camera, looked_at)
+        notes = _format_notes(frame)
+        self.image_size, self.dtype, self.bit_depth = first.shape[::-1], first.dtype, _depth(frame)
         if codec_name not in _LOSSLESS:
             notes.append(f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss")
         self.notes = tuple(f"{camera} camera: {note}" for note in notes)
@@ -73,20 +76,13 @@ class VideoFile:
         """File and frame."""
         return f"{self.file}, frame {index}"
 
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
-        where = f"{self.file} ({self.camera} camera, frame {index})"
+    def _place(self, index: int) -> str:
+        return str(self.file)
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         with self._lock:
-            image = _luma(self._decoded(index, where), where)
-        if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
-            raise RecordingError(
-                f"{where}: the video changes to {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit. "
-                "Export it again."
-            )
-        if out is None:
-            return image.copy()
-        out[...] = image
-        return out
+            image = _luma(self._frame(index, where), where)
+            return image.copy() if out is None else image
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of the file and the range: compressed frames cannot be told apart without decoding them."""
@@ -98,19 +94,7 @@ class VideoFile:
                 self._digest = b"unreadable" + os.urandom(16)
         return hashlib.sha256(self._digest + f"{start}:{stop}".encode()).hexdigest()
 
-    def _first_readable(self) -> tuple[Image, list[str]]:
-        problem: RecordingError | None = None
-        for index in range(len(self)):
-            try:
-                frame = self._decoded(index, self.describe(index))
-                image = _luma(frame, self.describe(index))
-                self._bit_depth = _depth(frame)
-                return image, _format_notes(frame)
-            except RecordingError as error:
-                problem = problem or error
-        raise RecordingError(f"none of the {len(self)} {self.camera} frames can be read; the first: {problem}")
-
-    def _decoded(self, index: int, where: str) -> Any:
+    def _frame(self, index: int, where: str) -> Any:
         try:
             cursor = self._cursor_near(index)
         except RecordingError as error:  # the file is opened anew to go back
