@@ -1,8 +1,8 @@
-"""What may be wrong about a measurement: clocks, cameras, dots, table. One class for each kind of fault.
+"""What may be wrong about a measurement: clocks, cameras, dots, table. One entry, or class, for each kind of fault.
 
-To add one, write a subclass of Fault here: its quantities, what it alters (`MeasurementSetup`) or shifts in the images,
-and its place in a scene (scene.description.Faults), so that it can be rendered, saved and given to the next diagnosis.
-Candidates, prediction, derivatives, saved models and trials take it from `faults_of`.
+To add one, write a `Keyed` here: its quantities, what it alters (`MeasurementSetup`), and its place in a scene
+(scene.description.Faults), so that it can be rendered, saved and given to the next diagnosis. One that does more than
+write its numbers there is a class. Candidates, prediction, derivatives, models and trials take it from `faults_of`.
 
 Quantities are addressed by name, as parameters of the effects of the motion are: "right_turned.rotation_x". Null is
 always zero: as calibrated, as declared.
@@ -10,9 +10,9 @@ always zero: as calibrated, as declared.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from calibration.camera import Camera, StereoRig, project_with_jacobians
 from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS, rotation_from_vector
-from disctrack.scene.description import CameraFault, Faults, Scene
+from disctrack.scene.description import Faults, Scene
 
 TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
 RIM_POINTS = 24  # of a dot's outline, for the centre of its image
@@ -60,7 +60,7 @@ class MeasurementSetup:
     cameras: tuple[CameraChange, CameraChange] = field(default_factory=lambda: (CameraChange(), CameraChange()))
     pattern_offset: Array = field(default_factory=lambda: np.zeros(3))  # [m] body axes
     pattern_turn: float = 0.0  # [rad] about e3
-    pattern_scale: float = 1.0
+    pattern_growth: float = 0.0  # relative
     table_turn: Array = field(default_factory=lambda: np.zeros(3))  # [rad] of the true table in calibrated axes
     table_height: float = 0.0  # [m]
 
@@ -69,7 +69,7 @@ class MeasurementSetup:
         centres = disc.marker_centres_body.copy()
         centres[:, :2] += self.misprint
         c, s = np.cos(self.pattern_turn), np.sin(self.pattern_turn)
-        centres[:, :2] = self.pattern_scale * centres[:, :2] @ np.array([[c, s], [-s, c]])
+        centres[:, :2] = (1.0 + self.pattern_growth) * centres[:, :2] @ np.array([[c, s], [-s, c]])
         return np.asarray(centres + self.pattern_offset)
 
 
@@ -98,27 +98,22 @@ class Sight:
 class Fault:
     """One thing that may be wrong about the measurement."""
 
-    family: ClassVar[str]  # name, but for the camera's or the dot's
-    title: ClassVar[str]
-    source: ClassVar[str]
-    unit: ClassVar[str]
-    step: ClassVar[float]  # of a fit: a hundredth of a pixel or so in the image
-    parts: ClassVar[tuple[str, ...]]  # its numbers
-    meaning: ClassVar[str]
-    bounds: ClassVar[tuple[float, float]] = (-np.inf, np.inf)  # beyond which no laboratory's lies
-    in_images: ClassVar[bool] = False  # adds its number times `column` to the dots' images
-    belongs_to: ClassVar[tuple[str, ...]] = ("rig",)  # what two recordings must have in common to share it
-    of_poses_alone: ClassVar[bool] = True  # may show in dots about free poses, without a model of the motion
+    family: str  # name, but for the camera's or the dot's
+    title: str
+    source: str
+    unit: str
+    step: float  # of a fit: a hundredth of a pixel or so in the image
+    parts: tuple[str, ...]  # its numbers
+    meaning: str
+    bounds: tuple[float, float] = (-np.inf, np.inf)  # beyond which no laboratory's lies
+    in_images: bool = False  # adds its number times `column` to the dots' images
+    belongs_to: tuple[str, ...] = ("rig",)  # what two recordings must have in common to share it
+    of_poses_alone: bool = True  # may show in dots about free poses, without a model of the motion
 
     @property
     def name(self) -> str:
         """Unique; quantities are "name.part"."""
         return self.family
-
-    @classmethod
-    def instances(cls, disc: Disc) -> Iterator[Fault]:
-        """One, or one for each camera or dot that it may befall."""
-        yield cls()
 
     def names(self) -> tuple[str, ...]:
         """Of its quantities."""
@@ -221,122 +216,88 @@ class FrameRate(Fault):
         return (faults.frame_rate_hz / scene.cameras.frame_rate_hz - 1.0 if faults.frame_rate_hz else 0.0,)
 
 
-class _Keyed(Fault):
-    """With a key of its own in a scene, that holds null + factor times its numbers."""
+@dataclass(frozen=True)
+class Keyed(Fault):
+    """What a key of its own in a scene holds, as null + factor times its numbers, and a field of the setup as well."""
 
-    key: ClassVar[str]
-    factor: ClassVar[float] = 1.0
-    null: ClassVar[float] = 0.0
-
-    def keyed(self, v: Array) -> dict[str, Any]:
-        """The key with what it holds."""
-        numbers = tuple(float(self.null + self.factor * x) for x in v)
-        return {self.key: numbers if len(numbers) > 1 else numbers[0]}
-
-    def held(self, place: Faults | CameraFault) -> list[float]:
-        """Its numbers, from what the key holds."""
-        return list((np.atleast_1d(getattr(place, self.key)) - self.null) / self.factor)
-
-    def to_scene(self, faults: Faults, v: Array, scene: Scene) -> Faults:
-        return replace(faults, **self.keyed(v))
-
-    def from_scene(self, faults: Faults, scene: Scene) -> Sequence[float]:
-        return self.held(faults)
-
-
-class _OfCamera(_Keyed):
-    """Of one camera; its key is that of a scene's CameraFault."""
-
-    def __init__(self, camera: str = "left") -> None:
-        self.camera = camera
+    family: str
+    parts: tuple[str, ...]
+    unit: str
+    step: float
+    title: str
+    source: str
+    meaning: str
+    key: str  # of the scene's Faults, or CameraFault
+    sets: tuple[str, slice | int | None]  # field of the setup, or of its CameraChange, and which of its numbers
+    factor: float = 1.0
+    null: float = 0.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    belongs_to: tuple[str, ...] = ("rig",)
+    camera: str = ""  # that it befell, if it befalls cameras
 
     @property
     def name(self) -> str:
-        return f"{self.camera}_{self.family}"
-
-    @classmethod
-    def instances(cls, disc: Disc) -> Iterator[Fault]:
-        yield from (cls(camera) for camera in CAMERAS)
+        return f"{self.camera}_{self.family}" if self.camera else self.family
 
     def said(self) -> str:
         return self.title.format(self.camera)
 
-    def change(self, setup: MeasurementSetup) -> CameraChange:
-        """Of this camera."""
-        return setup.cameras[CAMERAS.index(self.camera)]
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
+        changed = setup.cameras[CAMERAS.index(self.camera)] if self.camera else setup
+        field_, numbers = self.sets
+        if numbers is None:
+            setattr(changed, field_, v if len(v) > 1 else float(v[0]))
+        else:
+            getattr(changed, field_)[numbers] = v if isinstance(numbers, slice) else v[0]
 
     def to_scene(self, faults: Faults, v: Array, scene: Scene) -> Faults:
-        return replace(faults, **{self.camera: replace(getattr(faults, self.camera), **self.keyed(v))})
+        numbers = tuple(float(self.null + self.factor * x) for x in v)
+        keyed: dict[str, Any] = {self.key: numbers if len(numbers) > 1 else numbers[0]}
+        if self.camera:
+            return replace(faults, **{self.camera: replace(getattr(faults, self.camera), **keyed)})
+        return replace(faults, **keyed)
 
     def from_scene(self, faults: Faults, scene: Scene) -> Sequence[float]:
-        return self.held(getattr(faults, self.camera))
+        place = getattr(faults, self.camera) if self.camera else faults
+        return list((np.atleast_1d(getattr(place, self.key)) - self.null) / self.factor)
 
 
-class CameraTurned(_OfCamera):
-    """A camera that was turned."""
-
-    family, unit, step = "turned", "rad", 1e-5
-    parts = ("rotation_x", "rotation_y", "rotation_z")
-    title = "the {} camera turned after its calibration"
-    source, meaning = "mount, cable, knock", "in its own axes"
-    bounds = (-0.06, 0.06)
-    key, factor = "rotation_deg", 180 / np.pi
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        self.change(setup).rotation = v
-
-
-class CameraShifted(_OfCamera):
-    """A camera that was moved."""
-
-    family, unit, step = "shifted", "m", 1e-5
-    parts = ("translation_x", "translation_y", "translation_z")
-    title = "the {} camera moved after its calibration"
-    source, meaning = "mount, cable, knock", "in its own axes"
-    bounds = (-0.01, 0.01)
-    key, factor = "translation_mm", 1e3
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        self.change(setup).translation = v
-
-
-class FocalLength(_OfCamera):
-    """Another focal length."""
-
-    family, unit, step, parts = "focal", "1", 1e-5, ("change",)
-    title = "the focal length of the {} camera changed"
-    source, meaning = "focus, temperature", "relative"
-    bounds = (-0.05, 0.05)
-    key, null = "focal_scale", 1.0
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        self.change(setup).focal = float(v[0])
-
-
-class PrincipalPoint(_OfCamera):
-    """A lens that moved across."""
-
-    family, unit, step, parts = "principal_point", "px", 0.01, ("x", "y")
-    title = "the principal point of the {} camera moved"
-    source, meaning = "lens not fixed", "in the image"
-    bounds = (-5.0, 5.0)
-    key = "principal_point_change_px"
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        self.change(setup).centre = v
-
-
-class Distortion(_OfCamera):
-    """Another distortion."""
-
-    family, unit, step, parts = "distortion", "1", 1e-3, ("k1",)
-    title = "the distortion of the {} camera changed"
-    source, meaning = "focus, aperture, other lens", "change of Brown's k1"
-    bounds = (-1.0, 1.0)
-    key = "k1_change"
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        self.change(setup).k1 = float(v[0])
+_DEG = 180 / np.pi
+_ALL = slice(None)
+OF_CAMERAS = (
+    Keyed("turned", ("rotation_x", "rotation_y", "rotation_z"), "rad", 1e-5,
+          "the {} camera turned after its calibration", "mount, cable, knock", "in its own axes",
+          "rotation_deg", ("rotation", _ALL), _DEG, bounds=(-0.06, 0.06)),
+    Keyed("shifted", ("translation_x", "translation_y", "translation_z"), "m", 1e-5,
+          "the {} camera moved after its calibration", "mount, cable, knock", "in its own axes",
+          "translation_mm", ("translation", _ALL), 1e3, bounds=(-0.01, 0.01)),
+    Keyed("focal", ("change",), "1", 1e-5, "the focal length of the {} camera changed", "focus, temperature",
+          "relative", "focal_scale", ("focal", None), null=1.0, bounds=(-0.05, 0.05)),
+    Keyed("principal_point", ("x", "y"), "px", 0.01, "the principal point of the {} camera moved", "lens not fixed",
+          "in the image", "principal_point_change_px", ("centre", _ALL), bounds=(-5.0, 5.0)),
+    Keyed("distortion", ("k1",), "1", 1e-3, "the distortion of the {} camera changed", "focus, aperture, other lens",
+          "change of Brown's k1", "k1_change", ("k1", None), bounds=(-1.0, 1.0)),
+)  # fmt: skip
+OF_THE_PAPER = (
+    Keyed("pattern_offset", ("x", "y"), "m", 1e-6, "the dots as a whole are off the disc's centre",
+          "gluing of the paper", "body axes", "pattern_offset_mm", ("pattern_offset", slice(2)), 1e3,
+          belongs_to=("disc",)),
+    Keyed("pattern_rotation", ("angle",), "rad", 1e-5, "the dots as a whole are turned on the face",
+          "gluing; the same as another spin angle", "about e3", "pattern_turn_deg", ("pattern_turn", None), _DEG,
+          belongs_to=("disc",)),
+    Keyed("pattern_scale", ("change",), "1", 1e-5, "the dots as a whole are printed too large", "printer", "relative",
+          "pattern_scale", ("pattern_growth", None), null=1.0, belongs_to=("disc",)),
+    Keyed("pattern_height", ("offset",), "m", 1e-6, "the dots lie higher than half the thickness",
+          "paper, glue, thickness", "along e3", "pattern_height_mm", ("pattern_offset", 2), 1e3, belongs_to=("disc",)),
+)  # fmt: skip
+OF_THE_TABLE = (
+    Keyed("table_plane", ("tilt_x", "tilt_y"), "rad", 1e-5,
+          "the table is not parallel to the calibration's table view", "board on a burr",
+          "turn of the true table, calibrated axes", "table_turn_deg", ("table_turn", slice(2)), _DEG),
+    Keyed("table_height", ("offset",), "m", 1e-6, "the table is not where the calibration's table view says",
+          "thickness of the board", "true height of the table in the calibrated axes", "table_height_mm",
+          ("table_height", None), 1e3),
+)  # fmt: skip
 
 
 class Misprint(Fault):
@@ -347,16 +308,12 @@ class Misprint(Fault):
     title = "dot {} is not where it was declared"
     source, meaning = "printing", "body axes"
 
-    def __init__(self, dot: int = 0) -> None:
+    def __init__(self, dot: int) -> None:
         self.dot = dot
 
     @property
     def name(self) -> str:
         return f"misprint_{self.dot}"
-
-    @classmethod
-    def instances(cls, disc: Disc) -> Iterator[Fault]:
-        yield from (cls(i) for i in range(disc.n_markers))
 
     def said(self) -> str:
         return self.title.format(self.dot)
@@ -377,82 +334,6 @@ class Misprint(Fault):
 
     def from_scene(self, faults: Faults, scene: Scene) -> Sequence[float]:
         return tuple(1e-3 * x for x in faults.misprint_mm[self.dot]) if faults.misprint_mm else (0.0, 0.0)
-
-
-class PatternOffset(_Keyed):
-    """The paper off the disc's centre."""
-
-    belongs_to = ("disc",)
-    family, unit, step, parts = "pattern_offset", "m", 1e-6, ("x", "y")
-    title = "the dots as a whole are off the disc's centre"
-    source, meaning = "gluing of the paper", "body axes"
-    key, factor = "pattern_offset_mm", 1e3
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        setup.pattern_offset[:2] = v
-
-
-class PatternRotation(_Keyed):
-    """The paper turned."""
-
-    belongs_to = ("disc",)
-    family, unit, step, parts = "pattern_rotation", "rad", 1e-5, ("angle",)
-    title = "the dots as a whole are turned on the face"
-    source, meaning = "gluing; the same as another spin angle", "about e3"
-    key, factor = "pattern_turn_deg", 180 / np.pi
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        setup.pattern_turn = float(v[0])
-
-
-class PatternScale(_Keyed):
-    """The paper printed too large."""
-
-    belongs_to = ("disc",)
-    family, unit, step, parts = "pattern_scale", "1", 1e-5, ("change",)
-    title = "the dots as a whole are printed too large"
-    source, meaning = "printer", "relative"
-    key, null = "pattern_scale", 1.0
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        setup.pattern_scale = 1.0 + float(v[0])
-
-
-class PatternHeight(_Keyed):
-    """The paper above the face."""
-
-    belongs_to = ("disc",)
-    family, unit, step, parts = "pattern_height", "m", 1e-6, ("offset",)
-    title = "the dots lie higher than half the thickness"
-    source, meaning = "paper, glue, thickness", "along e3"
-    key, factor = "pattern_height_mm", 1e3
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        setup.pattern_offset[2] = v[0]
-
-
-class TablePlane(_Keyed):
-    """A table that the board did not lie flat on."""
-
-    family, unit, step, parts = "table_plane", "rad", 1e-5, ("tilt_x", "tilt_y")
-    title = "the table is not parallel to the calibration's table view"
-    source, meaning = "board on a burr", "turn of the true table, calibrated axes"
-    key, factor = "table_turn_deg", 180 / np.pi
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        setup.table_turn[:2] = v
-
-
-class TableHeight(_Keyed):
-    """A board of another thickness."""
-
-    family, unit, step, parts = "table_height", "m", 1e-6, ("offset",)
-    title = "the table is not where the calibration's table view says"
-    source, meaning = "thickness of the board", "true height of the table in the calibrated axes"
-    key, factor = "table_height_mm", 1e3
-
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        setup.table_height = float(v[0])
 
 
 class ExposureBlur(Fault):
@@ -477,7 +358,7 @@ class ExposureBlur(Fault):
         return (faults.exposure_s**2,)
 
 
-class EllipseCentre(_Keyed):
+class EllipseCentre(Fault):
     """Centres of images for images of centres."""
 
     family, unit, step, parts = "ellipse_centre", "1", 0.1, ("share",)
@@ -485,21 +366,25 @@ class EllipseCentre(_Keyed):
     source, meaning = "perspective of circles", "1: not corrected at all, -1: corrected twice"
     bounds = (-2.0, 2.0)
     in_images = True
-    key = "ellipse_centre_share"
 
     def column(self, part: str, sight: Sight) -> Array:
         return ellipse_centre_shift(sight.R[0], sight.t[0], sight.rig, sight.disc)
 
+    def to_scene(self, faults: Faults, v: Array, scene: Scene) -> Faults:
+        return replace(faults, ellipse_centre_share=float(v[0]))
 
-KINDS: tuple[type[Fault], ...] = (
-    TimeOffset, FrameRate, CameraTurned, CameraShifted, FocalLength, PrincipalPoint, Distortion, Misprint,
-    PatternOffset, PatternRotation, PatternScale, PatternHeight, TablePlane, TableHeight, ExposureBlur, EllipseCentre,
-)  # fmt: skip
+    def from_scene(self, faults: Faults, scene: Scene) -> Sequence[float]:
+        return (faults.ellipse_centre_share,)
 
 
 def faults_of(disc: Disc) -> tuple[Fault, ...]:
     """All that may be wrong about the measurement of this disc."""
-    return tuple(fault for kind in KINDS for fault in kind.instances(disc))
+    of_cameras = (replace(fault, camera=camera) for fault in OF_CAMERAS for camera in CAMERAS)
+    misprints = (Misprint(i) for i in range(disc.n_markers))
+    return (
+        TimeOffset(), FrameRate(), *of_cameras, *misprints, *OF_THE_PAPER, *OF_THE_TABLE, ExposureBlur(),
+        EllipseCentre(),
+    )  # fmt: skip
 
 
 def measurement_candidates(disc: Disc) -> tuple[Candidate, ...]:
