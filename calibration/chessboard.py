@@ -130,15 +130,14 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
             "number of the board's inner corners, or it is no chessboard"
         )
     dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
-    if not dark:
-        return BoardNotFound(
-            f"no corner square of a board of {inner_corners[0]} x {inner_corners[1]} inner corners is dark: "
-            "a negative print, or other counts than declared"
-        )
     if len(dark) == 1:
         return dark[0]
-    # the colouring leaves several orders: i to the right in this image; the stereo pair makes the two cameras agree
-    return max(dark, key=lambda c: float((c[columns - 1] - c[0]) @ np.array([1.0, -1e-3])))
+    # the colouring leaves several orders: i to the right in this image; the stereo pair makes the two cameras agree.
+    # With such counts all corner squares may be light: the print begins with one
+    return max(
+        dark or [corners[order] for order in orders],
+        key=lambda c: float((c[columns - 1] - c[0]) @ np.array([1.0, -1e-3])),
+    )
 
 
 def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> float:

@@ -15,6 +15,7 @@ from calibration.errors import CalibrationError
 from calibration.stereo_model import Observations, StereoModel
 
 MIN_POINTS = 8  # of one view in one camera, to start its pose
+MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
 MIN_VIEWS = 3  # Zhang: fewer do not determine a camera
 
 
@@ -41,15 +42,19 @@ def start_camera(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # its threads add up their views as they end: the last digits would be others in every run
     try:
-        _, K, distortion, turns, shifts = cv2.calibrateCamera(
-            objects, images, image_size, guess, np.zeros(5), flags=flags
-        )
+        # views that leave k1 open still tell of a plain camera, and the refinement knows what cameras are like
+        for plainer in (0, cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO):
+            _, K, distortion, turns, shifts = cv2.calibrateCamera(
+                objects, images, image_size, guess.copy(), np.zeros(5), flags=flags | plainer
+            )
+            k1 = float(np.ravel(distortion)[0])
+            if np.isfinite(K).all() and abs(k1) < MOST_K1:
+                break
     except cv2.error as error:
         raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
     finally:
         cv2.setNumThreads(threads)
-    k1 = float(np.ravel(distortion)[0])
-    if not (np.isfinite(K).all() and abs(k1) < 10):
+    if not (np.isfinite(K).all() and abs(k1) < MOST_K1):
         raise CalibrationError(f"{name} camera: the views do not determine the focal length; tilt the board more")
     camera = Camera(
         float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), (k1, 0.0, 0.0, 0.0, 0.0), image_size

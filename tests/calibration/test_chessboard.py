@@ -151,6 +151,19 @@ def test_order_follows_the_dark_side_however_the_board_lies(board_drawer, turn):
     assert_allclose(view.points, truth(board, R, t), atol=0.05)
 
 
+def test_a_print_whose_corner_squares_are_light_is_found_as_well(board_drawer):
+    board = Board((9, 7), 7e-3)
+    R, t = pose(board)
+    image = board_drawer(CAMERA, R, t, board)
+    dark, light = find_corners(image, (9, 7)), find_corners(image[:, ::-1], (9, 7))  # in a mirror the colours change
+    assert isinstance(light, CornerView)
+    assert light.accepted.all()
+    unflipped = light.points * [-1, 1] + [image.shape[1] - 1, 0]
+    grid = unflipped.reshape(7, 9, 2)
+    either = [grid[::-1].reshape(-1, 2), grid[:, ::-1].reshape(-1, 2)]  # the same board after half a turn
+    assert min(np.abs(points - dark.points).max() for points in either) < 0.02
+
+
 @pytest.mark.parametrize("counts", [(5, 4), (4, 5), (7, 6), (12, 7), (3, 4)])
 def test_other_boards_are_found_in_their_own_order(board_drawer, counts):
     board = Board(counts, 70e-3 / max(counts))
