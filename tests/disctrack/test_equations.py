@@ -224,6 +224,31 @@ def test_parameters_may_be_off_by_a_factor_of_two(rng):
     assert within(answer, "k", 64.0)
 
 
+def test_a_motor_that_runs_up_at_a_limited_current_is_not_led_astray(rng):
+    """Its first part tells neither number, and a model without the limit fits that best with both a thousandfold."""
+    time = np.arange(0, 3, 0.002)
+    angle = motion(lambda t, y: [y[1], min(600.0, (900.0 - y[1]) / 0.6)], [0.0, 0.0], time, max_step=0.01)[0]
+    motor = Equations({"angle": "w", "w": "(w_end - w)/tau"}, {"w_end": 500.0, "tau": 0.5}, units={"angle": "rad"})
+    run = Run(time, {"angle": angle + 0.02 * rng.standard_normal(len(time))}, known={"w": 0.0})
+    answer = diagnose(motor, run, [terms.coulomb("w")])
+    assert answer.verdict == "unexplained"
+    assert within(answer, "w_end", 900.0)
+    assert answer.sigmas["w_end"] < 300.0
+    assert 0.3 < answer.values["tau"] < 1.2
+
+
+def test_a_sensor_off_its_zero_that_loses_the_motion_at_once_is_told(rng):
+    time = np.arange(0, 12, 0.02)
+    drive = np.cos(6.0 * time)
+    x = motion(lambda t, y: [y[1], -49 * y[0] - 0.4 * y[1] + 10 * np.cos(6.0 * t)], [0.0, 0.0], time)[0] + 1.5
+    run = Run(time, {"x": x + 1e-3 * rng.standard_normal(len(time))}, inputs={"drive": drive})
+    numbers = {"w": 6.5, "b": 0.15, "g": 12.0}
+    told = " ".join(diagnose(Equations({"x": "v", "v": "-w**2*x - 2*b*v + g*drive"}, numbers, inputs=["drive"]), run,
+                             [terms.coulomb("v"), terms.sensor_offset("x")]).notes)  # fmt: skip
+    assert "with offset_x it follows" in told
+    assert "coulomb" not in told
+
+
 def test_where_the_model_loses_the_motion_it_is_asked_in_stretches_and_then_as_a_whole(rng):
     """Hares and lynxes, the hares with a limit of their own that the equations do not know."""
     time = np.arange(0, 40, 0.2)

@@ -497,7 +497,7 @@ class _Search:
             return "its refit does not converge"
         if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
             return "the free run over held-out data does not improve"
-        than_chosen = "less than what was chosen" if found else "and leaves what is no noise: it may be chance"
+        than_chosen = "less than what was chosen" if found else "too little of what is missing"
         return f"gains {gain:.4g}, {than_chosen}"
 
 

@@ -65,12 +65,12 @@ def _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
 
 @njit(
     types.UniTuple(types.int64, 2)(
-        RHS_TYPE, _v, _v, types.int64[::1], _v, types.int64, _v, types.float64[:, :, ::1], types.boolean, _v, _f,
+        RHS_TYPE, _v, _v, types.int64[::1], _v, types.int64, _v, types.float64[:, :, ::1], _v, _f,
         types.int64, _m, types.float64[:, :, ::1],
     ),
     cache=True, error_model="numpy", nogil=True,
 )  # fmt: skip
-def integrate(rhs, z0, p, columns, span, n, knots, pieces, stop_at_knots, size, tolerance, max_steps, samples, out):
+def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
     """Fill out (groups, m, len(z0)) with the solution at samples (groups, m), each group increasing.
 
     z0 : (n (1 + k),) states and their derivatives by k quantities at span[0]
@@ -100,10 +100,10 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, stop_at_knots, size, 
         remaining = end - t
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
-        if stop_at_knots:
-            i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
-            if i < len(knots) and t + step > knots[i]:
-                step, last = knots[i] - t, False
+        # inputs are smooth between their knots only: a step across one would be rejected more often than not
+        i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
+        if i < len(knots) and t + step > knots[i]:
+            step, last = knots[i] - t, False
         attempts += 1
         if attempts > max_steps or step < 1e-15 * max(abs(t), 1e-3):
             if last and remaining <= 0:
@@ -122,7 +122,7 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, stop_at_knots, size, 
                 total += _B[j] * K[j, i]
             new[i] = z[i] + step * total
         # at the end of a step that stops at a knot the inputs of the piece before it hold
-        at = t + step * (1.0 - 1e-13) if stop_at_knots else t + step
+        at = t + step * (1.0 - 1e-13) if len(knots) else t + step
         _slope(rhs, at, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
         worst = 0.0
         for c in range(k + 1):
@@ -160,7 +160,11 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, stop_at_knots, size, 
         inside = False
         for g in range(groups):
             if pointer[g] < m and (samples[g, pointer[g]] <= t + step or last):
-                inside = True
+                if abs(samples[g, pointer[g]] - t - step) > 1e-12 * step:
+                    inside = True
+                else:  # the step ends at the sample, as at every one with an input's knot
+                    out[g, pointer[g]] = new
+                    pointer[g] += 1
         if inside:
             for e in range(3):
                 for i in range(N):
@@ -195,7 +199,7 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, stop_at_knots, size, 
         steps += 1
         t += step
         z[:] = new
-        if stop_at_knots:
+        if len(knots):
             _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
         else:
             K[0] = K[12]

@@ -153,7 +153,6 @@ class Samples:
     sigma: Array  # (n, w)
     knots: Array  # (m,) [s] of the inputs
     pieces: Array  # (c, 4, m - 1)
-    stop_at_knots: bool
     constants: Mapping[str, float]
     start: Mapping[str, float]
     known: Mapping[str, tuple[float, float]]
@@ -242,8 +241,8 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
     known_states = {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
     knots, pieces = _inputs(equations, run, name, time - time[0])
     return Samples(
-        name, 0, time - time[0], data, sigma, knots, pieces, run.hold != "smooth", dict(run.constants),
-        dict(run.start), known_states, {**run.groups, "run": name}, run.noise, run.fit_until,
+        name, 0, time - time[0], data, sigma, knots, pieces, dict(run.constants), dict(run.start), known_states,
+        {**run.groups, "run": name}, run.noise, run.fit_until,
     )  # fmt: skip
 
 
@@ -251,7 +250,7 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
     from scipy.interpolate import CubicSpline
 
     if not equations.inputs:
-        return np.array([0.0, 1.0]), np.zeros((0, 4, 1))
+        return np.zeros(0), np.zeros((0, 4, 0))
     columns = []
     for u in equations.inputs:
         if u not in run.inputs:

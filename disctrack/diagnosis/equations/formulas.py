@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import sympy
+from numba.core.types import CompileResultWAP
 
 from calibration.arrays import Array
 from calibration.compiled import njit
@@ -182,4 +183,6 @@ def _compiled_source(source: str, name: str) -> Any:
     """The same equations are compiled once, however many runs are asked about."""
     scope = {k: getattr(math, k) for k in dir(math) if not k.startswith("_")}
     exec(source, scope)
-    return njit(kernel.RHS, error_model="numpy", nogil=True)(scope[name])
+    compiled = njit(kernel.RHS, error_model="numpy", nogil=True)(scope[name])
+    # its address, once: asked for at every call, it takes as long as a short stretch's motion
+    return CompileResultWAP(compiled.get_compile_result(kernel.RHS))

@@ -25,7 +25,7 @@ from disctrack.diagnosis.equations.noise import (
     step_of,
     with_noise,
 )
-from disctrack.diagnosis.equations.start import LOST, guessed, led, misfit, turn
+from disctrack.diagnosis.equations.start import LOST, Start, guessed, led, misfit, turn
 from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part, fitted_rows
 from disctrack.errors import AnalysisError
 
@@ -83,6 +83,8 @@ def ask(
             system, notes = system.with_(held=held), [*notes, remark]
             start = led(system, declared)
     values = declared if start is None else start.values
+    if start is not None and start.followed < min(turn(s) for s in system.stretches):
+        notes += _helpful(system, declared, start)
     if start is None or not start.whole:
         length = stretch or (SAFE * start.followed if start else np.inf)
         system, values, note = _in_stretches(system, values, length)
@@ -105,6 +107,15 @@ def ask(
         diagnosis, shapes = refine_shapes(judged, diagnosis)
         notes += list(shapes)
     return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory)
+
+
+def _helpful(system: EquationSystem, values: Mapping[str, float], start: Start) -> list[str]:
+    """With which of the terms would a model follow the data that loses them within a turn? A remark."""
+    names = [c.name for c in system.candidates if led(system.with_(promoted=(c.name,)), dict(values)).whole]
+    text = f"the model loses the data after {start.followed:.2g} s, less than a turn: sizes of terms mean little"
+    if names:
+        text += f"; with {' or '.join(names)} it follows them to their end: put it into the equations, and ask again"
+    return [text]
 
 
 def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
@@ -266,9 +277,7 @@ def _with_memory(
         block = max(2 * shortest_turn, 5 * lasting)
         reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
         spread = replace(_certain(system, diagnosis, block), reason=reason)
-        text = (
-            f"sigmas are those that what is left brings about from one {block:.2g} s to the next, not the noise alone"
-        )
+        text = f"sigmas are those of what is left ({block:.2g} s taken as one error), not of the noise alone"
         return spread, None, text
     remembering = Remembering(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values)

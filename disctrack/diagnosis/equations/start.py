@@ -23,6 +23,7 @@ from disctrack.diagnosis.equations.system import EquationSystem, first_part
 GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
 LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
 _LEASH = 0.3  # relative change of a parameter from window to window, of which none is surprised
+_FAR = 1.0  # relative change of a parameter from its declared value, which is said to be right to some 30 %
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
 _INSTANTS = 24  # at which the sizes of the states are looked at
 
@@ -156,7 +157,24 @@ def led(system: EquationSystem, values: dict[str, float], begin: float | None = 
         # what turns and drifts, or is chaotic, has no half turn: begin with less
         window = max(0.25 * window, shortest)
         found = _led(system, values, window, duration)
-    return found
+    return _not_astray(system, values, found)
+
+
+def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start) -> Start:
+    """What growing windows lead to, or what all data at once do where that describes them better.
+
+    The first part of a motion may not tell parameters apart that the whole does (a motor that runs up), and a model
+    that lacks something then takes them far away.
+    """
+    parameters = [q for q in system.base if not q.name.startswith("state.")]
+    shift = [abs(found.values.get(q.name, q.null) - q.null) / max(abs(q.null), q.scale) for q in parameters]
+    if found.whole and max(shift, default=0.0) < _FAR:
+        return found
+    tied = tuple(replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale))) for q in parameters)
+    states = tuple(q for q in system.base if q.name.startswith("state."))
+    values = declared | fit(system, (*states, *tied), declared, max_iterations=30).values
+    ends = [misfit(system, v) for v in (values, found.values)]
+    return Start(values, found.duration, found.duration) if ends[0] < min(ends[1], LOST) else found
 
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:

@@ -185,8 +185,7 @@ class EquationSystem:
         out = np.empty((len(times), m, n * (1 + k)))
         with np.errstate(all="ignore"):
             done, _ = kernel.integrate(
-                f.rhs, z0, p, columns, span, n, s.knots, s.pieces, s.stop_at_knots, self.sizes, TOLERANCE, MAX_STEPS,
-                times, out,
+                f.rhs, z0, p, columns, span, n, s.knots, s.pieces, self.sizes, TOLERANCE, MAX_STEPS, times, out,
             )  # fmt: skip
         if done != kernel.DONE:
             return None
