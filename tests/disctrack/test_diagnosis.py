@@ -1,5 +1,7 @@
 """Effects hidden in measured trajectories are found, named and sized; nothing is found where nothing is hidden."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,17 @@ def test_nothing_is_found_where_nothing_is_hidden():
     assert abs(result.before.reduced_chi_square - 1) < 0.05
     k_m = result.diagnosis.after
     assert abs(k_m.values["km.k_m"] - 0.381e-7) < 4 * k_m.sigma("km.k_m")
+
+
+def test_a_thickness_within_its_tolerance_is_no_effect():
+    """0.03 mm off in height, 2 sigma of what a caliper may err by and 20 of a micrometer's."""
+    trajectory = measured({"contact_height.h_error": 3e-5}, seed=8, n=200, declared_rate=500.0)
+    assert diagnose_trajectory(trajectory, separate=False).diagnosis.verdict == "found"
+    disc = replace(trajectory.disc, thickness_tolerance=3e-5)
+    result = diagnose_trajectory(replace(trajectory, disc=disc), separate=False)
+    assert result.diagnosis.verdict == "nothing missing"
+    after = result.diagnosis.after
+    assert abs(after.values["contact_height.h_error"] - 3e-5) < 4 * after.sigma("contact_height.h_error") < 3e-5
 
 
 def test_two_effects_are_found_together():

@@ -98,6 +98,35 @@ def test_score_of_a_linear_effect_equals_its_refit(rng):
     assert best.sigma[0] == pytest.approx(refit.sigma("drift"), rel=1e-2)
 
 
+def with_tolerance(system, sigma):
+    """The oscillator whose clock may drift by so much, as was declared."""
+    (drift,) = system.candidates[1].quantities
+    system.base = (*system.base, replace(drift, prior_sigma=sigma))
+    return system
+
+
+def test_score_of_an_effect_beyond_its_tolerance_equals_its_refit(rng):
+    system = with_tolerance(oscillator(rng, {"drift": 0.02}), 0.005)
+    base = fit(system, system.base, START)
+    scores = {s.candidate.name: s for s in score_all(Linearisation(system, base, system.candidates), system.candidates)}
+    free = fit(system, (*system.base[:3], *system.candidates[1].quantities), base.values)
+    assert base.cost - free.cost == pytest.approx((0.02 / 0.005) ** 2, rel=0.1)  # known to 0.0003
+    assert scores["drift"].gain == pytest.approx(base.cost - free.cost, rel=1e-2)
+    assert scores["drift"].values[0] == pytest.approx(free.values["drift"], rel=1e-2)
+    # what it is beyond the tolerance is no better known than that
+    assert scores["drift"].sigma[0] == pytest.approx(np.hypot(0.005, free.sigma("drift")), rel=1e-2)
+    assert scores["twin"].gain == pytest.approx(scores["drift"].gain, rel=1e-6)
+
+
+@pytest.mark.parametrize(("tolerance", "verdict"), [(0.01, "nothing missing"), (1e-4, "found")])
+def test_an_effect_within_its_tolerance_is_not_claimed(rng, tolerance, verdict):
+    answer = diagnose(with_tolerance(oscillator(rng, {"drift": 0.01}), tolerance), START)
+    assert answer.verdict == verdict
+    if answer.found:  # freed, it is as well known as if nothing had been declared
+        assert answer.after.sigma("drift") < 1e-3
+        assert answer.after.values["drift"] == pytest.approx(0.01, abs=4e-3)
+
+
 def test_twins_enclose_no_angle_and_strangers_a_right_one(rng):
     system = oscillator(rng)
     linear = Linearisation(system, fit(system, system.base, START), system.candidates)

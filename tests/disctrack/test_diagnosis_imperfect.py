@@ -14,7 +14,9 @@ from disctrack.diagnosis.disc.left_over import LeftOver
 from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.disc.stretch import at_rest
 from disctrack.diagnosis.disc.systematic import find_systematic, noise_over_stated, with_noise_of_frames
-from disctrack.diagnosis.engine.memory import long_run_variance
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.engine.memory import inflation, long_run_variance
+from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.trials.imperfect import ORDINARY, Laboratory
 from disctrack.scene.description import CameraFault, Faults
 from tests.oracles.measured_disc import Unseen, measured
@@ -102,6 +104,40 @@ def test_memory_enlarges_the_variance_of_a_sum_as_it_should(rng):
     assert_allclose(np.mean(ratios), 9.0, rtol=0.2)  # Bartlett's weights lose a tenth
     white = rng.standard_normal(n)
     assert_allclose(long_run_variance(white)[0] / np.mean(white**2), 1.0, rtol=0.15)
+
+
+class Line:
+    """Rows of 24 numbers that are a multiple of a smooth course, and noise."""
+
+    candidates, base = (), (Quantity("a", "1", 0.1),)
+
+    def __init__(self, noise):
+        n, w = noise.shape
+        self.time, self.noise, self.weights = np.arange(n, dtype=float), noise, np.full(n, float(w))
+        self.course = 0.01 * np.sin(0.02 * np.arange(n))[:, None] * np.cos(np.arange(w))
+
+    def linearise(self, values, names):
+        return self.noise - values["a"] * self.course, self.course[..., None][..., : len(names)]
+
+
+def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
+    """Images of a dot two pixels apart share pixels of uneven gain: a correlation that one series hides."""
+
+    def pulls(share):
+        found = []
+        for _ in range(200):
+            white = rng.standard_normal((251, 24))
+            line = Line((white[1:] + share * white[:-1]) / np.sqrt(1 + share**2))
+            fitted = fit(line, line.base, {})
+            factor = inflation(line, fitted)[0]
+            found.append((fitted.values["a"] / fitted.sigma("a"), fitted.values["a"] / fitted.sigma("a") / factor))
+        return np.std(found, axis=0)
+
+    white, stated = pulls(0.21)  # correlation 0.2: a smooth sum has 1 + 2 * 0.2 of the variance
+    # of 200 pulls the scatter is known to 5 %
+    assert_allclose([white, stated], [np.sqrt(1.4), 1.0], rtol=0.18)
+    assert white > 1.1
+    assert_allclose(pulls(0.0), 1.0, rtol=0.18)
 
 
 def test_what_is_left_is_the_motions_only_where_the_poses_hold_it():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence, Set
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,12 +29,15 @@ from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
 from disctrack.track.pose import whitening
+from disctrack.track.table_contact import ASSUMED_THICKNESS as MICROMETER
+from disctrack.track.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
+MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 
 
@@ -113,7 +116,21 @@ class DiscSystem:
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
-        self.base = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults, *nuisances)
+        fitted = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults)
+        self.base = (*fitted, *self._sizes({q.name for q in fitted}), *nuisances)
+
+    def _sizes(self, fitted: Set[str]) -> Iterator[Quantity]:
+        """What the disc's sizes may be off by, as priors: an effect is what goes beyond. Not those fitted anyway."""
+        radius = MICROMETER if self.disc.radius_tolerance is None else self.disc.radius_tolerance
+        half = 0.5 * thickness_tolerance(self.disc)
+        sizes = {"contact_radius.r_error": radius, "contact_height.h_error": half, "pattern_height.offset": half}
+        of_motion = motion_candidates(self.model, ("contact_radius", "contact_height"))
+        of_paper = (fault.candidate() for fault in self.faults if fault.name == "pattern_height")
+        for candidate in (*of_motion, *of_paper):
+            for q in candidate.quantities:
+                sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]
+                if q.name not in fitted and sigma > 0:
+                    yield replace(q, prior_sigma=sigma, lower=max(q.lower, -most), upper=min(q.upper, most))
 
     def _nuisances(self) -> tuple[tuple[Quantity, ...], Array]:
         """Errors common to all frames, with priors, and their whitened columns (n, 4 m, k).

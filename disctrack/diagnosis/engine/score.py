@@ -15,7 +15,7 @@ import numpy as np
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, compress, prior_rows, solve_bounded
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
-from disctrack.diagnosis.engine.system import Candidate, System
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System
 
 INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
 
@@ -35,30 +35,33 @@ class Linearisation:
     """All derivatives at one fit, compressed: residual and columns by name, priors included."""
 
     def __init__(self, system: System, fit: Fit, candidates: Sequence[Candidate]) -> None:
-        """Linearise at the fit for its own quantities and for those of all candidates."""
-        known = set(fit.names)
-        new = {q.name: q for c in candidates for q in c.quantities if q.name not in known}
+        """Linearise at the fit for its own quantities and for those of all candidates.
+
+        A candidate may free what the fit holds within a prior: its column then stands beside that of the fit.
+        """
+        known = {q.name: q for q in fit.quantities}
+        of_candidates = {q.name: q for c in candidates for q in c.quantities}
+        new = {n: q for n, q in of_candidates.items() if n not in known or _frees(q, known[n])}
         common = projection(system, fit.quantities, fit.values)
         self.fitted = tuple(q for q in fit.quantities if not is_linear(q))
-        self.quantities = {q.name: q for q in self.fitted} | new
-        self.values = {name: q.null for name, q in new.items()} | fit.values
-        self.values |= dict(zip(common.names, common.null.tolist(), strict=True))
-        names = list(self.quantities)
-        residual, derivative = system.linearise(self.values, names)
+        values = {name: q.null for name, q in new.items()} | fit.values
+        values |= dict(zip(common.names, common.null.tolist(), strict=True))
+        names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
+        residual, derivative = system.linearise(values, names)
         right, matrix = compress(residual, derivative, common)
-        prior, prior_matrix = prior_rows(list(self.quantities.values()), self.values)
-        self.right, self.matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
-        self.column = {name: i for i, name in enumerate(names)}
+        everything = [*self.fitted, *new.values()]
+        prior, prior_matrix = prior_rows(everything, values)
+        self.right = np.concatenate([right, prior])
+        self.matrix = np.vstack([matrix[:, [names.index(q.name) for q in everything]], prior_matrix])
+        self.column = {q.name: i for i, q in enumerate(everything)}  # of what is there twice, the free one
+        self.quantities = {q.name: q for q in everything}
+        self.values = values | {name: q.null for name, q in new.items()}
+        self._at = np.array([*(values[q.name] for q in self.fitted), *(q.null for q in new.values())])
         self._free = self._free_columns()
         self._basis = np.linalg.qr(_normalised(self.matrix[:, self._free]))[0]
 
     def _free_columns(self) -> list[int]:
-        free = []
-        for q in self.fitted:
-            at_bound = not q.lower < self.values[q.name] < q.upper
-            if not at_bound:
-                free.append(self.column[q.name])
-        return free
+        return [i for i, q in enumerate(self.fitted) if q.lower < self._at[i] < q.upper]
 
     def columns(self, names: Sequence[str]) -> Array:
         """Columns (m, k) as they are."""
@@ -72,15 +75,19 @@ class Linearisation:
 
     def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
         """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
-        fitted = [q.name for q in self.fitted if q.name not in names]
-        everything = [*fitted, *names]
-        A = self.columns(everything)
-        x0 = np.array([self.values[n] for n in everything])
-        lower = np.array([self.quantities[n].lower for n in everything]) - x0
-        upper = np.array([self.quantities[n].upper for n in everything]) - x0
+        mine = [self.column[n] for n in names]
+        fitted = [i for i in range(len(self.fitted)) if i not in mine]
+        A, x0 = self.matrix[:, [*fitted, *mine]], self._at[[*fitted, *mine]]
+        quantities = [*(self.fitted[i] for i in fitted), *(self.quantities[n] for n in names)]
+        lower = np.array([q.lower for q in quantities]) - x0
+        upper = np.array([q.upper for q in quantities]) - x0
         step = solve_bounded(self.right, A, lower, upper)
         gain = self.right @ self.right - np.sum((self.right - A @ step) ** 2)
         return float(max(gain, 0.0)), (x0 + step)[len(fitted) :]
+
+
+def _frees(q: Quantity, fitted: Quantity) -> bool:
+    return not np.isfinite(q.prior_sigma) and bool(np.isfinite(fitted.prior_sigma))
 
 
 def _normalised(columns: Array) -> Array:

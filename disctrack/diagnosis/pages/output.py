@@ -130,7 +130,7 @@ def tried_json(tried: Tried) -> dict[str, Any]:
 
 
 def _declared(fit: Fit) -> dict[str, Any]:
-    laws = [q for q in fit.quantities if q.name.partition(".")[0] not in ("state", "rig") and "dot_" not in q.name]
+    laws = [q for q in fit.quantities if not q.name.startswith("state.") and not np.isfinite(q.prior_sigma)]
     return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
 
 

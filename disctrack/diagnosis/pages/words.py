@@ -61,7 +61,7 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
 
 def together(found: Found, fit: Fit) -> tuple[Correlated, ...]:
     """Numbers of the effect that move together with each other or with those of a declared law."""
-    laws = [q.name for q in fit.quantities if not q.linear and not q.name.startswith("state.")]
+    laws = [q.name for q in fit.quantities if not (np.isfinite(q.prior_sigma) or q.name.startswith("state."))]
     return correlated(fit, [q.name for q in found.candidate.quantities if q.name != SLIP], laws)
 
 
