@@ -6,7 +6,9 @@ Brown's with OpenCV's coefficients in OpenCV's order, so that numbers can be exc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -239,6 +241,13 @@ class StereoRig(Brief):
             R_left_world=rotation_from_vector(delta[24:27]) @ self.R_left_world,
             t_left_world=self.t_left_world + delta[27:30],
         )
+
+
+def placed_at(poses: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
+    """Fields of a StereoRig whose cameras, left and right, stand so: R (3, 3), t (3,) from world to camera axes."""
+    (R_left, t_left), (R_right, t_right) = poses
+    R = R_right @ R_left.T
+    return {"R_right_left": R, "t_right_left": t_right - R @ t_left, "R_left_world": R_left, "t_left_world": t_left}
 
 
 def rotation_from_vector(v: Array) -> Array:

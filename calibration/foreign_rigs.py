@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from calibration.arrays import Array
-from calibration.camera import Camera, StereoRig
+from calibration.camera import Camera, StereoRig, placed_at
 from calibration.errors import RigFileError
 
 MRCAL_MODELS = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5}
@@ -127,9 +127,8 @@ def import_mrcal(
 
 
 def _rig(parts: list[tuple[Camera, Array, Array]], world_is_table: bool) -> StereoRig:
-    (left, R_left, t_left), (right, R_right, t_right) = parts
-    R = R_right @ R_left.T
-    return StereoRig(left, right, R, t_right - R @ t_left, R_left, t_left, world_is_table=world_is_table)
+    (left, *_), (right, *_) = parts
+    return StereoRig(left, right, **placed_at([(R, t) for _, R, t in parts]), world_is_table=world_is_table)
 
 
 def _camera(K: Array, D: Array, size: Array, where: str) -> Camera:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from disctrack.analyse.power_laws import (
 )
 from disctrack.analyse.propagation import RATES, DerivedSeries, propagate, rates
 from disctrack.errors import AnalysisError
-from disctrack.trajectory import Trajectory
+from disctrack.trajectory import Trajectory, part
 
 WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, for the exponents' dependence
 CIRCLE_DURATION = 0.6  # [s], as for the paper's figure 9
@@ -120,11 +119,7 @@ def _tracked_part(trajectory: Trajectory) -> Trajectory:
     n, rows = len(trajectory), np.flatnonzero(trajectory.looked_for)
     if rows.size in (0, n):
         return trajectory
-    part = slice(int(rows[0]), int(rows[-1]) + 1)
-    per_frame: dict[str, Any] = {
-        name: value[part] for name, value in vars(trajectory).items() if isinstance(value, np.ndarray)
-    }
-    return replace(trajectory, **per_frame)
+    return part(trajectory, slice(int(rows[0]), int(rows[-1]) + 1))
 
 
 def _end_of_rolling(motion: MeasuredMotion) -> tuple[float, float]:

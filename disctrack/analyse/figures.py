@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from calibration.arrays import Array
 from disctrack.analyse.analysis import Analysis
-from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
+from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.disc import MA_2014
 from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels
@@ -24,25 +24,12 @@ MIN_INSET_SHARE = 2.5  # the inset is drawn when the recording is this many time
 def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
     """Every figure that this recording has something to show in."""
     makers: tuple[Callable[[Analysis], Drawn | None], ...] = (
-        nutation_angle,
-        centre_path,
-        centre_and_contact_path,
-        nutation_count,
-        slip_speed,
-        contact_locus,
-        precession_rate,
-        axial_rates,
-        adiabatic_level,
-        energy_against_adiabatic,
-        energy_parts,
-        contact_forces,
-        energy_power_law,
-        nutation_power_law,
-        precession_power_law,
-        exponents_against_window,
-        pose_quality,
-    )
-    return tuple(drawn for drawn in (make(analysis) for make in makers) if drawn is not None)
+        nutation_angle, centre_path, centre_and_contact_path, nutation_count, slip_speed, contact_locus,
+        precession_rate, axial_rates, adiabatic_level, energy_against_adiabatic, energy_parts, contact_forces,
+    )  # fmt: skip
+    drawn = [make(analysis) for make in makers]
+    drawn += [*power_laws(analysis), exponents_against_window(analysis), pose_quality(analysis)]
+    return tuple(figure for figure in drawn if figure is not None)
 
 
 def _axes(width: float = 7.2, height: float = 3.6) -> tuple[Figure, Axes]:
@@ -329,7 +316,7 @@ def contact_forces(analysis: Analysis) -> Drawn | None:
 
 def _power_law(
     analysis: Analysis, series_value: Array, exponent: Exponent, which: int, of_theta: float, label: str
-) -> tuple[Figure, Axes] | None:
+) -> Figure | None:
     """Ln-ln plot of a quantity against the time left with the fit and the models' slopes."""
     laws, time = analysis.scaling.laws, analysis.motion.time
     left = laws.t_f - time
@@ -357,40 +344,28 @@ def _power_law(
     axes.invert_xaxis()
     axes.set(xlabel="ln (t_f - t), t in s", ylabel=label)
     axes.legend(frameon=False, fontsize=8)
-    return figure, axes
+    return figure
 
 
-def _law_caption(exponent: Exponent, laws: PowerLaws) -> str:
-    return (
-        f"Exponent {exponent.value:.4f} ± {exponent.sigma:.4f} (95 %: {exponent.low:.4f} to {exponent.high:.4f}) from "
-        f"{laws.window[0]:.3f} to {laws.window[1]:.3f} s before t_f = {laws.t_f:.5f} ± {laws.t_f_sigma:.5f} s. Grey: "
-        + "; ".join(name for name, _ in MODEL_EXPONENTS)
-        + "."
-    )
-
-
-def energy_power_law(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 14."""
+def power_laws(analysis: Analysis) -> Iterator[Drawn]:
+    """Paper's figures 14 to 16: energy, nutation, precession rate."""
     laws = analysis.scaling.laws
-    drawn = _power_law(analysis, analysis.series("total").value, laws.n_energy, 2, 1.0, "ln E, E in J")
-    caption = _law_caption(laws.n_energy, laws)
-    return Drawn("14_energy_law", "Power law of the energy", caption, drawn[0]) if drawn else None
-
-
-def nutation_power_law(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 15."""
-    laws = analysis.scaling.laws
-    drawn = _power_law(analysis, analysis.motion.euler[:, 1], laws.n_theta, 0, 1.0, "ln θ, θ in rad")
-    caption = _law_caption(laws.n_theta, laws)
-    return Drawn("15_nutation_law", "Power law of the nutation", caption, drawn[0]) if drawn else None
-
-
-def precession_power_law(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 16."""
-    laws = analysis.scaling.laws
-    drawn = _power_law(analysis, analysis.series("psidot").value, laws.n_psidot, 1, -0.5, "ln ψ̇, ψ̇ in rad/s")
-    caption = _law_caption(laws.n_psidot, laws)
-    return Drawn("16_precession_law", "Power law of the precession rate", caption, drawn[0]) if drawn else None
+    for name, title, value, exponent, which, of_theta, label in (
+        ("14_energy_law", "the energy", analysis.series("total").value, laws.n_energy, 2, 1.0, "ln E, E in J"),
+        ("15_nutation_law", "the nutation", analysis.motion.euler[:, 1], laws.n_theta, 0, 1.0, "ln θ, θ in rad"),
+        (
+            "16_precession_law", "the precession rate", analysis.series("psidot").value, laws.n_psidot, 1, -0.5,
+            "ln ψ̇, ψ̇ in rad/s",
+        ),
+    ):  # fmt: skip
+        drawn = _power_law(analysis, value, exponent, which, of_theta, label)
+        if drawn:
+            caption = (
+                f"Exponent {exponent.value:.4f} ± {exponent.sigma:.4f} (95 %: {exponent.low:.4f} to "
+                f"{exponent.high:.4f}) from {laws.window[0]:.3f} to {laws.window[1]:.3f} s before t_f = {laws.t_f:.5f} "
+                f"± {laws.t_f_sigma:.5f} s. Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
+            )
+            yield Drawn(name, f"Power law of {title}", caption, drawn)
 
 
 def exponents_against_window(analysis: Analysis) -> Drawn | None:

@@ -129,18 +129,13 @@ def _stacks(file: Path) -> list[str]:
     """Paths of the data sets in an HDF5 file that can be frames: (n, height, width) of 8 or 16 bit."""
     import h5py
 
-    found: list[str] = []
-
-    def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim == 3 and item.dtype in ("u1", "u2"):
-            found.append(f"/{name}")
+    from disctrack.readers.hdf5 import stacks_of
 
     try:
         with h5py.File(file, "r") as opened:
-            opened.visititems(visit)
+            return sorted((stack.name for stack in stacks_of(opened)), key=natural_key)
     except OSError:  # not HDF5, or damaged: no frames to name
         return []
-    return sorted(found, key=natural_key)
 
 
 def _difference(tokens: list[str], other: Sequence, first: Sequence) -> tuple[str, str] | None:

@@ -62,7 +62,7 @@ def _named(handle: Any, member: str, file: Path) -> Any:
     found = "nothing" if item is None else "a group"
     if isinstance(item, h5py.Dataset):
         found = f"a data set {item.shape} of {item.dtype}"
-    stacks = ", ".join(stack.name for stack in _stacks(handle))
+    stacks = ", ".join(stack.name for stack in stacks_of(handle))
     raise RecordingError(
         f"{file}:{member} is {found}; expected frames (n, height, width) of 8 or 16 bit without sign. "
         + (f"There are {stacks}." if stacks else "The file holds none.")
@@ -70,7 +70,7 @@ def _named(handle: Any, member: str, file: Path) -> Any:
 
 
 def _only_stack(handle: Any, file: Path) -> Any:
-    stacks = _stacks(handle)
+    stacks = stacks_of(handle)
     if len(stacks) == 1:
         return stacks[0]
     if not stacks:
@@ -79,7 +79,7 @@ def _only_stack(handle: Any, file: Path) -> Any:
     raise RecordingError(f"{file}: holds several stacks of frames: {names}. Name one: {file.name}:{stacks[0].name}")
 
 
-def _stacks(handle: Any) -> list[Any]:
+def stacks_of(handle: Any) -> list[Any]:
     """Data sets that may be frames; links to other files are not followed."""
     found: list[Any] = []
     seen = 0

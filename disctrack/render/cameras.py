@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from calibration.arrays import Array
-from calibration.camera import Camera, StereoRig
+from calibration.camera import Camera, StereoRig, placed_at
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
 from disctrack.render.rays import View, image_of
@@ -18,16 +19,11 @@ def rig_of(scene: Scene) -> StereoRig:
     """The rig as it was while it was calibrated, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
     left, right = (_camera(scene, index, rng) for index in (0, 1))
-    R_right_left = right.R_camera_world @ left.R_camera_world.T
-    return StereoRig(
-        left=left.camera,
-        right=right.camera,
-        R_right_left=R_right_left,
-        t_right_left=right.t_camera_world - R_right_left @ left.t_camera_world,
-        R_left_world=left.R_camera_world,
-        t_left_world=left.t_camera_world,
-        world_is_table=True,
-    )
+    return StereoRig(left.camera, right.camera, **_places(left, right), world_is_table=True)
+
+
+def _places(*views: View) -> dict[str, Any]:
+    return placed_at([(view.R_camera_world, view.t_camera_world) for view in views])
 
 
 def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
@@ -83,16 +79,7 @@ def rig_after_faults(rig: StereoRig, scene: Scene) -> StereoRig:
         moved = turn @ (t + R @ lift_table - np.array(fault.translation_mm) * 1e-3)
         views.append(View(_changed_lens(camera, fault), turn @ R @ turn_table, moved))
     left, right = views
-    R_right_left = right.R_camera_world @ left.R_camera_world.T
-    return replace(
-        rig,
-        left=left.camera,
-        right=right.camera,
-        R_right_left=R_right_left,
-        t_right_left=right.t_camera_world - R_right_left @ left.t_camera_world,
-        R_left_world=left.R_camera_world,
-        t_left_world=left.t_camera_world,
-    )
+    return replace(rig, left=left.camera, right=right.camera, **_places(left, right))
 
 
 def _changed_lens(camera: Camera, fault: CameraFault) -> Camera:

@@ -28,7 +28,7 @@ from disctrack.render import Truth, rig_of, write_recording
 from disctrack.scene.description import MotionSettings, RollingMotion, Scene
 from disctrack.scene.motion import SceneMotion, motion_of
 from disctrack.track.tracking import Tracking, TrackingSettings, track
-from disctrack.trajectory import Trajectory
+from disctrack.trajectory import Trajectory, part
 from disctrack.validate.comparison import PoseErrors, compare
 from disctrack.validate.poses import cameras_in_sight, static_poses
 
@@ -215,9 +215,4 @@ def locate(images: Image, rig: StereoRig, disc: Disc, frame_rate: float, *, apar
 
 def every(trajectory: Trajectory, step: int) -> Trajectory:
     """The trajectory's frames 0, step, 2 step, ..."""
-    parts = {
-        name: getattr(trajectory, name)[::step]
-        for name in type(trajectory).__dataclass_fields__
-        if isinstance(getattr(trajectory, name), np.ndarray)
-    }
-    return replace(trajectory, **parts)
+    return part(trajectory, slice(None, None, step))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calibration.arrays import Array
-from calibration.camera import StereoRig
+from calibration.camera import StereoRig, placed_at
 from disctrack.diagnosis.disc.faults import MeasurementSetup, faults_of, setup_of
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import DiscSystem
@@ -61,13 +61,8 @@ def rig_as_it_is(rig: StereoRig, setup: MeasurementSetup) -> StereoRig:
     for (R, t), change in zip(rig.camera_poses(), setup.cameras, strict=True):
         turn = rotation_from_vector(change.rotation).T
         poses.append((turn @ R, turn @ (t - change.translation)))
-    (R_left, t_left), (R_right, t_right) = poses
-    R = R_right @ R_left.T
     left, right = (change.lens(camera) for camera, change in zip(rig.cameras, setup.cameras, strict=True))
-    return replace(
-        rig, left=left, right=right, R_right_left=R, t_right_left=t_right - R @ t_left,
-        R_left_world=R_left, t_left_world=t_left,
-    )  # fmt: skip
+    return replace(rig, left=left, right=right, **placed_at(poses))
 
 
 def in_step(trajectory: Trajectory, delay: float) -> Array:
