@@ -106,3 +106,20 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
     assert result.after.reduced_chi_square < 1.05
     assert abs(fit.values["learned.angle_0"] - 1.0) < 3 * fit.sigma("learned.angle_0")
     assert abs(-fit.values["learned.c_0"] - 3e-4 * 0.15) < 3 * fit.sigma("learned.c_0") + 0.01 * 4.5e-5
+
+
+def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction():
+    """Known effects and a force that turns with the face come near it, and leave a memory of p = 1e-80."""
+    growing = np.array([1.2e-3, -3.8e-3, 0.0])  # [N/s]
+
+    def law(disc, now):
+        return newton_euler.ZERO, newton_euler.ZERO, disc.t * growing
+
+    result = diagnose_trajectory(recording(law, 11.0, 0.6, 0.7), separate=False)
+    assert result.learned is not None
+    fit = result.learned.fit
+    assert result.after.reduced_chi_square < 1.05
+    half = 0.5 * (result.system.time[-1] - result.system.time[0])
+    for i, true in enumerate(half * growing[:2]):  # the middle's force has the numbers c_0_0 and c_0_1
+        name = f"learned.c_0_{2 + i}"
+        assert abs(fit.values[name] - true) < 3 * fit.sigma(name)

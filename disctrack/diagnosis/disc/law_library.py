@@ -17,6 +17,7 @@ from calibration.arrays import Array
 Parts = Mapping[str, str]  # component of the wrench -> formula
 
 HIGHEST_HARMONIC = 4  # of the angles
+DRIFT_DEGREE = 4  # of the polynomials in time
 FASTEST_HUM = 150.0  # [Hz]
 MOMENTS = ("n", "m", "z")
 
@@ -86,6 +87,7 @@ def families(q: Array, time: Array, frame_rate: float) -> Iterator[Family]:
     yield from _magnets()
     for words, formula in SCALARS[:13]:
         yield Family(f"a force X_z by {words}", ({"X_z": formula},), kind="lift")
+    yield from _drifts(time)
     yield from _gates(q, time)
     yield from _bumps()
     yield from _hums(time, frame_rate)
@@ -122,6 +124,18 @@ def _places() -> Iterator[Family]:
     body = ("cos(psi + phi)", "sin(psi + phi)")
     turning = tuple(f(g) for f in (along_x, along_y) for g in body)
     yield Family("a force that turns with the face", turning, kind="force")
+
+
+def _drifts(time: Array) -> Iterator[Family]:
+    """Forces of the room that change slowly: a draught, a table that settles, a magnet that is moved away."""
+    middle, half = 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
+    u = f"((time - {middle!r}) / {half!r})"
+    powers = [" * ".join([u] * n) or "1.0" for n in range(DRIFT_DEGREE + 1)]
+    for n in range(1, DRIFT_DEGREE + 1):
+        level = tuple(along(f) for f in powers[: n + 1] for along in (along_x, along_y))
+        yield Family(f"a level force that changes with time, degree {n}", level, kind="drift")
+        upright = tuple({"X_z": f} for f in powers[: n + 1])
+        yield Family(f"a vertical force that changes with time, degree {n}", upright, kind="drift Z")
 
 
 def _magnets() -> Iterator[Family]:
