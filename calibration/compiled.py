@@ -26,8 +26,9 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-from numba import cfunc
+from numba.core import sigutils
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.ccallback import CFunc
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
@@ -56,6 +57,15 @@ def njit(function: Any = None, *, cache: bool = False, **rules: Any) -> Any:
         return dispatcher
 
     return compiled(function) if inspect.isfunction(function) else compiled
+
+
+def cfunc(function: Callable[..., Any], signature: Any, *, cache: bool = True, **rules: Any) -> CFunc:
+    """As `numba.cfunc`: a C function of these types; with cache=True as with `njit`. Keep it: it owns its address."""
+    callback: Any = CFunc(function, sigutils.normalize_signature(signature), {}, rules)
+    if cache:
+        callback._cache = _ShippedOrKept(function)
+    callback.compile()
+    return callback
 
 
 _to_be_told: list[Callable[[], None]] = []

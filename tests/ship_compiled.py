@@ -8,14 +8,19 @@ for one machine.
 import contextlib
 import gzip
 import pickle
+from types import SimpleNamespace
 
 import numba.core.codegen as codegen
 import numba.core.event as event
 import numpy as np
+from numba.core import sigutils
+from numba.core.ccallback import CFunc
+from numba.core.compiler_lock import global_compiler_lock
 
 from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, normal_equations
 from disctrack.readers import _png
-from disctrack.rolling import integrate
+from disctrack.rolling import equations, integrate
+from disctrack.rolling._compiled import system_types
 from disctrack.track import _kernels, following
 
 PREPARED = (
@@ -26,6 +31,10 @@ PREPARED = (
     (_kernels.track_frames, lambda: following.prepare(np.uint16)),
     (integrate._dop853, lambda: integrate.prepare(float)),
     (integrate._dop853, lambda: integrate.prepare(complex)),
+)
+
+CALLBACKS = tuple(
+    (function, scalar) for function in (equations.rates, equations.event_margins) for scalar in (float, complex)
 )
 
 TYPES_IN_WORDS = 5  # of what numba keeps after the library
@@ -84,20 +93,34 @@ def unoptimised(found):
 def ship(dispatcher, prepare):
     """Compile a function for the types that `prepare` calls it with, and write the files."""
     dispatcher._cache.disable()
-    stamp = dispatcher._cache._impl.locator.get_source_stamp()
     before, found = set(dispatcher.overloads), {}
     with unoptimised(found):
         prepare()
     for sig in set(dispatcher.overloads) - before:
-        result = dispatcher.overloads[sig]
-        (name, _, _), *others = result._reduce()
-        others[TYPES_IN_WORDS] = ""  # it names the folders of the machine
-        content = pickle.dumps(compiled.made_for(stamp, sig)) + compiled.dumps(
-            (name, found[result.fndesc.llvm_func_name], others)
-        )
-        file = compiled.shipped_file(dispatcher.py_func, sig)
-        file.write_bytes(gzip.compress(content, mtime=0))
-        print(f"{file.stat().st_size / 1024:6.0f} kB  {file.name}  {sig}")
+        write(dispatcher._cache, dispatcher.py_func, sig, dispatcher.overloads[sig], found)
+
+
+def ship_callback(function, signature):
+    """The same of a C function of these types."""
+    callback, found = CFunc(function, sigutils.normalize_signature(signature), {}, {"error_model": "numpy"}), {}
+    whole = {"dispatcher": SimpleNamespace(targetoptions={})}  # no part of another
+    with global_compiler_lock, unoptimised(found), event.trigger_event("numba:compile", whole):
+        result = callback._compile_uncached()
+        result.library.finalize()
+    write(compiled._ShippedOrKept(function), function, callback._sig, result, found)
+
+
+def write(cache, function, sig, result, found):
+    """Write one file of intermediate code."""
+    (name, _, _), *others = result._reduce()
+    others[TYPES_IN_WORDS] = ""  # it names the folders of the machine
+    stamp = cache._impl.locator.get_source_stamp()
+    content = pickle.dumps(compiled.made_for(stamp, sig)) + compiled.dumps(
+        (name, found[result.fndesc.llvm_func_name], others)
+    )
+    file = compiled.shipped_file(function, sig)
+    file.write_bytes(gzip.compress(content, mtime=0))
+    print(f"{file.stat().st_size / 1024:6.0f} kB  {file.name}")
 
 
 if __name__ == "__main__":
@@ -106,3 +129,5 @@ if __name__ == "__main__":
         old.unlink()
     for dispatcher, prepare in PREPARED:
         ship(dispatcher, prepare)
+    for function, scalar in CALLBACKS:
+        ship_callback(function, system_types(scalar))

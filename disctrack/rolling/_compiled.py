@@ -31,17 +31,22 @@ def _record(names: tuple[str, ...], scalar: type) -> types.Type:
 def _compile(function: Callable[..., None], signature: Any) -> Any:
     # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
     try:
-        return cfunc(signature, cache=True, error_model="numpy")(function)
+        return cfunc(function, signature, error_model="numpy")
     except RuntimeError:  # numba: "no locator available": typed at a prompt, there is no file to put a cache beside
-        return cfunc(signature, error_model="numpy")(function)
+        return cfunc(function, signature, cache=False, error_model="numpy")
 
 
 @cache
 def compile_system(function: Callable[..., None], scalar: type) -> Any:
     """f(t, y, out, table, body, kinematics, wrench) as C function; keep the object: it owns the `address`."""
+    return _compile(function, system_types(scalar))
+
+
+def system_types(scalar: type) -> Any:
+    """What the C functions of the equations of motion take."""
     v = _pointer(scalar)
     records = [_record(names, scalar) for names in (BODY, KINEMATICS, WRENCH)]
-    return _compile(function, types.void(v, v, v, types.CPointer(types.int64), *records))
+    return types.void(v, v, v, types.CPointer(types.int64), *records)
 
 
 @lru_cache(maxsize=256)  # the catalogue several times over; whoever calls a law holds it himself

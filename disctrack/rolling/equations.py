@@ -37,6 +37,8 @@ import numpy as np
 from calibration.compiled import njit
 from disctrack.rolling._addresses import call_law
 
+_part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
+
 ROLLING, SLIPPING, FLYING = 0, 1, 2
 EVENTS = ("theta_end", "load", "grip", "upright")
 N_EVENTS = len(EVENTS)
@@ -48,33 +50,33 @@ LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start o
 HEADER = 4
 
 
-@njit(error_model="numpy")
+@_part
 def _cross(a: Any, b: Any) -> Any:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@njit(error_model="numpy")
+@_part
 def _dot(a: Any, b: Any) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(error_model="numpy")
+@_part
 def _add(a: Any, b: Any) -> Any:
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@njit(error_model="numpy")
+@_part
 def _scale(f: Any, a: Any) -> Any:
     return (f * a[0], f * a[1], f * a[2])
 
 
-@njit(error_model="numpy")
+@_part
 def _nodal(n: Any, m: Any, z: Any, s: Any, c: Any) -> Any:
     """(n0, m0, k) -> (e1, e2, e3): n0 = e1, m0 = c e2 - s e3, k = s e2 + c e3."""
     return (n, m * c + z * s, z * c - m * s)
 
 
-@njit(error_model="numpy")
+@_part
 def _solve(rows: Any, b: Any) -> Any:
     """3 x 3 system by Cramer's rule."""
     r0, r1, r2 = rows
@@ -83,7 +85,7 @@ def _solve(rows: Any, b: Any) -> Any:
     return _scale(1.0 / _dot(r0, c0), x)
 
 
-@njit(error_model="numpy")
+@_part
 def _is_plain(body: Any) -> bool:
     """A round rim on a level, flat table."""
     return bool(
@@ -97,7 +99,7 @@ def _is_plain(body: Any) -> bool:
     )
 
 
-@njit(error_model="numpy")
+@_part
 def _plain_arm(body: Any, s: Any, c: Any) -> Any:
     """r_OA and its part a that turns with the nodal frame, nodal components."""
     rho = body.edge_radius
@@ -106,7 +108,7 @@ def _plain_arm(body: Any, s: Any, c: Any) -> Any:
     return (zero, a2 - rho * s, a3 - rho * c), (zero, a2, a3)
 
 
-@njit(error_model="numpy")
+@_part
 def _support(body: Any, cb: Any, sb: Any) -> Any:
     """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
     c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
@@ -116,7 +118,7 @@ def _support(body: Any, cb: Any, sb: Any) -> Any:
     return body.radius - body.edge_radius + two + three, slope, -4.0 * two - 9.0 * three
 
 
-@njit(error_model="numpy")
+@_part
 def _place(body: Any, kin: Any) -> Any:
     """W, its part in the face over its length, that length, the rim's support there, and the height of O."""
     s, c = kin.sin_theta, kin.cos_theta
@@ -141,7 +143,7 @@ def _place(body: Any, kin: Any) -> Any:
     return W, across, w, p, z
 
 
-@njit(error_model="numpy")
+@_part
 def _contact(body: Any, kin: Any) -> Any:
     """r_OA, the normal of the table there, and the height of O."""
     s, c = kin.sin_theta, kin.cos_theta
@@ -157,7 +159,7 @@ def _contact(body: Any, kin: Any) -> Any:
     return arm, n, z
 
 
-@njit(error_model="numpy")
+@_part
 def _contact_rates(body: Any, kin: Any, omega: Any, frame: Any, v: Any) -> Any:
     """Rates of r_OA and of the normal, as vectors; v: velocity of O, nodal components."""
     s, c = kin.sin_theta, kin.cos_theta
@@ -185,7 +187,7 @@ def _contact_rates(body: Any, kin: Any, omega: Any, frame: Any, v: Any) -> Any:
     return _add(_add(rim_rate, _scale(arm3, e3_rate)), _scale(-rho, n_rate)), n_rate
 
 
-@njit(error_model="numpy")
+@_part
 def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
     """Fills the record of kinematic quantities from the state."""
     psi, theta = y[2], y[3]
@@ -212,7 +214,7 @@ def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
     k.gravity = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
 
 
-@njit(error_model="numpy")
+@_part
 def _apply_laws(table: Any, w: Any) -> None:
     w.M_n = w.M_m = w.M_z = 0.0
     w.load_n = w.load_m = w.load_z = 0.0
@@ -221,7 +223,7 @@ def _apply_laws(table: Any, w: Any) -> None:
         call_law(table[HEADER + 2 * i], table[HEADER + 1 + 2 * i], table[2], table[3])
 
 
-@njit(error_model="numpy")
+@_part
 def _inertia_rows(body: Any, phi: Any) -> Any:
     """Inertia about G in nodal axes, from body axes turned by the spin angle."""
     c, s = np.cos(phi), np.sin(phi)
@@ -232,7 +234,7 @@ def _inertia_rows(body: Any, phi: Any) -> Any:
     return (J11, J12, J13), (J12, J22, J23), (J13, J23, body.J_33)
 
 
-@njit(error_model="numpy")
+@_part
 def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     """Omegadot and acceleration of O (vectors, nodal components); writes the contact force into the record."""
     s, c, m = kin.sin_theta, kin.cos_theta, body.mass
@@ -292,7 +294,7 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     return omegadot, frame, a_O
 
 
-@njit(error_model="numpy")
+@_part
 def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
     _kinematics(table[0], t, y, body, kin)
     _apply_laws(table, wrench)

@@ -8,15 +8,19 @@ import pytest
 
 from calibration import compiled
 from calibration._corner_kernel import fit_corners
+from calibration._normal_kernel import accumulate
 from disctrack.readers import _png
-from disctrack.rolling import integrate
+from disctrack.rolling import equations, integrate
 from disctrack.track._kernels import track_frames
 
 SHIPPED = {
-    "fit_corners": (fit_corners, 1),
-    "_undo_filters": (_png._undo_filters, 2),
-    "track_frames": (track_frames, 2),
-    "_dop853": (integrate._dop853, 2),
+    "fit_corners": (fit_corners.py_func, 1),
+    "accumulate": (accumulate.py_func, 1),
+    "_undo_filters": (_png._undo_filters.py_func, 2),
+    "track_frames": (track_frames.py_func, 2),
+    "_dop853": (integrate._dop853.py_func, 2),
+    "rates": (equations.rates, 2),
+    "event_margins": (equations.event_margins, 2),
 }
 
 
@@ -29,13 +33,13 @@ def headers(function):
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_what_ships_was_made_from_the_present_sources(name):
-    dispatcher, n = SHIPPED[name]
-    found = list(headers(dispatcher.py_func))
+    function, n = SHIPPED[name]
+    found = list(headers(function))
     assert len(found) == n
     *_, python, numba_version = compiled.made_for("", "")
     if any(made[-2:] != (python, numba_version) for made in found):
         pytest.skip("made for another Python or numba, so it is compiled here")
-    stamp = dispatcher._cache._impl.locator.get_source_stamp()
+    stamp = compiled._ShippedOrKept(function)._impl.locator.get_source_stamp()
     assert {made[0] for made in found} == {stamp}, "make it anew: python tests/ship_compiled.py"
 
 
