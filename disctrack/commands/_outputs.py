@@ -163,14 +163,15 @@ def pair_of(pairs: ImagePairs, row: int) -> NDArray:
     return images
 
 
-def write_times(folder: Path, command: str) -> None:
-    """Keep in times.json what the stages of this command took; nothing where all was reused. Raises OutputError.
+def write_times(folder: Path, command: str) -> list[Path]:
+    """Keep in times.json what the stages of this command took; returns it, or nothing where all was reused.
 
-    The processor's seconds are those of the whole process: with its imports, and with what is in no stage.
+    The processor's seconds are those of the whole process: with its imports, and with what is in no stage. Raises
+    OutputError.
     """
     stages = times_so_far()
     if not stages:
-        return
+        return []
     path = folder / "times.json"
     try:
         document = dict(json.loads(path.read_text(encoding="utf-8")))
@@ -183,6 +184,7 @@ def write_times(folder: Path, command: str) -> None:
         "stages": [asdict(stage) for stage in stages],
     }
     write_whole(path, json_file(document))
+    return [path]
 
 
 def relative(path: Path) -> Path:

@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rerun:
         write_rerun(motion, outcome.analysis)
         lines.append(f"              {motion}")
-    write_times(folder, "analyse")
+    lines += [f"              {file}" for file in write_times(folder, "analyse")]
     remember(folder, origin, lines, (outcome.report, page, *outcome.figures))
     print("\n".join(lines))
     return DONE

@@ -33,9 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
         outcome = run_diagnose(
             path, folder, model=arguments.model, overwrite=arguments.overwrite, settle=arguments.plan
         )
-    files = [outputs.relative(file) for file in (path, *outcome.files)]
+    files = [outputs.relative(file) for file in (path, *outcome.files, *outputs.write_times(folder, "diagnose"))]
     lines = [*outcome.summary, *summary.file_lines(files)]
-    outputs.write_times(folder, "diagnose")
     remember(folder, origin, lines, outcome.files)
     print("\n".join(lines))
     return DONE

@@ -33,8 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         folder / "trajectory.h5", recording, calibrated.rig, rig_name, pairs, options
     )
     text = [*calibrated.lines, *lines]
-    outputs.write_times(folder, "run")
     write_whole(folder / "summary.txt", ("\n".join(text) + "\n").encode())
-    files = [*calibrated.files, *files, folder / "summary.txt"]
+    files = [*calibrated.files, *files, folder / "summary.txt", *outputs.write_times(folder, "run")]
     print("\n".join([*text, *summary.file_lines([outputs.relative(file) for file in files])]))
     return outputs.tell_shortcomings(shortcomings)

@@ -30,6 +30,6 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_input(path)
     outputs.check_writable(path.parent)
     lines, files, shortcomings = outputs.track_into(path, recording, rig, str(rig_file), pairs, options)
-    outputs.write_times(path.parent, "track")
+    files += outputs.write_times(path.parent, "track")
     print("\n".join([*lines, *summary.file_lines([outputs.relative(file) for file in files])]))
     return outputs.tell_shortcomings(shortcomings)
