@@ -2,7 +2,7 @@
 
 A camera of 12 bits writes files of 16 bits, with the values as they are or shifted to the upper end; an 8-bit image may
 have been multiplied by 257. The step between neighbouring values is what rounding costs, and it is the unit in which
-images of any depth look alike.
+images of any depth look alike. A sensor with a colour filter writes grey values, too, in a pattern of 2 x 2 gains.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 _ENOUGH_LEVELS = 16
 # At the saturation level pixels pile up: so many times more of them than at any of the levels just below.
 _PILE, _PILE_PIXELS, _LEVELS_BELOW = 8, 30, 8
+# Gains of neighbouring pixels that differ by more are a colour filter: odd and even rows of one sensor by a few 0.1 %,
+# light that falls off by a half across the image, by less than 0.1 %.
+_MOSAIC = 0.02
 
 
 def level_step(image: NDArray) -> int:
@@ -47,3 +50,25 @@ def saturation_level(images: NDArray) -> int | None:
     below = counts[levels[-1 - _LEVELS_BELOW : -1]]
     found = levels[-1] == full_scale(images) or counts[-1] >= _PILE * int(below.max())
     return int(levels[-1]) if found else None
+
+
+def mosaic_gains(images: NDArray) -> NDArray | None:
+    """(2, 2) gains, of mean 1, of the pixels at even and odd rows and columns where a colour filter sets them apart.
+
+    images : (n, height, width) of a grey scene, uint8 or uint16. The gains are medians over the lighter half of each
+    image. None where any two images tell of different patterns, or of none.
+    """
+    found = []
+    for image in images:
+        height, width = (2 * (size // 2) for size in image.shape)
+        cells = np.asarray(image[:height, :width], np.float32).reshape(height // 2, 2, width // 2, 2)
+        mean = cells.mean(axis=(1, 3))
+        light = (mean >= max(float(np.median(mean)), 1.0)).nonzero()
+        if not len(light[0]):
+            return None
+        found.append(np.median(cells[light[0], :, light[1]] / mean[light][:, None, None], axis=0))
+    if not found:
+        return None
+    gains = np.median(found, axis=0)
+    same = np.abs(np.array(found) - gains).max() < 0.5 * _MOSAIC
+    return gains / gains.mean() if same and np.ptp(gains) > _MOSAIC else None

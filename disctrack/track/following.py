@@ -42,15 +42,22 @@ NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every th
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
 MOST_CARRIED = 60  # frames over which the last motion is carried on; each costs one look at the dots
 FRAMES_PER_SEARCH = 60  # a search that fails costs as much as some 600 frames: ten frames' time each on average
+UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
+MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
 
 
 @dataclass(frozen=True)
 class Law:
-    """Noise and blur [px] of the left and the right camera."""
+    """Noise and blur [px] of the left and the right camera, and how well dots fit."""
 
     noise: tuple[NoiseModel, NoiseModel] = (NoiseModel(1.0, 0.02), NoiseModel(1.0, 0.02))
     blur: tuple[float, float] = (TYPICAL_BLUR_PX, TYPICAL_BLUR_PX)
+    misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
+
+    def limits(self, limits: TemplateLimits) -> TemplateLimits:
+        """A dot is refused for a misfit that is unusual in this recording."""
+        return replace(limits, misfit=max(limits.misfit, UNUSUAL * self.misfit))
 
 
 @dataclass(frozen=True)
@@ -209,7 +216,7 @@ def run(
         face_edge(setup.disc),
         np.array(law.blur),
         np.stack([noise.parameters for noise in law.noise]),
-        setup.limits.array(),
+        law.limits(setup.limits).array(),
         R_last,
         t_last,
         R_before,
@@ -457,19 +464,22 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             )
         elif readable[:n, camera].any():
             noise[camera] = typical_noise(images[int(np.argmax(readable[:n, camera])), camera])
-    for blur_known in (False, True):  # the second time with the blur of the first
-        law = Law((noise[0], noise[1]), (blur[0], blur[1]))
+    misfit = 1.0
+    for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
+        law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit)
         trial = empty_rows(n, m)
-        limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf)
+        limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf, share=MOST_USUAL)
         done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
         if done == 0 or not _enough(trial.status[:1]):
             follower.law = law  # how the noise was taken to be tells why the dots are refused
             return
+        good = trial.status[:done] == MarkerStatus.MEASURED
         for camera, (R_cw, t_cw) in views:
-            good = trial.status[:done, camera] == MarkerStatus.MEASURED
-            if not good.any():
+            fits = trial.results[:done, camera][good[:, camera]]
+            if not len(fits):
                 continue
-            blur[camera] = float(np.median(trial.results[:done, camera, :, kernels.FIT_SIGMA][good]))
+            blur[camera] = float(np.median(fits[:, kernels.FIT_SIGMA]))
+            misfit = max(misfit, float(np.sqrt(np.median(fits[:, kernels.CHI_SQUARE]))))
             if not blur_known:
                 continue
             sample = range(0, done, NOISE_STEP)
@@ -481,12 +491,12 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
                 (setup.maps_x[camera], setup.maps_y[camera]),
                 blur[camera],
             )
-            noise[camera] = no_more_than_left(flat, noise[camera], trial.results[:done, camera][good])
+            noise[camera] = no_more_than_left(flat, noise[camera], fits)
     follower.saturated = (
         _saturated(images[:done, 0], trial.results[:done, 0], noise[0]),
         _saturated(images[:done, 1], trial.results[:done, 1], noise[1]),
     )
-    follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1])))
+    follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1]), misfit))
 
 
 def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
+from calibration.grey_levels import mosaic_gains
 from calibration.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
@@ -93,7 +94,7 @@ def track(
             + (" on one line" if disc.n_markers > 2 else "")
             + ": a pose needs at least three dots that are not on one line"
         )
-    read_blocks, stuck = _without_stuck_pixels(read_blocks, pairs)
+    read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
     tables = empty_tables(n, disc.n_markers)
     with ThreadPoolExecutor(2) as pool:  # 0.1 s each
         maps = list(pool.map(normalised_maps, rig.cameras))
@@ -193,32 +194,52 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     return [pairs.start + k * n // count for k in range(count + 1)]
 
 
-def _without_stuck_pixels(
+def _as_one_sensor(
     read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], pairs: range
 ) -> tuple[Callable[[int, int], Iterable[BlockOfPairs]], list[str]]:
-    """Blocks in which pixels that do not see are replaced by their neighbours, and what is to be said of them."""
+    """Blocks without a colour filter's pattern and pixels that do not see, and what is to be said of both."""
     # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
     chosen = np.unique(np.linspace(pairs.start, pairs.stop - 1, STUCK_FRAMES).astype(int)) if len(pairs) else ()
     found = [block.images[block.readable.all(1)].copy() for i in chosen for block in read_blocks(int(i), int(i) + 1)]
     images = np.concatenate(found) if found else np.zeros((0, 2, 1, 1), np.uint8)
+    gains = [mosaic_gains(images[:, camera]) for camera in (0, 1)]
+    for camera, pattern in enumerate(gains):
+        if pattern is not None:
+            images[:, camera] = _without_mosaic(images[:, camera], pattern)
     stuck = [stuck_pixels(images[:, camera]) for camera in (0, 1)]
-    if stuck[0] is None and stuck[1] is None:
+    told = [
+        f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
+        + " ".join(f"{gain:.2f}" for gain in pattern.ravel())
+        + "): they are divided by it, which is right for grey discs only; a monochrome camera sees more"
+        for name, pattern in zip(frames.CAMERAS, gains, strict=True)
+        if pattern is not None
+    ]
+    told += [
+        f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in for them"
+        for name, mask in zip(frames.CAMERAS, stuck, strict=True)
+        if mask is not None
+    ]
+    if not told:
         return read_blocks, []
 
     def repaired(start: int, stop: int) -> Iterator[BlockOfPairs]:
         for block in read_blocks(start, stop):
-            for camera, mask in enumerate(stuck):
+            for camera, (pattern, mask) in enumerate(zip(gains, stuck, strict=True)):
+                if pattern is not None:
+                    block.images[:, camera] = _without_mosaic(block.images[:, camera], pattern)
                 if mask is not None:
                     for image in block.images[:, camera]:
                         repair(image, mask)
             yield block
 
-    told = [
-        f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in for them"
-        for name, mask in zip(frames.CAMERAS, stuck, strict=True)
-        if mask is not None
-    ]
     return repaired, told
+
+
+def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:
+    """Images (..., height, width), uint8 or uint16, as a sensor without the filter gives them; gains (2, 2)."""
+    height, width = images.shape[-2:]
+    pattern = np.tile(gains, (height // 2 + 1, width // 2 + 1))[:height, :width]
+    return np.clip(np.rint(images / pattern), 0, np.iinfo(images.dtype).max).astype(images.dtype)
 
 
 def _cut(block: BlockOfPairs, edges: Sequence[int]) -> list[range]:

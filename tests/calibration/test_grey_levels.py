@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.chessboard import BoardNotFound, find_corners
-from calibration.grey_levels import full_scale, level_step, saturation_level
+from calibration.grey_levels import full_scale, level_step, mosaic_gains, saturation_level
 
 
 @pytest.mark.parametrize(("bits", "step"), [(8, 1), (8, 16), (8, 257), (10, 64), (12, 1), (12, 16), (16, 1)])
@@ -41,3 +41,16 @@ def test_corners_do_not_depend_on_the_unit_of_grey(sample_clip, scale):
     assert_array_equal(scaled.points, plain.points)
     assert_array_equal(scaled.covariance, plain.covariance)
     assert_array_equal(scaled.contrast, plain.contrast * scale)
+
+
+@pytest.mark.parametrize("gains", [[[0.75, 1.0], [1.0, 0.55]], [[1.02, 0.99], [0.99, 1.0]], [[1.0, 1.0], [1.0, 0.97]]])
+def test_a_colour_filter_shows_in_every_image_of_a_scene_and_in_no_other(rng, gains):
+    y, x = np.mgrid[:121, :161]
+    light = 150 * (1 - x / 330) * (1 - y / 400) * np.where(np.hypot(x - 70, y - 60) < 15, 0.2, 1.0)  # falls off by half
+    # columns of a sensor without a filter differ by 0.3 %
+    plain = light * np.array([1.0, 1.003])[x % 2] + rng.normal(0, 1.0, (4, *light.shape))
+    assert mosaic_gains(np.rint(plain).astype(np.uint8)) is None
+    filtered = np.rint(plain * np.array(gains)[y % 2, x % 2]).astype(np.uint8)
+    found = mosaic_gains(filtered)
+    assert_allclose(found, np.array(gains) / np.mean(gains), atol=0.004)  # the columns, and rounding
+    assert mosaic_gains(np.concatenate([filtered[:3], np.rint(plain[:1]).astype(np.uint8)])) is None
