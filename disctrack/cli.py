@@ -84,6 +84,7 @@ def _keep_compiled_loops_somewhere() -> None:
     if hasattr(os, "getuid") and os.stat(folder).st_uid != os.getuid():  # compiled code of others is not run
         folder = tempfile.mkdtemp(prefix=name)
     os.environ["NUMBA_CACHE_DIR"] = folder
+    os.environ.setdefault("MPLCONFIGDIR", os.path.join(folder, "matplotlib"))  # found fonts
     print(f"compiled inner loops are kept in {folder}: installation and home are read-only", file=sys.stderr)
 
 

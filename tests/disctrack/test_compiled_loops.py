@@ -18,8 +18,9 @@ from disctrack.progress import compiling
 
 def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch, tmp_path, capsys):
     monkeypatch.delitem(sys.modules, "numba", raising=False)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # so that it is as before after the test
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
+        monkeypatch.setenv(name, "")  # so that it is as before after the test
+        monkeypatch.delenv(name)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     cli._keep_compiled_loops_somewhere()
     assert "NUMBA_CACHE_DIR" not in os.environ  # this checkout can be written to
@@ -28,6 +29,7 @@ def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch,
     folder = os.environ["NUMBA_CACHE_DIR"]
     assert os.path.isdir(folder)
     assert folder.startswith(str(tmp_path))
+    assert os.environ["MPLCONFIGDIR"].startswith(folder)  # what matplotlib finds of fonts is kept there, too
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
     assert folder in said[0]
