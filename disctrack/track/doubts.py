@@ -18,6 +18,7 @@ DISAGREE = 0.003  # chance that board and disc differ by that much: three standa
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
 ONE_SIDED = "the dots of only one camera make sense"
+MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 MISFIT = "the dots miss their fitted places"
 
 
@@ -59,7 +60,7 @@ def warnings_of(
     if one > both:
         warnings.append(
             f"{ONE_SIDED} in {one} of {one + both} measured frames: are left and right "
-            "exchanged, does the rig belong to this recording, does one camera look at the underside?"
+            f"exchanged, does the rig belong to this recording, does one camera look at the underside? {MOVED}"
         )
     order = symmetry_order(follower.setup.disc)
     if order > 1:

@@ -26,7 +26,7 @@ from disctrack.errors import TrackingError
 from disctrack.track.arrangement import arrangement_found
 from disctrack.track.assembly import Tracking, TrackingSettings, assemble
 from disctrack.track.dots import normalised_maps
-from disctrack.track.doubts import ONE_SIDED
+from disctrack.track.doubts import MOVED, ONE_SIDED
 from disctrack.track.following import (
     Follower,
     Image,
@@ -153,12 +153,11 @@ def track(
         if _torn(tables, edges[k] - pairs.start):  # another branch of phi was found: go on from the stretch before
             carry_on(followers[k - 1], followers[k], edges[k], edges[k + 1])
     if not np.isfinite(tables.t).any():
-        reason = next((f.first_reason for f in followers if f.first_reason), "no image could be read")
-        arranged = _arrangement(read_blocks, rig, disc, pairs)
-        raise TrackingError(
-            f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. "
-            + (f"It is there if {arranged}" if arranged else f"First search: {reason}")
-        )
+        reason = next((f.first_reason for f in followers if f.first_reason), "")
+        told = f"First search: {reason.rstrip('.')}. {MOVED}" if reason else "No image could be read"
+        if arranged := _arrangement(read_blocks, rig, disc, pairs):
+            told = f"It is there if {arranged}"
+        raise TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}")
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     tracking = assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
