@@ -269,7 +269,7 @@ def _header(cine: _Cine, layout: PixelLayout, times: Array | None) -> CameraHead
     if not rate:
         raise RecordingError(f"{cine.path}: the camera setup states no frame rate. Export the recording again.")
     nanoseconds = cine.field("ShutterNs") or 1000 * (cine.field("Shutter") or 0)
-    exposure = 1e-9 * nanoseconds
+    exposure = nanoseconds / 1e9
     fraction, second = cine.trigger
     trigger_time = second + (fraction & 0xFFFFFFFC) * 2.0**-32
     version, serial = cine.field("CameraVersion"), cine.field("Serial")

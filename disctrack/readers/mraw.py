@@ -235,7 +235,7 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
     step, doubts = _saved_step(entries)
     remarks: list[str] = []
     nanoseconds = entries.number("Shutter Type2(nsec)")
-    exposure = 1e-9 * nanoseconds if nanoseconds else entries.number("Shutter Speed(s)")
+    exposure = nanoseconds / 1e9 if nanoseconds else entries.number("Shutter Speed(s)")
     if exposure is not None and exposure * rate > 1.001:
         remarks.append(f"the header's exposure of {exposure:g} s is longer than a frame of {1 / rate:g} s; not used")
         exposure = None

@@ -322,7 +322,7 @@ def _centres(value: Any) -> list[list[float]]:
 
 
 def _exposure(cameras: _Section) -> float:
-    exposure, interval = 1e-6 * cameras.get("exposure_us", _not_negative), 1 / cameras.get("frame_rate_hz", _positive)
+    exposure, interval = cameras.get("exposure_us", _not_negative) / 1e6, 1 / cameras.get("frame_rate_hz", _positive)
     if exposure > 1.001 * interval:
         raise cameras.error(
             f"exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 * interval:g} us at frame_rate_hz. "

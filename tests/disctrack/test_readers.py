@@ -85,7 +85,7 @@ def test_grey_stored_as_colour_is_read_without_loss_and_said(tmp_path, frames, c
 
 def test_a_colour_image_is_refused(tmp_path, rng):
     write_sequence(tmp_path / "left", rng.integers(0, 256, (2, 24, 32, 3), dtype=np.uint8))
-    with pytest.raises(RecordingError, match=r"none of the 2 left images can be read.*a colour image"):
+    with pytest.raises(RecordingError, match=r"none of the 2 left frames can be read.*a colour image"):
         open_frames("left/*", tmp_path, "left")
 
 
