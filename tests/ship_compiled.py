@@ -21,7 +21,7 @@ from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, no
 from disctrack.readers import _png
 from disctrack.rolling import equations, integrate
 from disctrack.rolling._compiled import system_types
-from disctrack.track import _kernels, following
+from disctrack.track import _kernels, dots, following
 
 PREPARED = (
     (_corner_kernel.fit_corners, corner_fit.prepare),
@@ -29,6 +29,8 @@ PREPARED = (
     (_png._undo_filters, _png.prepare),
     (_kernels.track_frames, lambda: following.prepare(np.uint8)),
     (_kernels.track_frames, lambda: following.prepare(np.uint16)),
+    (_kernels.look, lambda: dots.prepare(np.uint8)),
+    (_kernels.look, lambda: dots.prepare(np.uint16)),
     (integrate._dop853, lambda: integrate.prepare(float)),
     (integrate._dop853, lambda: integrate.prepare(complex)),
 )

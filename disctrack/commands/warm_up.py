@@ -12,6 +12,7 @@ from disctrack.progress import compiling
 from disctrack.readers import _png as png
 from disctrack.rolling import integrate
 from disctrack.track import _kernels as kernels
+from disctrack.track import dots
 from disctrack.track.following import prepare
 
 
@@ -24,8 +25,10 @@ def run(arguments: argparse.Namespace) -> int:
         normal_equations.prepare()
     with compiling("tracking, 8 bit", "5 to 20"):
         prepare(np.uint8)
+        dots.prepare(np.uint8)
     with compiling("tracking, 16 bit", "5 to 20"):
         prepare(np.uint16)
+        dots.prepare(np.uint16)
     with compiling("the integrator of motions", "2 to 20"):
         integrate.prepare(float)
         integrate.prepare(complex)

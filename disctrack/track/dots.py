@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from calibration.arrays import Array, Image
 from calibration.camera import Camera, normalise, project
@@ -144,6 +144,16 @@ def locate_on_disc(
         status,
     )
     return dot_centres(results[0], status[0])
+
+
+def prepare(dtype: DTypeLike = np.uint8) -> None:
+    """Compile the inner loop of `locate_on_disc` for images of this type, or load it."""
+    zeros = np.zeros
+    kernels.look(
+        zeros((1, 8, 8), dtype), zeros(1, bool), zeros((1, 8, 8)), zeros((1, 8, 8)), zeros((1, 9)), zeros((1, 3, 3)),
+        zeros((1, 3)), zeros((0, 3)), 1.0, 1.0, zeros(1), zeros((1, 3)), zeros(5), zeros((3, 3)), zeros(3),
+        *kernels.scratch(), zeros((1, 0, kernels.N_RESULT)), zeros((1, 0), np.uint8),
+    )  # fmt: skip
 
 
 def locate_on_plane(

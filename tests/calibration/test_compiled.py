@@ -11,13 +11,14 @@ from calibration._corner_kernel import fit_corners
 from calibration._normal_kernel import accumulate
 from disctrack.readers import _png
 from disctrack.rolling import equations, integrate
-from disctrack.track._kernels import track_frames
+from disctrack.track._kernels import look, track_frames
 
 SHIPPED = {
     "fit_corners": (fit_corners.py_func, 1),
     "accumulate": (accumulate.py_func, 1),
     "_undo_filters": (_png._undo_filters.py_func, 2),
     "track_frames": (track_frames.py_func, 2),
+    "look": (look.py_func, 2),
     "_dop853": (integrate._dop853.py_func, 2),
     "rates": (equations.rates, 2),
     "event_margins": (equations.event_margins, 2),
