@@ -50,12 +50,12 @@ def start_camera(
             k1 = float(np.ravel(distortion)[0])
             if np.isfinite(K).all() and abs(k1) < MOST_K1:
                 break
+        else:
+            raise CalibrationError(f"{name} camera: the views do not determine the focal length; tilt the board more")
     except cv2.error as error:
         raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
     finally:
         cv2.setNumThreads(threads)
-    if not (np.isfinite(K).all() and abs(k1) < MOST_K1):
-        raise CalibrationError(f"{name} camera: the views do not determine the focal length; tilt the board more")
     camera = Camera(
         float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), (k1, 0.0, 0.0, 0.0, 0.0), image_size
     )

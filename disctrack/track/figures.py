@@ -151,16 +151,15 @@ def dots_figure(trajectory: Trajectory) -> Figure:
 
 def _dot(axes: Axes, residuals: Array, colour: str, reach: float, middle: float) -> None:
     """One dot's cloud about x = middle, in a cell of twice the reach."""
-    good = residuals[(np.abs(residuals) <= reach).all(axis=1)]
-    n = int(np.isfinite(residuals).all(axis=1).sum())
+    seen = residuals[np.isfinite(residuals).all(axis=1)]
+    shown = seen[(np.abs(seen) <= reach).all(axis=1)]
     axes.axvline(middle, color=MUTED, linewidth=0.6)
     axes.axvline(middle + reach, color=INK, linewidth=0.8)
-    if n > 1:
-        axes.plot(middle + good[:, 0], good[:, 1], ".", color=colour, markersize=2, alpha=0.35)
-        seen = residuals[np.isfinite(residuals).all(axis=1)]
-        mean, error = seen.mean(axis=0), 3 * seen.std(axis=0) / np.sqrt(n)
+    if len(seen) > 1:
+        axes.plot(middle + shown[:, 0], shown[:, 1], ".", color=colour, markersize=2, alpha=0.35)
+        mean, error = seen.mean(axis=0), 3 * seen.std(axis=0) / np.sqrt(len(seen))
         axes.errorbar(middle + mean[0], mean[1], error[1], error[0], color=INK, linewidth=1.2)
-        text = f"n {n}\nrms {np.sqrt(np.mean(seen**2)):.4f}"
+        text = f"n {len(seen)}\nrms {np.sqrt(np.mean(seen**2)):.4f}"
     else:
         text = "not seen"
     axes.text(middle - 0.94 * reach, 0.94 * reach, text, fontsize=7, va="top")

@@ -100,9 +100,10 @@ class Effect:
         for p in self.parameters:
             value = self._values[p.name]
             if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
+                feeds = self.passive and value < p.lower
                 raise ModelError(
                     f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
-                    + (": a passive effect cannot feed the disc with energy" * (self.passive and value < p.lower))
+                    + (": a passive effect cannot feed the disc with energy" if feeds else "")
                 )
 
     @property
