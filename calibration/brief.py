@@ -5,6 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+SHOWN_RANGES = 6
+
+
+def ranges(numbers: ArrayLike) -> str:
+    """Ascending numbers (n,) as ranges: 3, 7-9, 12."""
+    counted = np.asarray(numbers)
+    parts = np.split(counted, np.flatnonzero(np.diff(counted) != 1) + 1)
+    shown = [f"{part[0]}" if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts[:SHOWN_RANGES]]
+    return ", ".join(shown) + (f", ... {len(parts) - SHOWN_RANGES} more" if len(parts) > SHOWN_RANGES else "")
+
 
 class Brief:
     """A result that holds large arrays and is shown by a few facts. Dataclasses that inherit it take `repr=False`."""

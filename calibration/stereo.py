@@ -18,7 +18,7 @@ from calibration.assessment import (
     stereo_covariance,
 )
 from calibration.board import Board, Target
-from calibration.brief import Brief
+from calibration.brief import Brief, ranges
 from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
@@ -356,8 +356,13 @@ def _require_views(
 
 
 def _listed(reasons: dict[int, str]) -> str:
-    shown = [f"view {v}: {reason}" for v, reason in list(reasons.items())[:3]]
-    return "; ".join(shown) + (f"; and {len(reasons) - 3} more" if len(reasons) > 3 else "")
+    """Each reason once with its views; three reasons at most."""
+    views: dict[str, list[int]] = {}
+    for v, reason in reasons.items():
+        views.setdefault(reason, []).append(v)
+    shown = [f"view {ranges(which)}: {reason}" for reason, which in list(views.items())[:3]]
+    more = sum(len(which) for which in list(views.values())[3:])
+    return "; ".join(shown) + (f"; and {more} more" if more else "")
 
 
 def _observations(views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]) -> Observations:

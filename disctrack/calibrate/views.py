@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
 from calibration.board import Target
 from calibration.stereo import Progress, check_sizes
-from disctrack.calibrate.targets import find_target
-from disctrack.errors import RecordingError
+from disctrack.calibrate.targets import find_target, other_board
+from disctrack.errors import CalibrationError, RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.readers import open_frames
 from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
@@ -179,7 +179,14 @@ def calibrate_views(
     check_sizes(*images, names)
     settings = settings or CalibrationSettings()
     target, seen_left, seen_right = find_target(*images, target, settings.threads, progress)
-    found = calibrate_from_corners(seen_left, seen_right, target, settings, position, board_thickness, names, progress)
+    try:
+        found = calibrate_from_corners(
+            seen_left, seen_right, target, settings, position, board_thickness, names, progress
+        )
+    except CalibrationError as error:
+        if other := other_board(*images, target):
+            raise CalibrationError(f"{str(error).rstrip('.')}. {other}") from error
+        raise
     return found, tuple(problems)
 
 

@@ -105,7 +105,7 @@ def shortcomings(findings: Mapping[str, Any]) -> list[str]:
     """What makes a result incomplete (exit code 3): images that could not be read, what had to be assumed."""
     unreadable, doubts = len(findings.get("unreadable", [])), len(findings.get("doubts", []))
     return [
-        *([f"{unreadable} image(s) could not be read; their frames have no answer"] if unreadable else []),
+        *([f"{unreadable} image(s) could not be read; their frames rest on one camera or none"] if unreadable else []),
         *([f"{doubts} warning(s) put the result in doubt"] if doubts else []),
     ]
 

@@ -19,13 +19,13 @@ from calibration.arrays import Mask
 from calibration.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
+from disctrack.calibrate.targets import evenly
 from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.first_look.declare import board_size, evenly, some_images
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.readers.flat_field import flat_fields
-from disctrack.recording.declaration import CalibrationViews, Recording, read_recording
+from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
@@ -160,7 +160,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
             some, declared.target, chosen.index(table.view), table.board_thickness, settings
         )
     except DiscTrackError as error:
-        seen.say("fix", "chessboard", str(error), _other_board(recording, declared))
+        seen.say("fix", "chessboard", str(error))
         return None
     seen.calibration = found
     used = len(chosen) - len(problems) - len(found.rejected_views)
@@ -173,26 +173,6 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
     for text in (*problems, *found.warnings):
         seen.say("look", "chessboard", text)
     return found.rig
-
-
-def _other_board(recording: Recording, declared: CalibrationViews) -> str:
-    """The chessboard that the views show, if it is another than was declared."""
-    if recording.chessboard is None:
-        return ""
-    try:
-        images = [
-            image
-            for pattern, camera in ((declared.left, "left"), (declared.right, "right"))
-            for image in some_images(pattern, recording.folder, camera)
-        ]
-    except DiscTrackError:
-        return ""
-    size, seen = board_size(images)
-    if size is None or size == recording.chessboard.inner_corners:
-        return ""
-    return (
-        f"{seen} of {len(images)} images tried show {size[0]} x {size[1]} inner corners: inner_corners = {list(size)}"
-    )
 
 
 def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:

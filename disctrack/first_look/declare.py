@@ -7,17 +7,15 @@ guess of ours becomes a measurement.
 from __future__ import annotations
 
 import tomllib
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.chessboard import BoardNotFound, find_corners, grey_values
+from disctrack.calibrate.targets import VIEWS_TRIED, board_size, evenly
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
@@ -28,9 +26,6 @@ from disctrack.readers.decoding import decode
 from disctrack.readers.files import match_files
 from disctrack.recording.declaration import FILE_NAME, OPTIONAL
 
-VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's
-LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
-LEAST_VIEWS = 2  # that must show the whole board
 OPTIONS = ("frame_rate_hz", "square_mm", "board_thickness_mm", "radius_mm", "thickness_mm", "mass_g", "diameter_mm")
 
 
@@ -122,25 +117,6 @@ def look_into(folder: Path) -> FolderContent:
     )
 
 
-def board_size(images: list[NDArray]) -> tuple[tuple[int, int] | None, int]:
-    """Inner corners (long side, short side) that most images show, and how many of them show these; None if none."""
-    counts: Counter[tuple[int, int]] = Counter()
-    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-    greys = [np.asarray(grey_values(image)[0]) for image in images]
-    for grey in greys:
-        stretched = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
-        found, _, squares = cv2.findChessboardCornersSBWithMeta(stretched, (3, 3), flags)
-        if found and squares is not None and squares.size >= LEAST_CORNERS:
-            short, long = sorted(squares.shape[:2])
-            counts[long, short] += 1
-    # part of a board is often taken for one: of sizes seen twice the largest, and then what `calibrate` itself finds
-    for size, _ in sorted(counts.items(), key=lambda item: (item[1] < LEAST_VIEWS, -item[0][0] * item[0][1])):
-        seen = sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in greys)
-        if seen >= min(LEAST_VIEWS, len(images)):
-            return size, seen
-    return None, 0
-
-
 def _views_among(folder: Path, pairs: list[CameraPair]) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
     """The pair that shows the chessboard: by its names, else by what is in the images, shortest first."""
     named = [pair for pair in pairs if pair.looks_like_calibration]
@@ -164,11 +140,6 @@ def some_images(pattern: str, folder: Path, camera: str = "left") -> list[NDArra
         return [decode(file.read_bytes(), str(file)) for file in chosen]
     reader = open_frames(pattern, folder, camera)
     return [np.array(reader.read(i)) for i in evenly(len(reader), VIEWS_TRIED)]
-
-
-def evenly(n: int, most: int) -> list[int]:
-    """Numbers of at most `most` of n things, evenly over them."""
-    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
 
 
 def _length(folder: Path, sequence: Sequence) -> int:

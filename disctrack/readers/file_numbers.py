@@ -66,8 +66,8 @@ def number_files(files: Sequence[Path], camera: str, pattern: str = "") -> Numbe
         slots[(number - first) // step] = file
     missing = _missing(numbers, step)
     notes = (
-        [f"{len(missing)} file(s) missing in the sequence, the first is number {missing[0]}; these frames are left "
-         "without an answer"] if missing else []
+        [f"{len(missing)} file(s) missing in the sequence, the first is number {missing[0]}; this camera says "
+         "nothing of these frames"] if missing else []
     )  # fmt: skip
     doubts = (
         [f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz. If that is "

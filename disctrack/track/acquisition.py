@@ -117,6 +117,27 @@ def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquis
     return Acquisition(best[1], best[2], best[3], "")
 
 
+def dots_of_one_camera(
+    image: NDArray[np.generic], camera: int, diameter_px: float, rig: StereoRig, disc: Disc
+) -> Array:
+    """Blobs of about that diameter that are the dots by one camera alone, (n_markers, 2) [px], NaN for those unseen.
+
+    What one camera sees is the same on every scale: neither the rig's baseline nor its table take part.
+    """
+    blobs = dot_blobs(image, diameter_px)
+    found = np.full((disc.n_markers, 2), np.nan)
+    candidates = _candidates_from_one_camera(blobs, camera, rig, disc)
+    if candidates:
+        R, t = candidates[0]
+        R_cw, t_cw = rig.camera_poses()[camera]
+        pixels = rig.project(disc.marker_centres_body @ R.T + t)[camera]
+        gap = np.linalg.norm(pixels[:, None] - blobs, axis=-1)
+        reach = INLIER_DIAMETERS * rig.cameras[camera].fx * disc.marker_diameter / float(R_cw[2] @ t + t_cw[2])
+        seen = gap.min(axis=1) < reach
+        found[seen] = blobs[gap.argmin(axis=1)[seen]]
+    return found
+
+
 def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> list[tuple[Array, Array]]:
     if min(len(b) for b in blobs) < 3:
         return []

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration import StereoCalibration, StereoRig
 from calibration.arrays import Array
+from calibration.brief import SHOWN_RANGES, ranges
 from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 
-_SHOWN_RANGES = 6
 LEAST_SIZE = 1e-5  # relative: a change of the rig's size that is worth a line
 
 
@@ -112,7 +111,7 @@ def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> lis
             lines.append(_line("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
         if table := findings.get("table"):
             lines.append(_line("table", table["told"]))
-    lines += [_line("image", reason) for reason in list(findings.get("unreadable", []))[:_SHOWN_RANGES]]
+    lines += [_line("image", reason) for reason in list(findings.get("unreadable", []))[:SHOWN_RANGES]]
     lines += [_line("note", note) for note in findings.get("notes", [])]
     lines += [_line("warning", warning) for warning in findings.get("warnings", [])]
     return lines
@@ -152,14 +151,7 @@ def _frame_lines(trajectory: Trajectory) -> Iterable[str]:
     for status in FrameStatus:
         rows = np.flatnonzero(trajectory.frame_status == status)
         if status != FrameStatus.MEASURED and rows.size:
-            yield _line("", f"{rows.size} {status.sentence} (frames {_ranges(trajectory.frame[rows])})")
-
-
-def _ranges(numbers: NDArray[np.int64]) -> str:
-    """Numbers as ranges: 3, 7-9, 12."""
-    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
-    shown = [f"{part[0]}" if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts[:_SHOWN_RANGES]]
-    return ", ".join(shown) + (f", ... {len(parts) - _SHOWN_RANGES} more" if len(parts) > _SHOWN_RANGES else "")
+            yield _line("", f"{rows.size} {status.sentence} (frames {ranges(trajectory.frame[rows])})")
 
 
 def _sigma_line(head: str, sigma: Array, what: str) -> str:

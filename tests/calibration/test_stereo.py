@@ -159,7 +159,7 @@ def test_views_without_a_board_are_left_out_with_the_reason(drawn):
 def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
     _, (left, right) = drawn
     blank = np.full_like(left[0], 90)
-    with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*view 0: no board"):
+    with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*view 0-7: no board"):
         calibrate_stereo([blank] * 8, right, BOARD)
     with pytest.raises(CalibrationError, match="not found in the table view 0"):
         calibrate_stereo([blank, *left[1:]], [blank, *right[1:]], BOARD, FLAT, table_view=0)

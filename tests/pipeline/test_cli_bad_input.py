@@ -183,6 +183,13 @@ def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsy
     assert "left 04.png" in message
 
 
+def test_other_corners_than_declared_are_named_once_for_all_views(recording, capsys):
+    edit(recording, "[9, 6]", "[10, 7]")
+    message = failure(capsys, "calibrate", recording)
+    assert message.count("no board of 10 x 7") == 1
+    assert "inner_corners = [9, 6]" in message
+
+
 def test_a_table_view_that_is_damaged_or_not_there(short_recording, tmp_path, capsys):
     for camera in ("left", "right"):
         (tmp_path / "calibration" / camera).mkdir(parents=True)

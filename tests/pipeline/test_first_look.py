@@ -13,10 +13,10 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from calibration.chessboard import BoardNotFound, find_corners
+from disctrack.calibrate.targets import board_size
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
-from disctrack.first_look.declare import board_size
 from disctrack.first_look.sequences import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
 

@@ -1,6 +1,8 @@
 """Faults planted into recordings: none ends with a pose that is wrong by more than its sigma says and not flagged."""
 
+import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -114,6 +116,28 @@ def test_images_mirrored_since_the_calibration_are_named(clip, said):
     except TrackingError as error:
         told = str(error)
     assert said in told
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [
+        (1000.0, "square_mm 0.001 times (are mm and m mixed up?)"),
+        (0.1, "square_mm 10 times (are cm and mm mixed up?)"),
+        (1.25, "[disc] and [markers] is 1.25 times the declared one"),
+    ],
+)
+def test_a_board_in_another_unit_is_named_with_the_factor(clip, scale, said):
+    rig = replace(clip.rig, t_right_left=scale * clip.rig.t_right_left, t_left_world=scale * clip.rig.t_left_world)
+    with pytest.raises(TrackingError, match=re.escape(said)):
+        measure(clip.images[:4], rig, clip.disc)
+
+
+def test_no_scale_is_told_where_no_dots_are(clip):
+    """The disc as declared, and images that show none: no unit is blamed."""
+    noise = np.random.default_rng(1).normal(120, 30, clip.images[:2].shape).clip(0, 255).astype(np.uint8)
+    with pytest.raises(TrackingError) as told:
+        measure(noise, clip.rig, clip.disc)
+    assert "times" not in str(told.value)
 
 
 def test_a_camera_that_left_out_an_image_is_named_with_the_frame(clip):
