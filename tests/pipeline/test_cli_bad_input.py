@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -183,9 +184,11 @@ def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsy
     assert "left 04.png" in message
 
 
-def test_other_corners_than_declared_are_named_once_for_all_views(recording, capsys):
-    edit(recording, "[9, 6]", "[10, 7]")
-    message = failure(capsys, "calibrate", recording)
+def test_other_corners_than_declared_are_named_once_for_all_views(short_recording, tmp_path, capsys):
+    shutil.copytree(short_recording / "calibration", tmp_path / "calibration", copy_function=os.link)
+    shutil.copy(short_recording / "recording.toml", tmp_path)
+    edit(tmp_path, "[9, 6]", "[10, 7]")
+    message = failure(capsys, "calibrate", tmp_path)
     assert message.count("no board of 10 x 7") == 1
     assert "inner_corners = [9, 6]" in message
 
