@@ -44,6 +44,11 @@ def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
     A blob's pixels differ from the mean of their surroundings (so uneven light does not matter), and its area must be
     that of the ellipse with the same second moments.
     """
+    return _sized_blobs(image, expected_diameter_px)[:, :2]
+
+
+def _sized_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
+    """`dot_blobs` with their areas, (k, 3): x, y [px], area [px^2]."""
     grey = np.asarray(image, np.float32) / np.float32(level_step(image))  # images of any depth alike, to the last bit
     block = 2 * int(1.25 * expected_diameter_px) + 1
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
@@ -55,10 +60,10 @@ def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
     for mask in (smooth < mean - threshold, smooth > mean + threshold):
         found += _elliptical_components(mask.astype(np.uint8), expected_diameter_px)
     found.sort()
-    return np.array([[x, y] for _, x, y in found[:MAX_BLOBS]], float).reshape(-1, 2)
+    return np.array([blob[1:] for blob in found[:MAX_BLOBS]], float).reshape(-1, 3)
 
 
-def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float]]:
+def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float, float]]:
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     result = []
     for contour in contours:
@@ -75,7 +80,7 @@ def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tup
             continue
         misfit = abs(area / (4 * np.pi * np.sqrt(major * minor)) - 1.0)
         if misfit < 0.08 and 2 * np.sqrt(major) < 1.3 * diameter:
-            result.append((misfit, moments["m10"] / area, moments["m01"] / area))
+            result.append((misfit, moments["m10"] / area, moments["m01"] / area, area))
     return result
 
 
@@ -117,25 +122,25 @@ def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquis
     return Acquisition(best[1], best[2], best[3], "")
 
 
-def dots_of_one_camera(
+def blobs_of_one_camera(
     image: NDArray[np.generic], camera: int, diameter_px: float, rig: StereoRig, disc: Disc
 ) -> Array:
-    """Blobs of about that diameter that are the dots by one camera alone, (n_markers, 2) [px], NaN for those unseen.
+    """Blobs of about that diameter that are the dots by one camera alone: x, y [px], area [px^2], (n_markers, 3).
 
-    What one camera sees is the same on every scale: neither the rig's baseline nor its table take part.
+    NaN for dots that are not seen. What one camera sees is the same on every scale: neither baseline nor table matter.
     """
-    blobs = dot_blobs(image, diameter_px)
-    found = np.full((disc.n_markers, 2), np.nan)
-    candidates = _candidates_from_one_camera(blobs, camera, rig, disc)
-    if candidates:
-        R, t = candidates[0]
-        R_cw, t_cw = rig.camera_poses()[camera]
+    blobs = _sized_blobs(image, diameter_px)
+    best = np.full((disc.n_markers, 3), np.nan)
+    R_cw, t_cw = rig.camera_poses()[camera]
+    for R, t in _candidates_from_one_camera(blobs[:, :2], camera, rig, disc):
         pixels = rig.project(disc.marker_centres_body @ R.T + t)[camera]
-        gap = np.linalg.norm(pixels[:, None] - blobs, axis=-1)
+        gap = np.linalg.norm(pixels[:, None] - blobs[:, :2], axis=-1)
         reach = INLIER_DIAMETERS * rig.cameras[camera].fx * disc.marker_diameter / float(R_cw[2] @ t + t_cw[2])
-        seen = gap.min(axis=1) < reach
-        found[seen] = blobs[gap.argmin(axis=1)[seen]]
-    return found
+        seen, nearest = gap.min(axis=1) < reach, gap.argmin(axis=1)
+        one_each = len(set(nearest[seen])) == seen.sum()  # a disc far off, or edge on, has many dots in one blob
+        if one_each and seen.sum() > np.isfinite(best[:, 0]).sum():
+            best = np.where(seen[:, None], blobs[nearest], np.nan)
+    return best
 
 
 def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> list[tuple[Array, Array]]:
@@ -167,7 +172,7 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     P, B = np.concatenate(found_points), np.concatenate(found_dots)
     if len(P) == 0:
         return []
-    R, t = _rigid_motions(B, P)
+    R, t = rigid_motions(B, P)
     # score by the points that fall on dots; keep the distinct best
     predicted = centres @ np.swapaxes(R, 1, 2) + t[:, None]
     gap = np.linalg.norm(predicted[:, :, None] - points[None, None], axis=-1).min(axis=2)
@@ -176,8 +181,8 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     return [(R[k], t[k]) for k in np.argsort(-score)[:40]]
 
 
-def _rigid_motions(body: Array, world: Array) -> tuple[Array, Array]:
-    """Rotations and translations that map triples (k, 3, 3) of body points onto world points (Kabsch)."""
+def rigid_motions(body: Array, world: Array) -> tuple[Array, Array]:
+    """Rotations and translations that map sets (k, n, 3) of body points onto world points (Kabsch)."""
     b0, w0 = body.mean(axis=1, keepdims=True), world.mean(axis=1, keepdims=True)
     U, _, Vt = np.linalg.svd(np.swapaxes(body - b0, 1, 2) @ (world - w0))
     sign = np.sign(np.linalg.det(U @ Vt))

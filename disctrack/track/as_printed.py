@@ -27,7 +27,7 @@ from calibration.arrays import Array, Mask
 from calibration.camera import N_RIG, StereoRig
 from calibration.tolerances import SIZE
 from disctrack.disc import Disc
-from disctrack.track.pose import fit_poses, marker_pixels, whitening
+from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
@@ -102,8 +102,8 @@ def refine_as_built(
         used = fits.used & ok[:, None, None]
         normal, gradient = shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
         # common errors: the data's information is bounded by what SYSTEMATIC_PX allows
-        # dots that scatter more than the image noise alone makes them tell accordingly less
-        scale = _information_scale(covariance, used) / max(1.0, after)
+        # dots that scatter more than the image noise alone makes them tell accordingly less, whatever is common to them
+        scale = _information_scale(covariance, used) / scatter_left(fits, normal, gradient)
         matrix = scale * normal + information
         rhs = scale * gradient - information @ shift[free]
         step = np.zeros_like(shift)
@@ -251,6 +251,16 @@ def _pattern_motions(disc: Disc) -> Array:
     motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)
     motions[..., 2] /= np.sqrt(np.mean(x * x + y * y))
     return motions
+
+
+def scatter_left(fits: PoseFits, normal: Array, gradient: Array) -> float:
+    """Reduced chi-square, at least 1, that the best step of what frames share will leave: the dots' own scatter.
+
+    Before that step, dots declared in wrong places look like noise a hundred times the pixels', and hold it up.
+    """
+    chi_square, freedom = fits.chi_square[fits.converged].sum(), fits.degrees_of_freedom[fits.converged].sum()
+    explained = gradient @ np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
+    return max(1.0, float(chi_square - explained) / max(float(freedom), 1.0))
 
 
 def _information_scale(covariance: Array, used: Mask) -> float:

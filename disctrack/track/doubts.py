@@ -6,12 +6,13 @@ import numpy as np
 
 from calibration.arrays import Array, Mask
 from disctrack import frames
-from disctrack.disc import symmetry_order
+from disctrack.disc import Disc, symmetry_order
 from disctrack.track.following import Follower
 from disctrack.track.own_scatter import Scatter, SharedFaults
 from disctrack.track.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
+MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
 DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
@@ -44,6 +45,21 @@ def _table_gap(trajectory: Trajectory) -> Array:
     return z - trajectory.disc.resting_height(theta)
 
 
+def misplaced_in_words(declared: Disc, found: Array) -> str:
+    """Dots whose places (m, 3) [m] are not where a printer puts them, and what to declare; "" without any."""
+    away = 1e3 * np.linalg.norm(found - declared.marker_centres_body, axis=1)
+    far = np.flatnonzero(away > MISPLACED_MM)
+    if not len(far):
+        return ""
+    named = ", ".join(f"dot {dot} by {away[dot]:.2f} mm" for dot in far)
+    centres = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in 1e3 * found[:, :2])
+    others = np.delete(away, far)
+    rest = f" (the others within {others.max():.3f} mm)" if len(others) else ""
+    return (
+        f"dots lie off the places declared in [markers]: {named}{rest}, counted from 0; centres_mm = [{centres}] fits"
+    )
+
+
 def warnings_of(
     follower: Follower,
     variance_factor: float,
@@ -74,6 +90,8 @@ def warnings_of(
                 f"{camera} camera: the light round the dots is clipped at grey value {saturation}, which hides part of "
                 "their edges and of the noise: positions may be off by a micrometre. Expose for a shorter time"
             )
+    if misplaced := misplaced_in_words(follower.setup.disc, trajectory.disc.marker_centres_body):
+        warnings.append(f"{misplaced}. Poses rest on these; that their middle is the disc's is as declared")
     if variance_factor > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
         warnings.append(
             f"{MISFIT} by {np.sqrt(variance_factor / own):.1f} times their own "

@@ -15,7 +15,13 @@ import numpy as np
 from calibration.arrays import Array, Mask
 from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, StereoRig
 from disctrack.disc import Disc
-from disctrack.track.as_printed import DOT_SIGMA, declared_places_kept, places_sigma, shared_normal_equations
+from disctrack.track.as_printed import (
+    DOT_SIGMA,
+    declared_places_kept,
+    places_sigma,
+    scatter_left,
+    shared_normal_equations,
+)
 from disctrack.track.pose import PoseFits, fit_poses, whitening
 
 MIN_FRAMES = 20
@@ -87,7 +93,7 @@ def without_shared_faults(
         normal, gradient = shared_normal_equations(
             observed, covariance, used, now_rig, now_disc, Rs, ts, free[:-1], by_delay[..., None]
         )
-        noise = max(1.0, trimmed_reduced_chi_square(fits))
+        noise = scatter_left(fits, normal, gradient)
         # in units of the wide sigmas, for the sake of the conditioning
         unit = wide[free]
         matrix = normal * np.outer(unit, unit) / noise + np.eye(len(unit))

@@ -1,5 +1,6 @@
 """Faults planted into recordings: none ends with a pose that is wrong by more than its sigma says and not flagged."""
 
+import json
 import re
 import time
 from dataclasses import replace
@@ -132,12 +133,47 @@ def test_a_board_in_another_unit_is_named_with_the_factor(clip, scale, said):
         measure(clip.images[:4], rig, clip.disc)
 
 
+def with_dots(disc, shift_mm=0.0, diameter=1.0):
+    """The disc as a user declares it who errs by shift_mm (m, 2) in the dots' places, and by a factor in their size."""
+    centres = disc.marker_centres_body.copy()
+    centres[:, :2] += 1e-3 * shift_mm
+    return replace(disc, marker_centres_body=centres, marker_diameter=diameter * disc.marker_diameter)
+
+
+def test_a_dot_declared_a_millimetre_off_is_found_and_named(clip):
+    """A typing error: before, the poses' shared sigma was 35 to 67 um, and a camera was said to have moved."""
+    off = np.zeros((clip.disc.n_markers, 2))
+    off[0] = -1.0, 0.0
+    found = measure(clip.images, clip.rig, with_dots(clip.disc, off))
+    (told,) = [text for text in found.warnings if "dots lie off" in text]
+    assert "dot 0 by 1.00 mm (the others within 0.0" in told
+    assert not any("a camera moved" in text for text in found.warnings)
+    np.testing.assert_allclose(found.trajectory.disc.marker_centres_body, clip.disc.marker_centres_body, atol=8e-6)
+    untouched = clip.untouched.trajectory
+    np.testing.assert_allclose(found.trajectory.q[:, :3], untouched.q[:, :3], rtol=0, atol=2e-6)
+    assert not any("dots lie off" in text for text in clip.untouched.warnings)
+
+
+@pytest.mark.parametrize(("shift", "diameter", "said"), [(0.5, 1.0, "centres_mm = [["), (0.0, 0.5, "diameter_mm is")])
+def test_dots_declared_too_far_off_to_be_followed_are_told(clip, shift, diameter, said):
+    """Places by a ruler, or half the diameter: no dot fits the template, and the error says what to declare."""
+    off = shift * np.random.default_rng(3).normal(size=(clip.disc.n_markers, 2))
+    with pytest.raises(TrackingError, match=re.escape(said)) as told:
+        measure(clip.images[:4], clip.rig, with_dots(clip.disc, off, diameter))
+    if shift:
+        centres = np.array(json.loads(re.search(r"centres_mm = (\[\[.*\]\])", str(told.value))[1]))
+        i, j = np.triu_indices(len(centres), 1)
+        true = 1e3 * clip.disc.marker_centres_body[:, :2]
+        distance, expected = (np.linalg.norm(places[i] - places[j], axis=1) for places in (centres, true))
+        np.testing.assert_allclose(distance, expected, atol=0.25)  # blobs err by up to 0.5 px, 0.2 mm
+
+
 def test_no_scale_is_told_where_no_dots_are(clip):
     """The disc as declared, and images that show none: no unit is blamed."""
     noise = np.random.default_rng(1).normal(120, 30, clip.images[:2].shape).clip(0, 255).astype(np.uint8)
     with pytest.raises(TrackingError) as told:
         measure(noise, clip.rig, clip.disc)
-    assert "times" not in str(told.value)
+    assert "It is there" not in str(told.value)
 
 
 def test_a_camera_that_left_out_an_image_is_named_with_the_frame(clip):

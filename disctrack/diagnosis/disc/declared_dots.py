@@ -2,7 +2,8 @@
 
 The tracking measures with the places that it found for the dots. When all dots are off by a little, as printed dots
 are, nothing is to be said about them. One dot that is off while the others are where they should be is a fault, and
-has to come out as one.
+has to come out as one. Farther off than any printer puts it, it was declared wrongly: the tracking has said so, and how
+the dots move with a place is no longer linear.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from disctrack.trajectory import Trajectory
 
 MIN_MISPRINT_UM = 4.0  # what the shapes of two dots may well differ by
+MOST_MISPRINT_UM = 300.0
 MIN_SIGMAS = 5.0
 
 
@@ -27,7 +29,8 @@ def misprinted(findings: Mapping[str, Any]) -> tuple[int, ...]:
         return ()
     length = np.linalg.norm(shift, axis=1)
     off = np.flatnonzero((length > MIN_MISPRINT_UM) & (length > MIN_SIGMAS * np.linalg.norm(sigma, axis=1)))
-    return tuple(int(i) for i in off) if 3 * off.size <= len(shift) else ()
+    alone = 3 * off.size <= len(shift) and length.max() < MOST_MISPRINT_UM
+    return tuple(int(i) for i in off) if alone else ()
 
 
 def with_declared_dots(trajectory: Trajectory, findings: Mapping[str, Any]) -> Trajectory:

@@ -1,0 +1,100 @@
+"""Dots that are there, and unlike the declared ones: on another scale, of another size, in other places.
+
+One camera alone numbers the dots, on any scale and of any size. What both see of a dot tells where it is in the unit of
+the rig, to some 0.2 mm: enough to say which declared number is wrong, and what it should be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Array, Mask
+from calibration.camera import StereoRig, triangulate
+from disctrack.disc import Disc
+from disctrack.track.acquisition import (
+    EPIPOLAR_PX,
+    MIN_EXPLAINED,
+    SIDE_TOLERANCE,
+    blobs_of_one_camera,
+    rigid_motions,
+)
+from disctrack.track.as_printed import declared_places_kept
+from disctrack.track.doubts import misplaced_in_words
+
+DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
+UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
+SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
+MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
+RIM = 64  # points of a dot's outline
+
+
+@dataclass(frozen=True)
+class SeenDots:
+    """Dots that both cameras number alike."""
+
+    which: Mask  # (m,) of the declared dots; k of them
+    points: Array  # (k, 3) [m] in the rig's world and unit
+    areas: Array  # (2, k) [px^2] of their blobs
+    scale: float  # their distances over those declared
+
+
+def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
+    """Which declared number makes no sense, in words, and what it should be; "" where that is not seen.
+
+    pair : (2, height, width), images of the left and the right camera
+    """
+    seen = _seen_dots(pair, rig, disc)
+    if seen is None:
+        return ""
+    if abs(np.log(seen.scale)) > SIDE_TOLERANCE:
+        return _scale_in_words(seen.scale)
+    (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
+    diameter = disc.marker_diameter * float(np.median(np.sqrt(seen.areas / _areas(seen, R, rig, disc))))
+    if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
+        return f"[markers] diameter_mm is about {1e3 * diameter:.2g}, not {1e3 * disc.marker_diameter:g}"
+    if not seen.which.all():
+        return ""
+    shift = (seen.points - t) @ R - disc.marker_centres_body
+    return misplaced_in_words(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
+
+
+def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> SeenDots | None:
+    for diameter in DOT_DIAMETERS_PX:
+        blobs = np.stack([blobs_of_one_camera(pair[camera], camera, diameter, rig, disc) for camera in (0, 1)])
+        which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
+        if which.sum() < MIN_EXPLAINED:
+            continue
+        pixels = blobs[:, which, :2]
+        points = triangulate(pixels, rig)
+        one, other = np.triu_indices(which.sum(), 1)
+        ratios = _distances(points, one, other) / _distances(disc.marker_centres_body[which], one, other)
+        scale = float(np.median(ratios))
+        if (
+            np.abs(rig.project(points) - pixels).max() < EPIPOLAR_PX
+            and scale > 0
+            and np.abs(ratios / scale - 1).max() < MISPLACED
+        ):
+            return SeenDots(which, points, blobs[:, which, 2], scale)
+    return None
+
+
+def _distances(points: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
+    return np.asarray(np.linalg.norm(points[one] - points[other], axis=-1))
+
+
+def _areas(seen: SeenDots, R: Array, rig: StereoRig, disc: Disc) -> Array:
+    """(2, k) [px^2] of the images of dots of the declared diameter."""
+    angle = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
+    rim = 0.5 * disc.marker_diameter * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) @ R.T
+    x, y = np.moveaxis(rig.project(seen.points[:, None] + rim).swapaxes(0, 1), -1, 0)
+    return np.asarray(0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1), axis=-1)))
+
+
+def _scale_in_words(scale: float) -> str:
+    units = [words for unit, words in UNITS.items() if abs(abs(np.log(scale)) / np.log(unit) - 1) < 0.02]
+    mixed = f" (are {units[0]} mixed up?)" if units else ""
+    disc, board = (f"{float(f'{factor:.3g}'):g} times" for factor in (scale, 1 / scale))
+    return f"every length of [disc] and [markers] is {disc} the declared one, or [calibration] square_mm {board}{mixed}"
