@@ -9,6 +9,9 @@ from numpy.typing import ArrayLike
 
 from calibration.arrays import Array
 
+AIR_DENSITY = 1.2  # [kg/m^3] where no other is declared: at 1013.25 hPa and 20 degC
+STANDARD_PRESSURE = 1013.25  # [hPa]
+
 
 @dataclass(frozen=True)
 class Disc:

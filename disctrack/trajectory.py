@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array, Mask
 from calibration.brief import Brief
 from calibration.camera import StereoRig
-from disctrack.disc import Disc
+from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.frames import euler_jacobian
 
 
@@ -103,6 +103,7 @@ class Trajectory(Brief):
     rig: StereoRig
     frame_rate: float  # [Hz]
     gravity: float  # [m/s^2]
+    air_density: float = AIR_DENSITY  # [kg/m^3]
 
     def __len__(self) -> int:
         return len(self.time)

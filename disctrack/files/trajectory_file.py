@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from calibration.rig_file import beyond_model, read_beyond_model
-from disctrack.disc import Disc
+from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
 from disctrack.files.software import software_version
@@ -243,6 +243,7 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "fingerprint": provenance.fingerprint,
         "frame_rate_hz": trajectory.frame_rate,
         "gravity_m_s2": trajectory.gravity,
+        "air_density_kg_m3": trajectory.air_density,
         **_CONVENTIONS,
     }
 
@@ -476,6 +477,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         rig=_rig(file["calibration"], groups["calibration"]),
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
+        air_density=float(file.attrs.get("air_density_kg_m3", AIR_DENSITY)),  # files of earlier versions
         **found,
     )
     _check_values(trajectory)

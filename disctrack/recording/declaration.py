@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
 from calibration.tolerances import BoardTolerances
-from disctrack.disc import Disc, disc_from_mm
+from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep
 from disctrack.files.toml_tree import read_toml
@@ -42,7 +42,7 @@ KEYS: dict[str, tuple[str, ...]] = {
     ),
     "table": ("view", "board_thickness_mm", "from", "board_thickness_tolerance_mm"),
     "gravity": ("g_m_s2",),
-    "air": ("pressure_hPa",),
+    "air": ("pressure_hPa", "density_kg_m3"),
 }
 
 # What declares each kind of calibration target.
@@ -57,6 +57,7 @@ TARGET_KEYS: dict[str, tuple[str, ...]] = {
 # Keys that have a default, or belong to another target than a chessboard; a calibration is either views or a rig.
 OPTIONAL = {
     ("air", "pressure_hPa"),
+    ("air", "density_kg_m3"),
     ("cameras", "exposure_us"),
     *(("cameras", f"{camera}_{kind}") for camera in ("left", "right") for kind in ("flat", "dark")),
     ("disc", "name"),
@@ -114,6 +115,7 @@ class Recording:
     gravity: float  # [m/s^2]
     board_tolerances: BoardTolerances
     declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
+    air_density: float = AIR_DENSITY  # [kg/m^3] round the disc
     sensors: tuple[SensorImages, SensorImages] = (SensorImages(), SensorImages())  # left, right
 
     @property
@@ -144,8 +146,6 @@ def read_recording(path: str | Path) -> Recording:
             _Section(file, declared, "").get(label, _text)
     if "name" in declared.get("disc", {}):  # which disc it was, where sizes and mass do not tell; also kept there
         disc.get("name", _text)
-    if "air" in declared:
-        _Section(file, declared, "air").get("pressure_hPa", _positive)
     return Recording(
         folder=file.parent,
         name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,
@@ -159,9 +159,19 @@ def read_recording(path: str | Path) -> Recording:
         rig_file=rig_file,
         board_tolerances=_tolerances(file, declared),
         gravity=_Section(file, declared, "gravity").get("g_m_s2", _positive),
+        air_density=_air_density(_Section(file, declared, "air")) if "air" in declared else AIR_DENSITY,
         declared=declared,
         sensors=(_sensor(cameras, "left"), _sensor(cameras, "right")),
     )
+
+
+def _air_density(air: _Section) -> float:
+    """[kg/m^3] as declared, or in proportion to the pressure at room temperature."""
+    if "density_kg_m3" in air and "pressure_hPa" in air:
+        raise air.error("has both pressure_hPa and density_kg_m3; expected one of them. Keep the one you measured.")
+    if "density_kg_m3" in air:
+        return float(air.get("density_kg_m3", _positive))
+    return AIR_DENSITY * (float(air.get("pressure_hPa", _positive)) / STANDARD_PRESSURE)
 
 
 def _sensor(cameras: _Section, camera: str) -> SensorImages:

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.arrays import Array, Array32, Image
 from calibration.camera import StereoRig
-from disctrack.disc import Disc
+from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
 from disctrack.frames import CAMERAS
 from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
@@ -234,6 +234,8 @@ board_thickness_tolerance_mm = 0.0
 [gravity]
 g_m_s2 = {scene.gravity_m_s2!r}
 """
+    if scene.air_density_kg_m3 != AIR_DENSITY:
+        text += f"\n[air]\ndensity_kg_m3 = {scene.air_density_kg_m3!r}\n"
     if scene.imperfections == ImperfectionSettings():
         return text
     return "".join(line for line in text.splitlines(keepends=True) if "_tolerance_" not in line)

@@ -21,6 +21,10 @@ place of k, and |n| = 1 gives the height of O; nothing of this is singular at ka
 r_OA, and in slip n . v_A = 0 is differentiated with the rate of n. A rim with the support function p(beta), beta the
 angle of e in the body, is touched at p e + p' e3 x e (both at once: to first order in kappa p'). F_z stands for n . F.
 
+A table that moves by u(t) is at rest in its own axes, where gravity is g - u''. If it gives way by c F_z, then to first
+order in the compliance c the load is that of the rigid table, whose course F_z', F_z'' along the motion is had by
+differences over LOAD_STEP.
+
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
 thetadot, and (2.7) taken with Omega, the rate of the frame, not omega, that of the body.
@@ -43,6 +47,7 @@ ROLLING, SLIPPING, FLYING = 0, 1, 2
 EVENTS = ("theta_end", "load", "grip", "upright")
 N_EVENTS = len(EVENTS)
 STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
+LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
 LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
 
 # table: integers shared by all functions: regime, number of laws, addresses of kinematics and wrench, then the address
@@ -96,6 +101,7 @@ def _is_plain(body: Any) -> bool:
         and body.oval_s == 0.0
         and body.lobes_c == 0.0
         and body.lobes_s == 0.0
+        and body.flat_depth == 0.0
     )
 
 
@@ -115,7 +121,13 @@ def _support(body: Any, cb: Any, sb: Any) -> Any:
     c3, s3 = c2 * cb - s2 * sb, s2 * cb + c2 * sb
     two, three = body.oval_c * c2 + body.oval_s * s2, body.lobes_c * c3 + body.lobes_s * s3
     slope = 2.0 * (body.oval_s * c2 - body.oval_c * s2) + 3.0 * (body.lobes_s * c3 - body.lobes_c * s3)
-    return body.radius - body.edge_radius + two + three, slope, -4.0 * two - 9.0 * three
+    p, bend = body.radius - body.edge_radius + two + three, -4.0 * two - 9.0 * three
+    if body.flat_depth != 0.0:
+        k = body.flat_sharpness
+        along, across = cb * body.flat_cos + sb * body.flat_sin, sb * body.flat_cos - cb * body.flat_sin
+        dip = -body.flat_depth * np.exp(k * (along - 1.0))
+        p, slope, bend = p + dip, slope - k * across * dip, bend + k * (k * across * across - along) * dip
+    return p, slope, bend
 
 
 @_part
@@ -211,6 +223,7 @@ def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
         k.z, k.v_z = y[10], y[11]
     k.slip_n, k.slip_m = k.v_n + turn_n, k.v_m + turn_m
     k.radius, k.half_thickness, k.mass = body.radius, body.half_thickness, body.mass
+    k.air_density = body.air_density
     k.gravity = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
 
 
@@ -219,6 +232,9 @@ def _apply_laws(table: Any, w: Any) -> None:
     w.M_n = w.M_m = w.M_z = 0.0
     w.load_n = w.load_m = w.load_z = 0.0
     w.X_n = w.X_m = w.X_z = 0.0
+    w.table_x = w.table_y = w.table_z = 0.0
+    w.table_vx = w.table_vy = w.table_vz = 0.0
+    w.table_ax = w.table_ay = w.table_az = 0.0
     for i in range(table[1]):
         call_law(table[HEADER + 2 * i], table[HEADER + 1 + 2 * i], table[2], table[3])
 
@@ -248,7 +264,8 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     com = (body.com_1 * cf - body.com_2 * sf, body.com_1 * sf + body.com_2 * cf, body.com_3)
     D = _add(arm, _scale(-1.0, com))
     sp, cp = np.sin(kin.psi), np.cos(kin.psi)
-    g = _nodal(body.g_x * cp + body.g_y * sp, body.g_y * cp - body.g_x * sp, body.g_z, s, c)
+    g_x, g_y, g_z = body.g_x - w.table_ax, body.g_y - w.table_ay, body.g_z - w.table_az
+    g = _nodal(g_x * cp + g_y * sp, g_y * cp - g_x * sp, g_z, s, c)
     X = _nodal(w.X_n, w.X_m, w.X_z, s, c)
     M0 = _nodal(w.M_n, w.M_m, w.M_z, s, c)
     L = _nodal(w.load_n, w.load_m, w.load_z, s, c)
@@ -296,25 +313,78 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
 
 @_part
 def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    load = _course_of_load(t, y, table, body, kin, wrench)
     _kinematics(table[0], t, y, body, kin)
     _apply_laws(table, wrench)
+    wrench.table_z -= body.compliance * load[0]
+    wrench.table_vz -= body.compliance * load[1]
+    wrench.table_az -= body.compliance * load[2]
     return _accelerations(table[0], y, body, kin, wrench)
+
+
+@_part
+def _flow(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    """Rates of the first ten components on a rigid table; fills kinematics and wrench on the way."""
+    _kinematics(table[0], t, y, body, kin)
+    _apply_laws(table, wrench)
+    return _rates_of(y, kin, _accelerations(table[0], y, body, kin, wrench))
+
+
+@_part
+def _rates_of(y: Any, kin: Any, found: Any) -> Any:
+    omegadot, frame, a_O = found
+    s, c, sp, cp = kin.sin_theta, kin.cos_theta, np.sin(kin.psi), np.cos(kin.psi)
+    # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
+    relative = _cross(frame, (y[5], y[6], y[7]))
+    a_n, a_m = a_O[0], c * a_O[1] - s * a_O[2]
+    return (
+        kin.v_n * cp - kin.v_m * sp, kin.v_n * sp + kin.v_m * cp, kin.psidot, kin.thetadot, kin.phidot,
+        omegadot[0] - relative[0], omegadot[1] - relative[1], omegadot[2] - relative[2],
+        a_n * cp - a_m * sp, a_n * sp + a_m * cp,
+    )  # fmt: skip
+
+
+@_part
+def _moved(y: Any, h: float, rate: Any) -> Any:
+    """The state after h along these rates of its first ten components."""
+    return (
+        y[0] + h * rate[0], y[1] + h * rate[1], y[2] + h * rate[2], y[3] + h * rate[3], y[4] + h * rate[4],
+        y[5] + h * rate[5], y[6] + h * rate[6], y[7] + h * rate[7], y[8] + h * rate[8], y[9] + h * rate[9],
+        y[10], y[11],
+    )  # fmt: skip
+
+
+@_part
+def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    """F_z on the rigid table and its first two derivatives by time; zeros where the table does not give way."""
+    nothing = 0.0 * y[0]
+    if body.compliance == 0.0 or table[0] == FLYING:
+        return nothing, nothing, nothing
+    slips = table[0] == SLIPPING
+    v_x, v_y = (y[8], y[9]) if slips else (nothing, nothing)
+    here = (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], v_x, v_y, nothing, nothing)
+    first = _flow((t[0],), here, table, body, kin, wrench)
+    now, h = wrench.F_z, LOAD_STEP
+    middle = _flow((t[0] + 0.5 * h,), _moved(here, 0.5 * h, first), table, body, kin, wrench)
+    _flow((t[0] + h,), _moved(here, h, middle), table, body, kin, wrench)
+    after = wrench.F_z
+    middle = _flow((t[0] - 0.5 * h,), _moved(here, -0.5 * h, first), table, body, kin, wrench)
+    _flow((t[0] - h,), _moved(here, -h, middle), table, body, kin, wrench)
+    before = wrench.F_z
+    return now, (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
 
 
 def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
     """Time derivative of the state; fills kinematics and wrench on the way."""
-    omegadot, frame, a_O = _evaluate(t, y, table, body, kin, wrench)
-    s, c, sp, cp = kin.sin_theta, kin.cos_theta, np.sin(kin.psi), np.cos(kin.psi)
-    # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
-    relative = _cross(frame, (y[5], y[6], y[7]))
-    ydot[0], ydot[1] = kin.v_n * cp - kin.v_m * sp, kin.v_n * sp + kin.v_m * cp
-    ydot[2], ydot[3], ydot[4] = kin.psidot, kin.thetadot, kin.phidot
-    ydot[5], ydot[6], ydot[7] = omegadot[0] - relative[0], omegadot[1] - relative[1], omegadot[2] - relative[2]
+    found = _evaluate(t, y, table, body, kin, wrench)
+    rate = _rates_of(y, kin, found)
+    ydot[0], ydot[1], ydot[2], ydot[3], ydot[4] = rate[0], rate[1], rate[2], rate[3], rate[4]
+    ydot[5], ydot[6], ydot[7] = rate[5], rate[6], rate[7]
     if table[0] != ROLLING:
-        a_n, a_m = a_O[0], c * a_O[1] - s * a_O[2]
-        ydot[8], ydot[9] = a_n * cp - a_m * sp, a_n * sp + a_m * cp
+        ydot[8], ydot[9] = rate[8], rate[9]
     if table[0] == FLYING:
-        ydot[10], ydot[11] = kin.v_z, s * a_O[1] + c * a_O[2]
+        a_O = found[2]
+        ydot[10], ydot[11] = kin.v_z, kin.sin_theta * a_O[1] + kin.cos_theta * a_O[2]
 
 
 def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:

@@ -9,14 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.arrays import Array
-from disctrack.disc import Disc
+from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.rolling.effects import Effect
 from disctrack.rolling.records import KINEMATICS, WRENCH, record_dtype
 
 _K = np.array([0.0, 0.0, 1.0])
 
 
-def kinematics(q: Array, qdot: Array, disc: Disc, gravity: float = 9.81, time: ArrayLike = 0.0) -> np.recarray:
+def kinematics(
+    q: Array,
+    qdot: Array,
+    disc: Disc,
+    gravity: float = 9.81,
+    time: ArrayLike = 0.0,
+    air_density: float = AIR_DENSITY,
+) -> np.recarray:
     """Kinematic quantities (...) of records.KINEMATICS from coordinates and rates (..., 6); a record array.
 
     The slip is that of the disc's material point at the contact, from the velocity of O given in qdot.
@@ -36,7 +43,7 @@ def kinematics(q: Array, qdot: Array, disc: Disc, gravity: float = 9.81, time: A
         "omega_z": psidot + phidot * c,
         "slip_n": v_n - h * omega2 + r * omega3,
         "slip_m": v_m + (r * s + h * c) * thetadot,
-        **dict(radius=r, half_thickness=h, mass=disc.mass, gravity=gravity),
+        **dict(radius=r, half_thickness=h, mass=disc.mass, gravity=gravity, air_density=air_density),
         **dict(normal_n=0.0, normal_m=0.0, normal_z=1.0),
     }
     result = np.empty(theta.shape, record_dtype(KINEMATICS, float))

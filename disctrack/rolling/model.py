@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.disc import Disc
+from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.rolling.effects import Effect, EffectParameter, ModelError, effect_class, effect_from_formulas
 from disctrack.rolling.records import BODY
 
@@ -23,6 +23,7 @@ class Model:
     disc: Disc
     gravity: float = 9.81  # [m/s^2] along -k, unless an effect says otherwise
     effects: tuple[Effect, ...] = ()
+    air_density: float = AIR_DENSITY  # [kg/m^3]
     laws: tuple[type[Effect], ...] = ()  # by formula, that parameters may name beside those of the catalogue
 
     def __post_init__(self) -> None:
@@ -34,6 +35,8 @@ class Model:
                 raise ModelError(f"effect '{name}' is in the model twice: give it once, with the sum of its amounts")
         if not (np.isfinite(self.gravity) and self.gravity > 0):
             raise ModelError(f"gravity is {self.gravity} m/s^2: expected a positive number")
+        if not (np.isfinite(self.air_density) and self.air_density >= 0):
+            raise ModelError(f"the density of the air is {self.air_density} kg/m^3: expected a number from 0 on")
 
     @property
     def values(self) -> dict[str, float]:
@@ -102,6 +105,7 @@ def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | N
     body.J_11 = body.J_22 = disc.moment_diametral
     body.J_33 = disc.moment_axial
     body.g_z = -model.gravity
+    body.air_density = model.air_density
     body.theta_end = theta_end
     for effect in model.effects:
         if effect.adjust is not None:

@@ -95,6 +95,15 @@ def coordinates(kinematics: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     return q, qdot
 
 
+def as_seen(kinematics: NDArray[Any], wrench: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Q and qdot (n, 6) in the axes of cameras at rest, from records (n,): the table may move in them."""
+    q, qdot = coordinates(kinematics)
+    for i, axis in enumerate("xyz"):
+        q[..., i] += wrench[f"table_{axis}"]
+        qdot[..., i] += wrench[f"table_v{axis}"]
+    return q, qdot
+
+
 @dataclass(frozen=True)
 class MotionSamples:
     """Raw answers of the compiled equations at n times."""
@@ -117,7 +126,7 @@ def motion_from_samples(
 ) -> Motion:
     """All quantities of a `Motion` from the solution's samples; `body` is a record (1,) of records.BODY."""
     k, w, b = samples.kinematics, samples.wrench, body[0]
-    q, qdot = coordinates(k)
+    q, qdot = as_seen(k, w)
     omega_nodal = np.stack([k["thetadot"], k["omega2"], k["omega3"]], axis=-1)
     frame_nodal = np.stack([k["thetadot"], k["omega2"], k["psidot"] * k["cos_theta"]], axis=-1)
     omegadot_nodal = samples.rates[:, 5:8] + np.cross(frame_nodal, omega_nodal)
@@ -143,7 +152,10 @@ def motion_from_samples(
     slip = np.stack([k["slip_n"], k["slip_m"]], axis=-1)
     slip[samples.regime == Regime.ROLLING] = 0.0
     slip_power = np.where(samples.regime == Regime.SLIPPING, w["F_n"] * k["slip_n"] + w["F_m"] * k["slip_m"], 0.0)
-    external_power = np.sum(external * np.stack([k["v_n"], k["v_m"], k["v_z"]], axis=-1), axis=-1)
+    to_contact = np.swapaxes(contact_axes, 1, 2)
+    external_power = np.sum(external * np.einsum("nij,nj->ni", to_contact, qdot[:, :3]), axis=-1)
+    table_velocity = np.stack([w[f"table_v{a}"] for a in "xyz"], axis=-1)
+    table_power = np.sum(force * np.einsum("nij,nj->ni", to_contact, table_velocity), axis=-1)
     return Motion(
         model=model,
         time=samples.time,
@@ -160,7 +172,7 @@ def motion_from_samples(
         contact_moment=moment,
         external_force=external,
         slip_velocity=slip,
-        power=moment_power(k, moment) + external_power + slip_power,
+        power=moment_power(k, moment) + external_power + slip_power + table_power,
         regime=samples.regime,
         switches=tuple(switches),
         end=end,

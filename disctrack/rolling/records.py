@@ -43,6 +43,7 @@ KINEMATICS = (
     "half_thickness",
     "mass",
     "gravity",  # magnitude [m/s^2]
+    "air_density",  # [kg/m^3]
     "normal_n",  # of the table at the contact
     "normal_m",
     "normal_z",
@@ -64,6 +65,9 @@ WRENCH = (
     "F_z",
     "N",  # its part along the normal of the table at the contact: F_z on a flat one
     "T",  # and the size of the rest, which friction has to supply
+    *(f"table_{a}" for a in "xyz"),  # where the table is, in the axes of cameras at rest [m]; q is relative to it
+    *(f"table_v{a}" for a in "xyz"),  # its velocity [m/s]
+    *(f"table_a{a}" for a in "xyz"),  # and acceleration [m/s^2]
 )
 
 # Constants of one body on one table. Inertia about the centre of mass in body axes.
@@ -76,6 +80,11 @@ BODY = (
     "oval_s",  # angle beta in the body [m]
     "lobes_c",
     "lobes_s",
+    "flat_depth",  # of a flat of the rim: support function less depth exp(sharpness (cos(beta - angle) - 1)) [m]
+    "flat_cos",  # of its angle in the body
+    "flat_sin",
+    "flat_sharpness",  # 1 / width^2 [1/rad^2]
+    "compliance",  # of the table: it sinks by so much per load [m/N]
     "curvature",  # of the table, a sphere through the origin: positive in a hollow [1/m]
     "slope_x",  # of the table at the origin, descending towards i, and j
     "slope_y",
@@ -91,6 +100,7 @@ BODY = (
     "g_x",  # gravity in world axes [m/s^2]
     "g_y",
     "g_z",
+    "air_density",  # [kg/m^3]
     "inverse_friction",  # 1/mu of Coulomb's law; 0 = never slips
     "theta_end",  # the motion ends here [rad]
 )

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from calibration.arrays import Array
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
-from disctrack.rolling.motion import EndReason, coordinates
+from disctrack.rolling.motion import EndReason, as_seen
 from disctrack.rolling.records import STATE_COMPONENTS
 from disctrack.rolling.simulate import MAX_SWITCHES, RTOL, _grid, _start, follow
 from disctrack.rolling.state import State
@@ -61,7 +61,7 @@ def sensitivities(
     q, qdot = np.full((2, len(grid), 6), np.nan)
     path = follow(Assembly(enlarged, theta_end), y0, grid, rtol, max_switches)
     n = len(path.samples.time)
-    q[:n], qdot[:n] = coordinates(path.samples.kinematics)
+    q[:n], qdot[:n] = as_seen(path.samples.kinematics, path.samples.wrench)
     if path.end is EndReason.CHATTER:
         return Sensitivities(grid, q, qdot, names, dq, dqdot)
     for column, name in enumerate(names):
@@ -72,7 +72,7 @@ def sensitivities(
             values = {name: enlarged.values[name] + 1j * _SEED}
         path = follow(Assembly(enlarged, theta_end, complex, values), y, grid, rtol)
         n = len(path.samples.time)
-        complex_q, complex_qdot = coordinates(path.samples.kinematics)
+        complex_q, complex_qdot = as_seen(path.samples.kinematics, path.samples.wrench)
         dq[:n, :, column], dqdot[:n, :, column] = complex_q.imag / _SEED, complex_qdot.imag / _SEED
     return Sensitivities(grid, q, qdot, names, dq, dqdot)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from disctrack.disc import MA_2014, Disc, disc_from_mm
+from disctrack.disc import AIR_DENSITY, MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
 from disctrack.files.toml_tree import build, read_toml, toml_lines
 
@@ -258,6 +258,7 @@ class Scene:
     name: str = "scene"
     seed: int = 1
     gravity_m_s2: float = 9.81
+    air_density_kg_m3: float = AIR_DENSITY
     cameras: CameraSettings = field(default_factory=CameraSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     optics: OpticsSettings = field(default_factory=OpticsSettings)
@@ -357,6 +358,7 @@ def _check(scene: Scene, where: str) -> None:
         "markers.diameter_mm": scene.markers.diameter_mm,
         "board.square_mm": board.square_mm,
         "gravity_m_s2": scene.gravity_m_s2,
+        "air_density_kg_m3": scene.air_density_kg_m3,
         "faults.pattern_scale": scene.faults.pattern_scale,
         "faults.left.focal_scale": scene.faults.left.focal_scale,
         "faults.right.focal_scale": scene.faults.right.focal_scale,

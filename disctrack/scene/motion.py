@@ -99,7 +99,8 @@ def rolling_model(scene: Scene) -> Model:
     from disctrack.rolling import Model, effects_from_tables
 
     settings = scene.motion.rolling
-    return Model(scene.declared_disc, scene.gravity_m_s2, effects_from_tables(settings.effects, settings.formulas))
+    effects = effects_from_tables(settings.effects, settings.formulas)
+    return Model(scene.declared_disc, scene.gravity_m_s2, effects, scene.air_density_kg_m3)
 
 
 def effects_in_words(scene: Scene) -> str:

@@ -183,6 +183,7 @@ def measure(
         **pairs.camera_headers(),
     }
     trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
+    trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     return Measurement(trajectory, tuple(unreadable), findings, seconds)

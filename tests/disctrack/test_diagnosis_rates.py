@@ -35,7 +35,8 @@ def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
     candidate = candidate_of(system, planted.truth)
     base = tuple(q for q in system.base if q.name not in candidate.names)
-    found = fit(system, (*base, *candidate.quantities), system.start())
+    of_shape = {k: v for k, v in planted.effects.items() if k not in planted.truth}
+    found = fit(system, (*base, *candidate.quantities), system.start() | of_shape)
     assert found.converged
     # 3600 numbers: 1 +- 0.024
     assert found.reduced_chi_square < 1.1

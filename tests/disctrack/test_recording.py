@@ -70,6 +70,20 @@ def test_every_key_of_the_reference_recording_is_known(shared_data):
     assert named == {(s, k) for s, values in recording.declared.items() if isinstance(values, dict) for k in values}
 
 
+@pytest.mark.parametrize(
+    ("air", "density"),
+    [("", 1.2), ("[air]\npressure_hPa = 101.325\n", 0.12), ("[air]\ndensity_kg_m3 = 0.3\n", 0.3)],
+)
+def test_density_of_the_air_is_declared_or_follows_from_the_pressure(tmp_path, air, density):
+    assert read_recording(write(tmp_path, REFERENCE + air)).air_density == pytest.approx(density)
+
+
+def test_pressure_and_density_of_the_air_are_not_declared_both(tmp_path):
+    both = REFERENCE + "[air]\npressure_hPa = 1000\ndensity_kg_m3 = 1.2\n"
+    assert "both pressure_hPa and density_kg_m3" in message(tmp_path, both)
+    assert "density_kg_m3 is -1" in message(tmp_path, REFERENCE + "[air]\ndensity_kg_m3 = -1\n")
+
+
 def test_a_shared_rig_replaces_views_and_table(tmp_path):
     start, end = REFERENCE.index("[calibration]"), REFERENCE.index("[gravity]")
     text = REFERENCE[:start] + '[calibration]\nrig = "../rig.h5"\n' + REFERENCE[end:]

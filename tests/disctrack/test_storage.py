@@ -86,6 +86,7 @@ def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
         ),
         frame_rate=1000.0,
         gravity=9.81,
+        air_density=0.3,
     )
 
 

@@ -21,7 +21,8 @@ def one(name, belongs_to, **more):
 
 
 class Decay:
-    def __init__(self, observed):
+    def __init__(self, observed, density=1.0):
+        self.root_density = density**0.5
         self.time, self.observed, self.weights = TIME, observed, np.ones(len(TIME))
         self.base = (Quantity("state.a", "1", 0.1), Quantity("state.b", "1", 0.1),
                      Quantity("friction.g", "1/s", 0.01, null=1.0, belongs_to=CONTACT))  # fmt: skip
@@ -36,12 +37,12 @@ class Decay:
         t, g = TIME, get("friction.g", 1.0)
         fall = np.exp(-g * t)
         by = {
-            "state.a": fall, "state.b": np.ones_like(t), "drag.c": t * fall, "growth.k": t**2,
+            "state.a": fall, "state.b": np.ones_like(t), "drag.c": self.root_density * t * fall, "growth.k": t**2,
             "hum.c": np.cos(9 * t), "hum.s": np.sin(9 * t),
         }  # fmt: skip
         linear = {k: v for k, v in by.items() if k in values}
         predicted = sum((get(k) * v for k, v in linear.items()), np.zeros_like(t))
-        by["friction.g"] = -t * fall * (get("state.a") + t * get("drag.c"))
+        by["friction.g"] = -t * fall * (get("state.a") + t * self.root_density * get("drag.c"))
         J = np.array([by[n] for n in names]).reshape(len(names), len(t)).T / SIGMA
         return ((self.observed - predicted) / SIGMA)[:, None], J[:, None]
 
@@ -51,12 +52,10 @@ class DecayMember:
 
     def __init__(self, item):
         name, observed, labels, covariates, density = item
-        self.system = Decay(observed)
+        self.system = Decay(observed, density)
         self.base = fit(self.system, self.system.base, {"state.a": 1.0, "state.b": 0.0, "friction.g": 1.0})
         candidates = self.system.candidates
-        powers = {"drag": 0.5}
-        told = (name, self.system.base, candidates, self.base.values, len(TIME), labels, covariates, density)
-        self.member = Member(*told, density_powers=powers)
+        self.member = Member(name, self.system.base, candidates, self.base.values, len(TIME), labels, covariates)
 
     def share(self, own):
         mine = [q for q in self.system.base if q.name in own]
@@ -78,9 +77,9 @@ def runs(rng, n, drag=0.0, rate=0.8, **changed):
         own = {"rate": rate, "drag": drag, "growth": 0.0, "mass": 1.0, "density": 1.0, **changed.get(f"run_{i}", {})}
         truth = {"state.a": 1 + 0.2 * rng.standard_normal(), "state.b": 0.1 * rng.standard_normal(),
                  "friction.g": own["rate"], "drag.c": own["drag"], "growth.k": own["growth"]}  # fmt: skip
-        clean = -Decay(np.zeros_like(TIME)).linearise(truth, [])[0][:, 0] * SIGMA
+        clean = -Decay(np.zeros_like(TIME), own["density"]).linearise(truth, [])[0][:, 0] * SIGMA
         labels = {"disc": f"{own['mass']:g} kg", "surface": "glass", "rig": "rig 1", "air": f"{own['density']:g}"}
-        covariates = {"mass": own["mass"], "pressure": own["density"]}
+        covariates = {"mass": own["mass"], "density": own["density"]}
         items.append((f"run {i}", clean + SIGMA * rng.standard_normal(len(TIME)), labels, covariates, own["density"]))
     return items
 
@@ -89,7 +88,7 @@ def fitted_at_once(items, extra=()):
     """Every quantity of every run in one least-squares problem, by SciPy: values and sigmas of g and `extra`, cost."""
     from scipy.optimize import least_squares
 
-    systems = [Decay(data) for _, data, *_ in items]
+    systems = [Decay(data, density) for _, data, _, _, density in items]
     names = ["friction.g", *extra]
 
     def misfit(x):

@@ -51,6 +51,9 @@ def true_motion(body: newton_euler.Disc, theta_deg: float, omega3: float, durati
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)  # thin disc, centre at rest
     state = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, omega3)
     times = np.arange(0.0, duration + 2 * LEAD, 1.0 / (SAMPLES * rate))
+    if body.gives_way:
+        body.table = newton_euler.yielding(body, state, times)
+        state = newton_euler.state_from_angles(body.at(0.0), 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, omega3)
     answer = newton_euler.follow(body, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
     assert answer.success
     q = newton_euler.coordinates(body, answer.y)

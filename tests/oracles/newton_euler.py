@@ -6,8 +6,11 @@ written once more from their published form. Slow, and meant to be.
 State: O (3), quaternion (4), velocity of O (3), omega (3), all in world axes; psi and phi by quadrature (2).
 """
 
+from copy import copy
+
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
 K = np.array([0.0, 0.0, 1.0])
@@ -29,10 +32,16 @@ class Disc:
         laws=(),
         bowl=None,
         waves=(),
+        dips=(),
+        table=None,
+        gives_way=0.0,
     ):
         self.r, self.h, self.m, self.edge, self.mu, self.laws = r, h, m, edge, mu, laws
         self.bowl = None if bowl is None else (np.array(bowl[0], float), bowl[1])  # centre and radius of a sphere
         self.waves = waves  # of the rim: (number around, cosine, sine) of its support function
+        self.dips = dips  # of the rim: (depth, angle in the body, width)
+        self.gives_way = gives_way  # compliance of a table that `yielding` makes move [m/N]
+        self.table = table  # t -> displacement, velocity, acceleration in the axes of the world; None: at rest
         self.g = np.array(gravity, float)
         J1 = m * r * r / 4 + m * h * h / 3
         self.J = np.diag([J1, J1, m * r * r / 2]) if J_body is None else np.array(J_body, float)
@@ -87,14 +96,15 @@ class Instant:
         self.normal, self.normal_rate = K, np.zeros(3)
         if disc.bowl is not None:
             self.touch_the_bowl(disc, d, d_rate)
-        if disc.waves:
+        if disc.waves or disc.dips:
             self.touch_with_the_rim(disc, d, d_rate, e2, e2_rate)
         self.n0 = np.cross(e2, d)  # e1 = e2 x e3
         self.m0 = np.cross(K, self.n0)
         self.psidot = (d[0] * d_rate[1] - d[1] * d_rate[0]) / sine**2
         self.phidot = self.omega @ d - self.psidot * d[2]
         self.thetadot = self.omega @ self.n0
-        self.v_contact = self.v + np.cross(self.omega, self.arm)
+        self.u, self.u_rate, self.u_acceleration = (np.zeros(3),) * 3 if disc.table is None else disc.table(disc.t)
+        self.v_contact = self.v + np.cross(self.omega, self.arm) - self.u_rate  # past the table
 
     def touch_the_bowl(self, disc, d, d_rate):
         """A sharp edge in a sphere seen from inside: the point of the rim that is farthest from its centre."""
@@ -124,6 +134,11 @@ class Instant:
             p += c * np.cos(k * angle) + s * np.sin(k * angle)
             slope += k * (s * np.cos(k * angle) - c * np.sin(k * angle))
             bend -= k * k * (c * np.cos(k * angle) + s * np.sin(k * angle))
+        for depth, middle, width in disc.dips:
+            off, k = angle - middle, width**-2
+            dip = depth * np.exp(k * (np.cos(off) - 1))
+            p, slope = p - dip, slope + k * np.sin(off) * dip
+            bend += k * (np.cos(off) - k * np.sin(off) ** 2) * dip
         self.arm = p * e + slope * along - disc.h * d
         self.arm_rate = (slope * e + bend * along) * angle_rate - p * e2_rate + slope * along_rate - disc.h * d_rate
 
@@ -148,9 +163,9 @@ def accelerations(disc, state, regime):
     n = now.normal
     A[3:6, 0:3], A[3:6, 3:6], A[3:6, 6:9] = m * S(rho), J_O, -S(now.arm) - np.outer(M_load, n)
     b[3:6] = M_fixed + np.cross(rho, m * disc.g) - np.cross(w, J_O @ w)
-    # a + wd x arm + w x arm_rate = 0, all of it (rolling) or its vertical part (slipping), or F = 0
+    # a + wd x arm + w x arm_rate = the table's, all of it (rolling) or its vertical part (slipping), or F = 0
     constraint = np.hstack([np.eye(3), -S(now.arm), np.zeros((3, 3))])
-    right = -np.cross(w, now.arm_rate)
+    right = now.u_acceleration - np.cross(w, now.arm_rate)
     if regime == "rolling":
         A[6:9], b[6:9] = constraint, right
     elif regime == "slipping":
@@ -184,11 +199,12 @@ def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, vel
 
         state[2] = brentq(gap, state[2] - 0.03, state[2] + 0.03, xtol=1e-16, rtol=1e-15)
         now = Instant(disc, state)
-    state[7:10] = -np.cross(omega, now.arm)
+    state[7:10] = -np.cross(omega, now.arm) + now.u_rate
+    state[:3] += now.u
     if velocity is not None:
         n = now.normal
-        state[7:9] = velocity
-        slip = state[7:10] + np.cross(omega, now.arm)
+        state[7:9] = velocity + now.u_rate[:2]
+        slip = state[7:10] + np.cross(omega, now.arm) - now.u_rate
         state[9] -= slip @ n / n[2]
     return state
 
@@ -266,6 +282,39 @@ def vibration(cosine, sine, frequency):
     """Of a table, in its own axes; accelerations."""
     course = lambda t: np.cos(2 * np.pi * frequency * t) * cosine + np.sin(2 * np.pi * frequency * t) * sine  # noqa: E731
     return lambda disc, now: (ZERO, ZERO, -disc.m * course(disc.t))
+
+
+def swing(cosine, sine, frequency, start=0.0):
+    """A table that swings under cameras at rest; displacements, with the phase that they have at `start`."""
+    w = 2 * np.pi * frequency
+
+    def course(t):
+        c, s = np.cos(w * (t - start)), np.sin(w * (t - start))
+        return c * cosine + s * sine, w * (c * sine - s * cosine), -w * w * (c * cosine + s * sine)
+
+    return course
+
+
+def yielding(disc, start, times, **integration):
+    """The course of a table that has given way to the load of the motion on the rigid one, by a spline."""
+    rigid = copy(disc)
+    rigid.table = None
+    solution = follow(rigid, start, times, **integration)
+    load = [accelerations(rigid.at(t), s, "rolling")[2][2] for t, s in zip(times, solution.y.T, strict=True)]
+    sunk = make_interp_spline(times, -disc.gives_way * np.array(load), k=7)
+    return lambda t: tuple(sunk(t, order) * K for order in range(3))
+
+
+def bildsten(beta, density, viscosity=1.81e-5):
+    def law(disc, now):
+        size = beta * np.sqrt(density * viscosity) * disc.r**4 * abs(now.psidot) ** 1.5
+        return -size * np.sign(now.psidot) / now.sine * now.m0, ZERO, ZERO
+
+    return law
+
+
+def quadratic_air(a, density):
+    return lambda disc, now: (-a * density * disc.r**5 * np.linalg.norm(now.omega) * now.omega, ZERO, ZERO)
 
 
 def linear_drag(c):

@@ -10,7 +10,8 @@ from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, ModelEr
 from disctrack.rolling.effects import catalogue_table, effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
-LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None]
+MOVES_THE_TABLE = ("table_shaken",)  # and exerts nothing in its axes
+LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None and name not in MOVES_THE_TABLE]
 
 
 def random_motion(rng, n, counter_rotating):
@@ -174,6 +175,23 @@ def test_load_dependent_moments_are_solved_with_the_acceleration_not_lagged():
     second = np.gradient(np.gradient(height, motion.time, edge_order=2), motion.time, edge_order=2)
     # F_z is read from the equations, the height from their solution: 1 ms differences of a 30 rad/s motion
     assert_allclose(F_z[3:-3], MA_2014.mass * (9.81 + second[3:-3]), rtol=0.02)
+
+
+@pytest.mark.parametrize(("name", "power"), [("air_moffatt", 0.0), ("air_bildsten", 0.5), ("air_quadratic", 1.0)])
+def test_every_law_of_the_air_reads_its_density(name, power):
+    """Declared, or by the effect `air`: an amount in thin air is the power of the density smaller in ordinary air."""
+    state, times = steady_precession(np.radians(9), MA_2014), np.linspace(0, 0.3, 31)
+    q = lambda model: rolling.simulate(model, state, times=times).q  # noqa: E731
+    amount = CATALOGUE[name].parameters[0]
+    law = CATALOGUE[name](**{amount.name: 20 * amount.nominal})
+    thin = q(Model(MA_2014, effects=(law,), air_density=0.12))
+    assert_allclose(q(Model(MA_2014, effects=(law, CATALOGUE["air"](density=0.1)))), thin, rtol=1e-13)
+    weaker = CATALOGUE[name](**{amount.name: 20 * amount.nominal * 0.1**power})
+    assert_allclose(q(Model(MA_2014, effects=(weaker,))), thin, rtol=0, atol=1e-10)
+    usual = q(Model(MA_2014, effects=(law,)))
+    assert (np.abs(usual - thin).max() > 1e-4) == (power > 0)
+    with pytest.raises(ModelError, match="density of the air"):
+        Model(MA_2014, air_density=-0.1)
 
 
 def test_an_effect_written_as_a_formula_is_the_effect_written_as_a_class():

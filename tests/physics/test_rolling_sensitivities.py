@@ -45,8 +45,8 @@ def test_derivative_by_the_initial_state(component):
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_derivative_by_every_parameter_of_the_catalogue(name):
     effect, parameter = name.split(".")
-    # a phase of 2 pi f t may turn by 0.02 rad in 0.3 s
-    step = 0.01 if parameter == "frequency" else 0.02 * CATALOGUE[effect]().values[parameter]
+    # a phase of 2 pi f t may turn by 0.02 rad in 0.3 s, an angle by 0.01 rad
+    step = 0.01 if parameter in ("frequency", "angle") else 0.02 * CATALOGUE[effect]().values[parameter]
     model = MODEL.with_effects(CATALOGUE[effect]())
     found = rolling.sensitivities(model, STATE, TIMES, [name], components=[])
     assert found.names == (name,)

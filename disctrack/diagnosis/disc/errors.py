@@ -125,7 +125,7 @@ def simulated(system: DiscSystem, values: Values) -> Motion:
 def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
     """Energy lost in the recording [J], and the work of each effect, in the fitted motion."""
     motion = simulated(system, values)
-    k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time)
+    k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time, system.model.air_density)
     balance = {"lost": float(motion.energy[0] - motion.energy[-1])}
     for effect in motion.model.effects:
         if effect.law is not None:

@@ -508,7 +508,7 @@ def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:
     from disctrack.diagnosis.disc.errors import simulated
 
     motion = simulated(system, fit.values)
-    k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time)
+    k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time, system.model.air_density)
     effect = motion.model.effect(law.candidate.effect)
     if effect is None:
         return np.zeros((len(motion), 3))

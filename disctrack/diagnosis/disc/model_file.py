@@ -33,9 +33,9 @@ class Declared:
 def declared_model(trajectory: Trajectory, choice: str = PAPER) -> Declared:
     """Model by name or file: "paper" (rolling with the paper's k_m), "none" (no losses), or a saved model or scene.
 
-    The disc and gravity are those of the trajectory. Raises AnalysisError, SceneError, ModelError.
+    Disc, gravity and air are those of the trajectory. Raises AnalysisError, SceneError, ModelError.
     """
-    bare = Model(trajectory.disc, trajectory.gravity)
+    bare = Model(trajectory.disc, trajectory.gravity, air_density=trajectory.air_density)
     if choice == PAPER:
         return Declared(bare.with_effects(CATALOGUE["km"]()), {}, choice)
     if choice == NONE:
@@ -55,7 +55,8 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
     """
     model = system.model_with(values)
     state = {k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")}
-    scene = scene_with_rig(Scene(name=name, gravity_m_s2=model.gravity), system.rig)
+    scene = Scene(name=name, gravity_m_s2=model.gravity, air_density_kg_m3=model.air_density)
+    scene = scene_with_rig(scene, system.rig)
     disc = model.disc
     scene = replace(
         scene,

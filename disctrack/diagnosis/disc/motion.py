@@ -86,7 +86,8 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
         for name, members in parts.items():
             quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
             shape = tuple(effect_quantity(effect, p) for p in effect.parameters if p.is_shape)
-            found.append(Candidate(name, effect.name, "motion", effect.title, effect.source, quantities, shape=shape))
+            told = (name, effect.name, "motion", effect.title, effect.source, quantities)
+            found.append(Candidate(*told, shape=shape, sought=effect.sought))
         if effect.name == "slip":
             found.append(slip_candidate(effect))
     return tuple(found)

@@ -19,12 +19,12 @@ from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, triangle
 from disctrack.diagnosis.engine.score import Linearisation, score
 from disctrack.diagnosis.engine.search import Diagnosis
-from disctrack.diagnosis.engine.system import Candidate, Quantity
+from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.reduction import Reduction
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.frames import rotation_from_euler
-from disctrack.rolling import CATALOGUE, State, simulate, steady_precession
+from disctrack.rolling import State, simulate, steady_precession
 from disctrack.trajectory import MarkerStatus
 
 NUTATIONS_DEG = (3.0, 8.0, 15.0, 30.0)
@@ -222,7 +222,7 @@ class Planner:
             if q.name.startswith("rig."):
                 mixing[row, : system.rig_directions.shape[1]] = system.rig_directions[int(q.name[4:])]
             elif not (another and q.belongs_to == ("disc",)) and q.name in self.column:
-                mixing[row, self.column[q.name]] = _density_factor(q, proposal.pressure)
+                mixing[row, self.column[q.name]] = 1.0
         return np.asarray(triangle(reduced.matrix @ mixing) / np.sqrt(self._noise), float)
 
     def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
@@ -230,9 +230,6 @@ class Planner:
         system = self.system
         disc = _changed(system.disc, proposal)
         values = {k: v for k, v in self.fit.values.items() if not k.startswith(("state.", "rig.", "dot_"))}
-        for q in self.tested:
-            if q.name in values:
-                values[q.name] = q.null + (values[q.name] - q.null) * _density_factor(q, proposal.pressure)
         start = state_of(self.fit.values)
         if proposal.theta_deg is not None:
             start = steady_precession(
@@ -261,7 +258,8 @@ def planned_recording(
 ) -> DiscSystem:
     """The same cameras and noise, another motion; raises DiscTrackError where that motion is too short."""
     old, proposal, disc = system.trajectory, proposal or Proposal(), disc or system.disc
-    model = replace(system.model_with(values), disc=disc)
+    density = old.air_density * proposal.pressure
+    model = replace(system.model_with(values), disc=disc, air_density=density)
     rate = old.frame_rate * proposal.rate
     motion = simulate(model, start, duration, rate=rate, theta_end=MIN_THETA)
     n, m = len(motion), disc.n_markers
@@ -289,9 +287,11 @@ def planned_recording(
         marker_status=np.where(inside, MarkerStatus.MEASURED, MarkerStatus.OUTSIDE).astype(np.uint8),
         disc=disc,
         frame_rate=rate,
+        air_density=density,
     )
     stretch = Stretch(slice(0, n))
-    return DiscSystem(trajectory, replace(system.model, disc=disc), stretch=stretch, systematic=system.systematic)
+    known = replace(system.model, disc=disc, air_density=density)
+    return DiscSystem(trajectory, known, stretch=stretch, systematic=system.systematic)
 
 
 def _changed(disc: Disc, proposal: Proposal) -> Disc:
@@ -302,12 +302,6 @@ def _changed(disc: Disc, proposal: Proposal) -> Disc:
         radius=disc.radius * proposal.radius,
         marker_centres_body=disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0],
     )
-
-
-def _density_factor(q: Quantity, pressure: float) -> float:
-    effect = CATALOGUE.get(q.name.partition(".")[0])
-    power = effect.density_power if effect is not None else None
-    return 1.0 if power is None else float(pressure**power)
 
 
 def _cleared(column: Array, others: Array) -> Array:
@@ -393,7 +387,7 @@ def open_questions(diagnosis: Diagnosis, system: DiscSystem, most: int = 6) -> t
     single = [
         c
         for c in system.candidates
-        if c.kind == "motion" and len(c.quantities) == 1 and not c.threshold and c.name not in named
+        if c.kind == "motion" and len(c.quantities) == 1 and not (c.threshold or c.sought) and c.name not in named
     ]
     linear = Linearisation(system, diagnosis.after, single)
 

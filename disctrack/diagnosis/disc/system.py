@@ -21,6 +21,7 @@ from disctrack.diagnosis.disc.motion import (
     state_of,
     state_quantities,
 )
+from disctrack.diagnosis.disc.sought import sought
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.diagnosis.engine.fit import triangle
@@ -251,7 +252,12 @@ class DiscSystem:
         return self.model.with_values(effects)
 
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
-        """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time."""
+        """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time.
+
+        For others: values of the shape, where that has to be looked for.
+        """
+        if not candidate.threshold:
+            return sought(self, candidate, values)
         motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
         needed = float(np.max(motion.friction_needed))
         return [(1.0 / (share * needed),) for share in SLIP_STARTS]

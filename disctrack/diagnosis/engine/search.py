@@ -143,6 +143,7 @@ class _Search:
     def __init__(self, system: System, settings: Settings, rows: Mask | None = None) -> None:
         self.system, self.settings = system, settings
         self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
+        self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
         self.refits: dict[str, Trial] = {}
         self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
@@ -158,8 +159,8 @@ class _Search:
         self.noise = self._noise(base)
         current = Trial((), base, 0.0, self._held_out(base), 0.0)
         before = current
-        linear = Linearisation(self.system, base, self.system.candidates)
-        scores = score_all(linear, self.system.candidates)
+        linear = Linearisation(self.system, base, self.candidates)
+        scores = score_all(linear, self.candidates)
         by_chance = chance(linear, scores, self.noise) if scores else None
         while len(current.candidates) < self.settings.max_effects:
             better = self._next(current, linear, scores if not current.candidates else None)
@@ -168,7 +169,7 @@ class _Search:
             current = self._pruned(better)
             # a large effect reaches into the fast part of the residual: with it in the model, the noise is seen better
             self.noise = min(self.noise, self._noise(current.fit))
-            linear = Linearisation(self.system, current.fit, self.system.candidates)
+            linear = Linearisation(self.system, current.fit, self.candidates)
         if current.candidates and not self._worth_naming(before, current):
             return replace(self._answer(before, before, (), scores, partial=current), chance=by_chance)
         current = self._standing(current)
@@ -291,7 +292,7 @@ class _Search:
     ) -> list[tuple[Candidate, ...]]:
         """Candidates, and pairs of them where one alone will not do, that are worth a refit."""
         taken = {c.name for c in current.candidates}
-        scores = scores or score_all(linear, [c for c in self.system.candidates if c.name not in taken])
+        scores = scores or score_all(linear, [c for c in self.candidates if c.name not in taken])
         if not scores:
             return []
         ranked = sorted(scores, key=lambda s: self._price([s.candidate]) - s.gain / self.noise)
@@ -411,11 +412,11 @@ class _Search:
         effect = trial.candidates[position]
         rest = tuple(c for c in trial.candidates if c is not effect)
         reduced = _restricted(trial.fit, self._quantities(rest))
-        linear = Linearisation(self.system, reduced, self.system.candidates)
+        linear = Linearisation(self.system, reduced, self.candidates)
         amount = np.array([trial.fit.values[q.name] - q.null for q in effect.quantities])
         signal = linear.columns(effect.names) @ amount
         strength = float(np.sum(linear.cleared(signal[:, None]) ** 2)) / self.noise
-        others = [c for c in self.system.candidates if c.name not in {d.name for d in trial.candidates}]
+        others = [c for c in self.candidates if c.name not in {d.name for d in trial.candidates}]
         angles = {c.name: angle(linear, signal, c.names) for c in others}
         near = sorted(others, key=lambda c: angles[c.name])
         near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]

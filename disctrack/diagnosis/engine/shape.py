@@ -179,7 +179,9 @@ def _started(system: System, base: Fit, candidate: Candidate, shape: dict[str, f
 
 def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate) -> Diagnosis | None:
     base, before = diagnosis.before, diagnosis.held_out_before
-    first = min((_started(system, base, candidate, shape) for shape in _grid(candidate)), key=lambda f: f.cost)
+    starts = [dict(zip(_names(candidate.shape), s, strict=True)) for s in system.starts(candidate, base.values)]
+    fits = [_started(system, base, candidate, shape) for shape in starts or _grid(candidate)]
+    first = min(fits, key=lambda f: f.cost)
     expected = {q.name: _first_order(system, first, q) for q in candidate.shape}
     free = tuple(q for q in candidate.shape if np.isfinite(expected[q.name]))
     fitted = first

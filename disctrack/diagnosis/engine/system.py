@@ -47,6 +47,7 @@ class Candidate:
     quantities: tuple[Quantity, ...]
     start: tuple[float, ...] = ()  # where a refit begins, if not at null
     shape: tuple[Quantity, ...] = ()  # of its law (an exponent, a scale): held at null until the effect is found
+    sought: bool = False  # the first of its shape may lie anywhere: the system gives starts, the search leaves it out
     threshold: bool = False  # acts only beyond some value: at null it has no derivative, and the system gives starts
 
     @property
@@ -82,7 +83,10 @@ class System(Protocol):
         """(n,) how many numbers of each row are data."""
 
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
-        """Values from which refits of a candidate with a threshold begin, given a fit without it."""
+        """Values from which refits of a candidate with a threshold begin, given a fit without it.
+
+        Of any other: of its shape, where the system knows where to look; none, where the shape's range is tried.
+        """
 
 
 class Wrapped:

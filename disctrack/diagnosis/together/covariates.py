@@ -35,14 +35,11 @@ class Hypothesis:
         return self.degrees <= 0 or self.p_value > LEVEL
 
 
-def hypotheses(
-    values: Array, covariance: Array, covariates: Mapping[str, Sequence[float]], exponents: Mapping[str, float]
-) -> list[Hypothesis]:
+def hypotheses(values: Array, covariance: Array, covariates: Mapping[str, Sequence[float]]) -> list[Hypothesis]:
     """Constant, and in proportion to a power of each covariate that differs between the groups; the best first.
 
     values (g,), covariance (g, g) : of the coefficient in each group, fitted together
     covariates : by name, one number per group
-    exponents : by covariate, a power that theory foretells; tested beside the free one
     Generalised least squares, exact to first order of the groups' uncertainties.
     """
     n = len(values)
@@ -72,19 +69,4 @@ def hypotheses(
         relative = x / np.exp(np.mean(np.log(x)))
         if n > 2:
             answers.append(tested(f"in proportion to a power of the {name}", {f"exponent of the {name}": relative}))
-        if name in exponents:
-            power = exponents[name]
-            scaled = relative**power
-            fixed = hypotheses_fixed(values, covariance, scaled, f"in proportion to {name}^{power:g}, as its law says")
-            answers.append(fixed)
     return sorted(answers, key=lambda h: h.criterion)
-
-
-def hypotheses_fixed(values: Array, covariance: Array, shape: Array, text: str) -> Hypothesis:
-    """Values in proportion to a given course over the groups."""
-    inverse = np.linalg.inv(covariance)
-    weight = float(shape @ inverse @ shape)
-    constant = float(shape @ inverse @ values) / weight
-    rest = values - constant * shape
-    chi_square, n = float(rest @ inverse @ rest), len(values)
-    return Hypothesis(text, {"constant": (constant, weight**-0.5)}, chi_square, n - 1, chi_square + float(np.log(n)))

@@ -306,8 +306,7 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
         values = np.array([after.values[n] for n in names])
         covariance = after.covariance[np.ix_(index, index)]
         q = after.quantities[index[0]]
-        covariates, powers = sharing.covariates_of(local)
-        tested = hypotheses(values, covariance, covariates, powers)
+        tested = hypotheses(values, covariance, sharing.covariates_of(local))
         shown = {g: (after.values[n], after.sigma(n)) for g, n in groups.items()}
         found.append(Dependence(local, q.unit, shown, tuple(tested)))
     return tuple(found)

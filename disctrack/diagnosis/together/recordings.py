@@ -31,10 +31,8 @@ from disctrack.diagnosis.together.sharing import Member
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
-from disctrack.rolling import CATALOGUE
 from disctrack.trajectory import MarkerStatus, Trajectory
 
-STANDARD_PRESSURE = 1013.25  # [hPa]
 SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
 SEEN_PLACES = 60  # frames of a recording whose dots tell where the lenses' fields are needed
 
@@ -47,20 +45,17 @@ class Recorded:
     trajectory: Trajectory
     surface: str = ""
     disc: str = ""  # name of the disc, where sizes and mass do not tell it from others
-    pressure: float | None = None  # [hPa] of the air
 
 
 def read_recorded(path: Path) -> Recorded:
     """From a trajectory file. Raises TrajectoryFileError."""
     provenance = read_provenance(path)
     declared = provenance.settings.get("recording", {})
-    pressure = declared.get("air", {}).get("pressure_hPa")
     return Recorded(
         provenance.recording,
         with_declared_dots(read_trajectory(path), read_findings(path)),
         str(declared.get("surface", "")),
         str(declared.get("disc", {}).get("name", "")),
-        None if pressure is None else float(pressure),
     )
 
 
@@ -80,10 +75,15 @@ def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
             "disc": r.disc or _disc_words(r.trajectory.disc),
             "surface": r.surface,
             "rig": f"rig {rigs[rig_key(r.trajectory)]}",
-            "air": "" if r.pressure is None else f"{r.pressure:g} hPa",
+            "air": f"{_density(r.trajectory):g} kg/m^3",
         }
         for r in recordings
     ]
+
+
+def _density(trajectory: Trajectory) -> float:
+    """Of the air [kg/m^3], as far as it is known: what differs by less is one air."""
+    return float(f"{trajectory.air_density:.3g}")
 
 
 def _disc_words(disc: Disc) -> str:
@@ -229,10 +229,8 @@ class DiscMember:
         linked: dict[str, Quantity] = {}
         if first is not None:
             linked = {f"rig.common_{j}": replace(first, name=f"rig.common_{j}") for j in range(directions.shape[1])}
-        pressure = self.item.recorded.pressure
         covariates = {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness}
-        if pressure is not None:
-            covariates["pressure"] = 100.0 * pressure
+        covariates["density of the air"] = _density(self.trajectory)
         start = {n: v for n, v in self.base.values.items() if n in known}
         return Member(
             self.item.recorded.name,
@@ -242,10 +240,8 @@ class DiscMember:
             int(np.sum(system.weights)),
             self.item.labels,
             covariates,
-            1.0 if pressure is None else pressure / STANDARD_PRESSURE,
             links,
             linked,
-            {e.name: e.density_power for e in CATALOGUE.values() if e.density_power is not None},
         )
 
     @property

@@ -25,11 +25,9 @@ class Member:
     n_data: int
     labels: Mapping[str, str]  # "disc", "surface", "rig", "air" -> which one it was
     covariates: Mapping[str, float] = field(default_factory=dict)  # declared: "mass", "radius", ... in SI
-    density: float = 1.0  # of the air, relative
     # Base quantities that are sums of common ones, e.g. of directions in which a rig may err: name -> common -> factor
     links: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     linked: Mapping[str, Quantity] = field(default_factory=dict)  # the common ones
-    density_powers: Mapping[str, float] = field(default_factory=dict)  # of effects of the air, by their name
 
 
 class Sharing:
@@ -55,8 +53,8 @@ class Sharing:
         """Quantities of laws that differ from group to group: name -> group -> shared name."""
         return {local: groups for local, groups in self._groups.items() if len(groups) > 1}
 
-    def covariates_of(self, local: str) -> tuple[dict[str, list[float]], dict[str, float]]:
-        """Declared numbers by name, one for each group of this quantity; and powers of them that its law foretells.
+    def covariates_of(self, local: str) -> dict[str, list[float]]:
+        """Declared numbers by name, one for each group of this quantity.
 
         Those that differ within a group are left out.
         """
@@ -67,9 +65,7 @@ class Sharing:
             numbers = [{m.covariates[name] for m in group} for group in groups]
             if all(len(n) == 1 for n in numbers):
                 found[name] = [n.pop() for n in numbers]
-        effect = local.partition(".")[0]
-        powers = {e: p for group in groups for m in group for e, p in m.density_powers.items()}
-        return found, {"pressure": powers[effect]} if effect in powers else {}
+        return found
 
     def _grouped(self, i: int, local: str, group: str, shared: str) -> None:
         self._groups.setdefault(local, {})[group] = shared
@@ -114,7 +110,7 @@ class Sharing:
         by_name: dict[str, dict[int, Candidate]] = {}
         for i, member in enumerate(self.members):
             for c in member.candidates:
-                if not c.threshold and all(q.belongs_to for q in c.quantities):
+                if not (c.threshold or c.sought) and all(q.belongs_to for q in c.quantities):
                     by_name.setdefault(c.name, {})[i] = c
         return tuple(variant for having in by_name.values() for variant in self._variants(having))
 
@@ -127,17 +123,13 @@ class Sharing:
         groups = {self.group(self.members[i], q) for i, c in having.items() for q in c.quantities[:1]}
         variants = []
         is_law = any(k in LAWS for q in first.quantities for k in q.belongs_to)
-        powers = {self.members[i].density_powers.get(c.effect) for i, c in having.items()}
         one_for_all = len(groups) == 1 or (is_law and first.kind == "motion")
         if one_for_all:
             for i, c in having.items():
-                power = self.members[i].density_powers.get(c.effect, 0.0)
                 for q in c.quantities:
-                    self._share(i, q, q, self.members[i].density ** power, base=False)
+                    self._share(i, q, q, 1.0, base=False)
             quantities = tuple(replace(q, linear=False) for q in first.quantities)
-            scaled = len(groups) > 1 and any(p for p in powers) and len({m.density for m in self.members}) > 1
-            remark = ", in proportion to a power of the air's density" if scaled else ", one value for all"
-            title = first.title + (remark if len(groups) > 1 else "")
+            title = first.title + (", one value for all" if len(groups) > 1 else "")
             variants.append(replace(first, quantities=quantities, title=title))
         if len(groups) > 1:
             new: dict[str, Quantity] = {}

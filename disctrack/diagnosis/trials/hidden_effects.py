@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.random import Generator
 
-from disctrack.diagnosis.trials.recordings import Unseen
+from disctrack.diagnosis.trials.recordings import STATION, Unseen
 from disctrack.errors import DiscTrackError
+from disctrack.rolling import CATALOGUE
 from disctrack.scene.description import CameraFault, Faults, Triple
 
 N_DOTS = 6
@@ -69,6 +70,24 @@ def _vector(candidate: str, title: str, keys: tuple[str, ...], size: float, unit
         return Planted(values, effects=values)
 
     return HiddenEffect(candidate, title, size, unit, plant)
+
+
+def _flat(size: float, rng: Generator) -> Planted:
+    values = {"rim_flat.depth": size}
+    return Planted(values, effects=values | {"rim_flat.angle": rng.uniform(0, 2 * np.pi)})
+
+
+def _shaken(size: float, rng: Generator) -> Planted:
+    """The diagnosis' phase is that at the first frame."""
+    cosine, sine = np.array(_direction(size, rng, 6)).reshape(2, 3)
+    turn = 2 * np.pi * CATALOGUE["table_shaken"]().values["frequency"] * STATION
+    c, s = np.cos(turn), np.sin(turn)
+    keys = [f"table_shaken.u_{phase}_{axis}" for phase in ("cos", "sin") for axis in "xyz"]
+    truth, effects = (
+        dict(zip(keys, np.ravel(u).tolist(), strict=True))
+        for u in ((cosine, sine), (c * cosine - s * sine, s * cosine + c * sine))
+    )
+    return Planted(truth, effects=effects)
 
 
 def _delay(size: float, rng: Generator) -> Planted:
@@ -144,6 +163,9 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _law("table_curved", "hollow or domed table", "kappa", 0.1, "1/m", signed=True),
     _vector("rim_oval", "oval rim", ("rim.oval_c", "rim.oval_s"), 1e-5, "m"),
     _vector("rim_lobes", "rim with three lobes", ("rim.lobes_c", "rim.lobes_s"), 1e-5, "m"),
+    HiddenEffect("rim_flat", "flat of the rim", 1e-5, "m", _flat),
+    _law("table_yielding", "table gives way", "c", 1e-6, "m/N"),
+    HiddenEffect("table_shaken", "table shaken under the cameras", 2e-6, "m", _shaken),
     HiddenEffect("frame_rate", "wrong frame rate", 0.012, "1", _clock),
     _law("rolling_classical", "classical rolling friction", "delta", 2e-4, "m"),
     _law("air_moffatt", "air layer (Moffatt)", "f", 1.0, "1"),

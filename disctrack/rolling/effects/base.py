@@ -72,11 +72,11 @@ class Effect:
     passive: ClassVar[bool] = True  # its power is never positive ...
     counter_rotating: ClassVar[bool] = False  # ... provided that psidot phidot < 0, as in every rolling down
     airborne: ClassVar[bool] = False  # acts also without contact
+    sought: ClassVar[bool] = False  # the first shape among its parameters may lie anywhere: an angle, a frequency
     candidate: ClassVar[bool] = True  # may be proposed as an explanation; False for tools
     # What must be the same in two recordings for them to share its parameters: "disc", "surface", "rig", "air"; ()
     # where every recording has its own, ("nature",) where all have the same
     belongs_to: ClassVar[tuple[str, ...]] = ("disc", "surface")
-    density_power: ClassVar[float | None] = None  # of the air's density, that its amounts go with; None: no air law
     law: ClassVar[Any] = None  # static method law(p, s, w), or None
     formulas: ClassVar[dict[str, str] | None] = None  # of an effect written as formulas (effects.learned)
     adjust: ClassVar[Any] = None  # static method adjust(body, p), or None

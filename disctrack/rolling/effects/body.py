@@ -113,6 +113,33 @@ def rim(body: Any, p: Any) -> None:
 
 
 @effect(
+    "flat of the rim, p = r - depth exp((cos(beta - angle) - 1) / width^2)",
+    "support function of a convex curve with a flat worn smooth; Baranyai and Varkonyi 2017",
+    EffectParameter("depth", "m", 1e-5, "by which the rim is nearer to the axis there", lower=0.0, upper=5e-4),
+    EffectParameter("angle", "rad", 0.0, "of its middle, in the body", lower=-1.0, upper=7.3, is_shape=True),
+    EffectParameter("width", "rad", 0.15, "standard deviation of the dip", lower=0.05, upper=0.5, is_shape=True),
+    belongs_to=("disc",),
+    sought=True,
+)
+def rim_flat(body: Any, p: Any) -> None:
+    """A flat of the rim: over its width the contact nears the axis, and the disc dips once a turn."""
+    body.flat_depth = body.flat_depth + p.depth
+    body.flat_cos, body.flat_sin = np.cos(p.angle), np.sin(p.angle)
+    body.flat_sharpness = 1.0 / (p.width * p.width)
+
+
+@effect(
+    "table that gives way, by c F_z downwards",
+    "Hooke's law, inertia of the table neglected (Johnson 1985, Contact Mechanics, ch. 4); to first order in c",
+    EffectParameter("c", "m/N", 1e-6, "compliance", lower=0.0, upper=1e-3),
+    belongs_to=("surface",),
+)
+def table_yielding(body: Any, p: Any) -> None:
+    """The table, or a mat on it, sinks in proportion to the load: under its mean, and with its course."""
+    body.compliance = body.compliance + p.c
+
+
+@effect(
     "J1 and J2 multiplied by 1 + e",
     "holes, rims, inhomogeneous material",
     EffectParameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),

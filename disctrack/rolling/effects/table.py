@@ -46,3 +46,28 @@ def table_vibration(p: Any, s: Any, w: Any) -> None:
     w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
     w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
     w.X_z -= s.mass * (p.a_cos_z * c + p.a_sin_z * d)
+
+
+@effect(
+    "table shaken under cameras at rest: u = u_cos cos 2 pi f t + u_sin sin 2 pi f t",
+    "kinematics: gravity g - u'' in the table's axes",
+    *(EffectParameter(f"u_cos_{a}", "m", 1e-6, f"displacement of the table along {a} at t = 0") for a in "xyz"),
+    *(EffectParameter(f"u_sin_{a}", "m", 1e-6, f"along {a}, a quarter of a period later") for a in "xyz"),
+    EffectParameter("frequency", "Hz", 50.0, "of the vibration", lower=0.1, upper=1e4, is_shape=True),
+    belongs_to=(),
+    passive=False,
+    airborne=True,
+    sought=True,
+)
+def table_shaken(p: Any, s: Any, w: Any) -> None:
+    """The table swings with one frequency, and the cameras, which stand elsewhere, see it."""
+    rate = 2 * np.pi * p.frequency
+    c, d = np.cos(rate * s.time), np.sin(rate * s.time)
+    u_x, u_y, u_z = p.u_cos_x * c + p.u_sin_x * d, p.u_cos_y * c + p.u_sin_y * d, p.u_cos_z * c + p.u_sin_z * d
+    w.table_x, w.table_y, w.table_z = w.table_x + u_x, w.table_y + u_y, w.table_z + u_z
+    w.table_vx += rate * (p.u_sin_x * c - p.u_cos_x * d)
+    w.table_vy += rate * (p.u_sin_y * c - p.u_cos_y * d)
+    w.table_vz += rate * (p.u_sin_z * c - p.u_cos_z * d)
+    w.table_ax -= rate * rate * u_x
+    w.table_ay -= rate * rate * u_y
+    w.table_az -= rate * rate * u_z

@@ -1,0 +1,61 @@
+"""Where numbers lie that have to be looked for: an angle on the rim, a frequency of the table.
+
+At an effect's null they have no derivative, and the data are far from quadratic in them. So the effect's amounts are
+fitted to first order at many angles round the rim, or at peaks in the spectrum of what is left of the positions, and
+refits begin where they gain most.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from calibration.arrays import Array
+from disctrack.diagnosis.engine.system import Candidate, Values
+
+if TYPE_CHECKING:
+    from disctrack.diagnosis.disc.system import DiscSystem
+
+ANGLES = 48  # round the rim: 7.5 deg apart, half the width of a flat
+PEAKS = 6  # of the spectrum
+PADDED = 8  # times the length of the recording, for peaks between its frequencies
+REFITS = 2  # begin at so many of them
+SLOW = 3.0  # periods in the recording that a vibration has at least
+
+
+def sought(system: DiscSystem, candidate: Candidate, values: Values) -> list[tuple[float, ...]]:
+    """Values of the candidate's shape to begin with, the best first; empty where none has to be looked for."""
+    if not candidate.sought:
+        return []
+    first, *rest = candidate.shape
+    places = 2 * np.pi * np.arange(ANGLES) / ANGLES if first.unit == "rad" else _frequencies(system, values)
+    residual, derivative = system.linearise(values, [q.name for q in system.base])
+    priors = np.diag([1.0 / q.prior_sigma for q in system.base])
+    base = np.concatenate([derivative.reshape(-1, len(priors)), priors])
+    length = np.linalg.norm(base, axis=0)
+    Q = np.linalg.qr(base / np.where(length > 0, length, 1.0))[0][: residual.size]
+    r = residual.ravel()
+    gains = []
+    for place in places:
+        own = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values) | {first.name: float(place)}
+        columns = system.linearise(own, candidate.names)[1].reshape(len(r), -1)
+        cleared = columns - Q @ (Q.T @ columns)
+        amounts, *_ = np.linalg.lstsq(cleared, r, rcond=1e-10)
+        inside = all(q.lower <= q.null + a <= q.upper for q, a in zip(candidate.quantities, amounts, strict=True))
+        gains.append(float(r @ r - np.sum((r - cleared @ amounts) ** 2)) if inside else 0.0)
+    best = np.argsort(gains)[::-1][:REFITS]
+    return [(float(places[i]), *(q.null for q in rest)) for i in best if gains[i] > 0]
+
+
+def _frequencies(system: DiscSystem, values: Values) -> Array:
+    """Peaks [Hz] in the spectrum of measured less predicted positions, in units of their noise; highest first."""
+    difference, sigma = (x[:, :3] for x in system.pose_difference(values))
+    left = np.nan_to_num(difference / sigma)
+    n, rate = len(left), 1.0 / float(np.median(np.diff(system.time)))
+    spectrum = np.abs(np.fft.rfft((left - left.mean(axis=0)) * np.hanning(n)[:, None], PADDED * n, axis=0))
+    power, frequency = np.sum(spectrum**2, axis=1), np.fft.rfftfreq(PADDED * n, 1 / rate)
+    power[frequency < SLOW * rate / n] = 0.0
+    peaks, _ = find_peaks(power)
+    return np.asarray(frequency[peaks[np.argsort(power[peaks])[::-1][:PEAKS]]], float)
