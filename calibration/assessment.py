@@ -227,8 +227,8 @@ def assess(
         warnings = (
             "the pairs are not synchronised, or the lenses are not as modelled: the two images of a pair differ as if "
             f"the board had moved by {motion.distance * 1e3:.2g} mm between them ({motion.pixels:.2g} px; corners "
-            f"scatter by {motion.scatter:.2g} px). Trigger both cameras at once, or hold the board still; the sigmas "
-            "of the pair allow for it",
+            f"scatter by {motion.scatter:.2g} px). The refinement gives every board a motion of its own; the sigmas "
+            "contain it. Trigger both cameras at once, or hold the board still",
             *warnings,
         )
     warnings = (*wide, *warnings)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array
+from calibration.board_motion import motions
 from calibration.normal_equations import inverse_covariance
 from calibration.refinement import Refinement, refine_stereo
 from calibration.splines import LensField, spline_weights
@@ -90,12 +91,20 @@ def _reduced(
     blocks = [(d_stereo.reshape(2 * m, N_STEREO) @ problem.stereo_basis).reshape(m, 2, -1)]
     if problem.shape_basis.shape[-1]:
         blocks.append(d_point @ problem.shape_basis[o.point])
+    if problem.motion is not None:  # a place of the board for each of the two images
+        d_pose = np.concatenate([np.where((o.camera == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1)
     whole = np.concatenate([*blocks, field, d_pose, (o.pixels - pixels)[..., None]], axis=-1)
     L = np.linalg.cholesky(inverse_covariance(o.covariance, extra))
     rows = (np.swapaxes(L, 1, 2) @ whole).reshape(2 * m, -1)
-    Q, _ = np.linalg.qr(rows[:, -7:-1])
+    k = d_pose.shape[-1]
+    if problem.motion is not None:
+        between, by_poses = (values[view] for values in motions(refinement.model))
+        more = np.zeros((6, rows.shape[1]))
+        more[:, -k - 1 : -1], more[:, -1] = by_poses, -between
+        rows = np.concatenate([rows, np.sqrt(problem.motion.weights)[:, None] * more])
+    Q, _ = np.linalg.qr(rows[:, -k - 1 : -1])
     rows = rows - Q @ (Q.T @ rows)
-    return rows[:, :-7], rows[:, -1]
+    return rows[:, : -k - 1], rows[:, -1]
 
 
 def _solved(matrix: Array, rhs: Array, n_other: int, sigma: float) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
+from calibration.board_motion import BoardMotion, split
 from calibration.normal_equations import Problem, inverse_covariance, minimise
 from calibration.refinement import Refinement, refine_stereo
 from calibration.stereo_model import (
@@ -42,12 +43,13 @@ class TermsTried:
 
 
 def held_out(
-    refinement: Refinement, sigma: float, good: Mask
+    refinement: Refinement, sigma: float, good: Mask, motion: BoardMotion | None = None
 ) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
     """Per view, each view left out in turn: chi-square (truncated) of all points, squared distance [px^2] of good ones.
 
     sigma : unexplained noise [px] for the comparison, the same for every candidate
     good : (m,) the observations that count in the distance
+    motion : of the boards between the exposures, for the comparison
     returns : chi-square, squared distance, number of all and of good points, each (n_views,)
     """
     used = refinement.observations[refinement.kept]
@@ -56,7 +58,8 @@ def held_out(
     chi2, square = np.full(n_views, np.nan), np.full(n_views, np.nan)
     count, good_count = np.zeros(n_views, int), np.zeros(n_views, int)
     views = np.unique(used.view)
-    whole = replace(refinement.problem, observations=used, weights=inverse_covariance(used.covariance, sigma**2))
+    weights = inverse_covariance(used.covariance, sigma**2)
+    whole = replace(refinement.problem, observations=used, weights=weights, motion=motion)
     at_minimum = whole.linearise(refinement.model)
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
@@ -73,7 +76,7 @@ def held_out(
         ).model
         tested = np.isin(everything.view, left_out)
         test = everything[tested]
-        model = fit_poses(test, model, sigma)
+        model = fit_poses(test, model, sigma, motion)
         residuals = test.pixels - predict_pixels(model, test)
         distance = np.einsum("mi,mij,mj->m", residuals, inverse_covariance(test.covariance, sigma**2), residuals)
         for v in left_out:
@@ -84,8 +87,11 @@ def held_out(
     return chi2, square, count, good_count
 
 
-def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> StereoModel:
+def fit_poses(
+    observations: Observations, model: StereoModel, sigma: float, motion: BoardMotion | None = None
+) -> StereoModel:
     """Poses of the target in the views of the observations, everything else held."""
+    model = replace(model, boards_right=None) if motion is None else split(model)
     problem = Problem(
         observations,
         inverse_covariance(observations.covariance, sigma**2),
@@ -93,13 +99,15 @@ def fit_poses(observations: Observations, model: StereoModel, sigma: float) -> S
         np.zeros((*model.points.shape, 0)),
         len(model.R_left_board),
         huber=3.0,
+        motion=motion,
     )
     return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
 
 
-def candidate(refinement: Refinement, sigma: float, good: Mask) -> TermsTried:
-    """The row of one fitted model; see `held_out`."""
-    chi2, square, count, good_count = held_out(refinement, sigma, good)
+def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
+    """The row of one fitted model, by the noise, the good points and the boards' motion of another; see `held_out`."""
+    sigma = quietest.unexplained_sigma
+    chi2, square, count, good_count = held_out(refinement, sigma, quietest.kept, quietest.problem.motion)
     with np.errstate(invalid="ignore"):
         per_view = chi2 / np.where(count > 0, count, np.nan)
     return TermsTried(
@@ -133,17 +141,19 @@ def choose_terms(
     boards: tuple[str, ...] = BOARD_MODELS,
     equal_aspect: bool = False,
     progress: Callable[[str], None] = lambda _: None,
+    motion: BoardMotion | None = None,
 ) -> tuple[Refinement, tuple[TermsTried, ...]]:
     """Choose distortion terms, then the board's shape, then the distortion again if the board is not flat.
 
     Returns the refinement of the chosen terms and the table of everything that was compared: up to three comparisons
     in turn, each with a noise of its own; the last row of a model is the one that counted last. Names that are given as
-    one-element tuples are taken, not chosen.
+    one-element tuples are taken, not chosen. motion : as in `refine_stereo`
     """
     distortions = tuple(DISTORTION_MODELS) if distortions is None else distortions
     richest = max(distortions, key=lambda name: len(DISTORTION_MODELS[name]))
     board = boards[0]
-    fits = {(richest, board): refine_stereo(observations, start, nominal, Terms(richest, board, equal_aspect))}
+    terms = Terms(richest, board, equal_aspect)
+    fits = {(richest, board): refine_stereo(observations, start, nominal, terms, motion=motion)}
     table: list[TermsTried] = []
     judged: dict[tuple[tuple[str, str], Terms], TermsTried] = {}  # by the model, and by the one that gave the noise
 
@@ -161,7 +171,7 @@ def choose_terms(
         noise = quietest.terms
         for key in keys:
             if (key, noise) not in judged:
-                judged[key, noise] = candidate(fits[key], quietest.unexplained_sigma, quietest.kept)
+                judged[key, noise] = candidate(fits[key], quietest)
         rows = [judged[key, noise] for key in keys]
         table.extend(rows)
         return keys[best(rows)]
@@ -175,5 +185,5 @@ def choose_terms(
             chosen = compare(again, fits[chosen])
     fit = fits[chosen]
     if not table:
-        table.append(candidate(fit, fit.unexplained_sigma, fit.kept))
+        table.append(candidate(fit, fit))
     return fit, tuple(table)

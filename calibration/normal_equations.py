@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibration._normal_kernel import N_COLUMNS, accumulate
 from calibration.arrays import Array
+from calibration.board_motion import BoardMotion, motions
 from calibration.errors import CalibrationError
 from calibration.priors import Prior
 from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved
@@ -31,9 +32,9 @@ class Normal:
     point: Array  # (n_views, n, 3, 3) and of each point
     shape: Array  # (3 n, s2) directions in which the points may move
     gradient: Array  # (n_views, s)
-    cross: Array  # (n_views, s, 6)
-    pose: Array  # (n_views, 6, 6)
-    pose_gradient: Array  # (n_views, 6)
+    cross: Array  # (n_views, s, k); k = 6, or 12 where boards moved between the two exposures
+    pose: Array  # (n_views, k, k)
+    pose_gradient: Array  # (n_views, k)
     costs: Array  # (n_views,) chi-square, or Huber's sum when robust
     n_views: int  # without the prior
 
@@ -57,7 +58,7 @@ class Normal:
             point=part(self.point),
             gradient=part(self.gradient),
             cross=part(self.cross),
-            pose=np.where(use[:, None, None], self.pose, np.eye(6)),
+            pose=np.where(use[:, None, None], self.pose, np.eye(self.pose.shape[-1])),
             pose_gradient=part(self.pose_gradient),
             costs=part(self.costs),
         )
@@ -81,8 +82,8 @@ class Normal:
         return self._assembled(self.stereo.sum(0), self.stereo_point.sum(0), self.point.sum(0))
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """Damped step of the shared parameters (s,) and of the poses (n_views, 6)."""
-        pose = self.pose * (1 + damping * np.eye(6))
+        """Damped step of the shared parameters (s,) and of the poses (n_views, k)."""
+        pose = self.pose * (1 + damping * np.eye(self.pose.shape[-1]))
         carried, own = self._eliminated(pose)
         total = self.shared
         schur = total + damping * np.diag(np.diag(total)) - self._by_poses(carried)
@@ -90,14 +91,14 @@ class Normal:
         return step, own - carried @ step
 
     def _eliminated(self, pose: Array) -> tuple[Array, Array]:
-        carried = np.linalg.solve(pose, np.swapaxes(self.cross, 1, 2))  # (v, 6, s)
+        carried = np.linalg.solve(pose, np.swapaxes(self.cross, 1, 2))  # (v, k, s)
         own: Array = np.asarray(np.linalg.solve(pose, self.pose_gradient[..., None])[..., 0], np.float64)
         return np.asarray(carried, np.float64), own
 
     def _by_poses(self, carried: Array) -> Array:
         """What the poses take from the shared parameters' information (s, s)."""
-        V, s, _ = self.cross.shape
-        taken: Array = np.swapaxes(self.cross, 1, 2).reshape(6 * V, s).T @ carried.reshape(6 * V, s)
+        V, s, k = self.cross.shape
+        taken: Array = np.swapaxes(self.cross, 1, 2).reshape(k * V, s).T @ carried.reshape(k * V, s)
         return taken
 
     def view_information(self) -> tuple[Array, Array]:
@@ -134,7 +135,7 @@ class Normal:
         return seen / expected if expected > 0 else float("nan")
 
     def covariances(self) -> tuple[Array, Array, Array]:
-        """Of the shared parameters (s, s), of each pose (v, 6, 6), and between shared and pose (v, s, 6)."""
+        """Of the shared parameters (s, s), of each pose (v, k, k), and between shared and pose (v, s, k)."""
         carried, _ = self._eliminated(self.pose)
         information = self.shared - self._by_poses(carried)
         shared = scaled_solve(information, np.eye(len(information)))
@@ -165,6 +166,7 @@ class Problem:
     n_views: int
     huber: float = np.inf  # residuals beyond this many sigmas count linearly
     prior: Prior | None = None  # of the cameras
+    motion: BoardMotion | None = None  # of the boards between the two exposures, for a model that has such places
 
     def linearise(self, model: StereoModel) -> Normal:
         """Normal equations at the model."""
@@ -172,41 +174,53 @@ class Problem:
         if np.any(np.diff(o.view) < 0):
             raise ValueError("observations must be sorted by view")
         s1, s2, n = self.stereo_basis.shape[1], self.shape_basis.shape[-1], len(self.shape_basis)
-        V = self.n_views + (self.prior is not None)
-        full, costs = np.zeros((V, N_COLUMNS, N_COLUMNS)), np.zeros(V)
-        of_point, point = (np.zeros((V, n if s2 else 0, 3, columns)) for columns in (N_COLUMNS, 3))
+        n_views, V = self.n_views, self.n_views + (self.prior is not None)
+        exposures = 1 if self.motion is None else 2
+        places, boards = o.view, (model.R_left_board, model.t_left_board)
+        if model.boards_right is not None:
+            places = o.view + V * o.camera  # the prior's has no board
+            (R, t), pad = model.boards_right, V - n_views
+            boards = np.concatenate([boards[0], R[:pad], R]), np.concatenate([boards[1], t[:pad], t])
+        full, costs = np.zeros((exposures * V, N_COLUMNS, N_COLUMNS)), np.zeros(exposures * V)
+        of_point, point = (np.zeros((len(full), n if s2 else 0, 3, columns)) for columns in (N_COLUMNS, 3))
         cameras = np.stack([camera.parameters for camera in model.cameras])
-        given = (o.pixels, self.weights, cameras, model.R_right_left, model.t_right_left)
-        boards = (model.R_left_board, model.t_left_board, model.points)
-        if not _accumulated((o.view, o.camera, o.point), self.huber, (*given, *boards), full, of_point, point, costs):
+        given = (o.pixels, self.weights, cameras, model.R_right_left, model.t_right_left, *boards, model.points)
+        if not _accumulated((places, o.camera, o.point), self.huber, given, full, of_point, point, costs):
             costs[...] = np.inf
         free = np.zeros((N_COLUMNS, s1 + 7))
         free[:N_STEREO, :s1], free[N_STEREO:, s1:] = self.stereo_basis, np.eye(7)
-        squares = free.T @ full @ free
-        if self.prior is not None:
-            information, towards, costs[-1] = self.prior.normal(model)
-            squares[-1, :s1, :s1] = self.stereo_basis.T @ information @ self.stereo_basis
-            squares[-1, :s1, -1] = self.stereo_basis.T @ towards
-        pose = squares[:, s1:-1, s1:-1]
-        pose[np.bincount(o.view, minlength=V) == 0] = np.eye(6)
-        stereo_point, shape, of_shape = np.zeros((V, s1, 0)), np.zeros((0, 0)), np.zeros((V, 0, 7))
-        if s2:
-            flat = of_point.reshape(V, 3 * n, N_COLUMNS) @ free
-            stereo_point = np.swapaxes(flat[..., :s1], 1, 2)
-            shape = self.shape_basis.reshape(3 * n, s2)
-            of_shape = shape.T @ flat[..., s1:]  # (V, s2, 7)
-        return Normal(
-            stereo=squares[:, :s1, :s1],
-            stereo_point=stereo_point,
-            point=point,
+        squares = (free.T @ full @ free).reshape(exposures, V, s1 + 7, s1 + 7)
+        shape = self.shape_basis.reshape(3 * n, s2) if s2 else np.zeros((0, 0))
+        flat = of_point.reshape(exposures, V, len(shape), N_COLUMNS) @ free
+        of_shape = shape.T @ flat[..., s1:]  # (exposures, V, s2, 7)
+        normal = Normal(
+            stereo=squares[..., :s1, :s1].sum(0),
+            stereo_point=np.swapaxes(flat[..., :s1], 2, 3).sum(0),
+            point=point.reshape(exposures, V, *point.shape[1:]).sum(0),
             shape=shape,
-            gradient=np.concatenate([squares[:, :s1, -1], of_shape[..., -1]], axis=1),
-            cross=np.concatenate([squares[:, :s1, s1:-1], of_shape[..., :-1]], axis=1),
-            pose=pose,
-            pose_gradient=squares[:, s1:-1, -1],
-            costs=costs,
-            n_views=self.n_views,
+            gradient=np.concatenate([squares[..., :s1, -1], of_shape[..., -1]], axis=2).sum(0),
+            cross=np.concatenate([*np.concatenate([squares[..., :s1, s1:-1], of_shape[..., :-1]], axis=2)], axis=2),
+            pose=np.zeros((V, 6 * exposures, 6 * exposures)),
+            pose_gradient=np.concatenate([*squares[..., s1:-1, -1]], axis=1),
+            costs=costs.reshape(exposures, V).sum(0),
+            n_views=n_views,
         )
+        for k in range(exposures):
+            normal.pose[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = squares[k, :, s1:-1, s1:-1]
+        if self.motion is not None:
+            between, by_poses = motions(model)
+            weighted = by_poses * self.motion.weights[:, None]
+            normal.pose[:n_views] += np.swapaxes(by_poses, 1, 2) @ weighted
+            normal.pose_gradient[:n_views] -= np.einsum("vij,vi->vj", weighted, between)
+            normal.costs[:n_views] += between**2 @ self.motion.weights
+        unseen = np.bincount(o.view, minlength=V) == 0
+        normal.pose[unseen], normal.pose_gradient[unseen] = np.eye(6 * exposures), 0.0
+        normal.costs[unseen] = 0.0
+        if self.prior is not None:
+            information, towards, normal.costs[-1] = self.prior.normal(model)
+            normal.stereo[-1] = self.stereo_basis.T @ information @ self.stereo_basis
+            normal.gradient[-1, :s1] = self.stereo_basis.T @ towards
+        return normal
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array, Mask
+from calibration.board_motion import BoardMotion
 from calibration.model_choice import fit_poses
 from calibration.normal_equations import inverse_covariance
 from calibration.refinement import Refinement, refine_stereo
@@ -76,7 +77,7 @@ def judge_pairs(observations: Observations, fit: Refinement, apart: Sequence[int
         if min(np.sum((observations.view == v) & (observations.camera == c)) for c in (0, 1)) >= MIN_POINTS
     ]
     begun = {v: (model.R_left_board[places.get(v, v)], model.t_left_board[places.get(v, v)]) for v in both}
-    views = replace(model, R_left_board=model.R_left_board[:n], t_left_board=model.t_left_board[:n])
+    views = replace(model, R_left_board=model.R_left_board[:n], t_left_board=model.t_left_board[:n], boards_right=None)
     behind = np.unique(observations.view[~np.isfinite(predict_pixels(views, observations)).all(axis=1)])
     in_sight = observations[~np.isin(observations.view, behind)]
     together = fit_poses(in_sight, views, sigma)
@@ -126,6 +127,7 @@ def _cost_of_one_place(
             weights=inverse_covariance(observations.covariance, max(fit.unexplained_sigma, 1e-3) ** 2),
             n_views=len(model.R_left_board),
             huber=3.0,
+            motion=None,
         )
         normal = problem.linearise(model)
         H, g = normal.view_information()
@@ -201,6 +203,11 @@ class PairMotion:
     def is_seen(self) -> bool:
         """True if it is far beyond what corners that scatter so would show of a board at rest."""
         return self.pixels > MOVED * max(self.scatter, self.at_rest)
+
+    def as_random(self, points: Array) -> BoardMotion:
+        """As a random motion of boards with these points (n, 3) [m], roughly: what is begun with."""
+        reach = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
+        return BoardMotion(self.distance / reach, self.distance)
 
 
 def motion_between_exposures(refinement: Refinement) -> PairMotion | None:

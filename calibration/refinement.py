@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array, Mask
+from calibration.board_motion import BoardMotion, learnt, split
 from calibration.errors import CalibrationError
 from calibration.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.priors import Prior, camera_priors
@@ -36,11 +37,6 @@ class Refinement:
     iterations: int
     converged: bool
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Kept coordinates minus parameters."""
-        return _degrees_of_freedom(self.problem, int(self.kept.sum()))
-
     def rms(self, select: Mask | None = None) -> float:
         """Root mean square distance [px] of the kept observations, or of some of them."""
         use = self.kept if select is None else self.kept & select
@@ -60,6 +56,7 @@ def refine_stereo(
     reject_beyond: float = 5.5,
     begin: Refinement | None = None,
     priors: bool = True,
+    motion: BoardMotion | None = None,
 ) -> Refinement:
     """Refine everything `terms` frees, from image points of any flat target.
 
@@ -69,6 +66,7 @@ def refine_stereo(
     reject_beyond : sigmas, after the noise that the residuals themselves show: of 10^4 good points none lies beyond
     begin : an earlier refinement of the same observations with other terms: spares the robust start
     priors : whether what is known of cameras beforehand counts, see `priors`
+    motion : about how far boards moved between the two exposures of a pair; None: they did not, or as `begin` has it
 
     Raises CalibrationError if the views cannot determine the parameters.
     """
@@ -79,22 +77,28 @@ def refine_stereo(
     kept = np.ones(len(observations), bool)
     model, total = restricted(start if begin is None else begin.model, nominal, terms), 0
     prior = camera_priors(model) if priors else None
+    motion = begin.problem.motion if motion is None and begin is not None else motion
     if begin is None:
         model, extra = _robust_start(observations, model, stereo_basis, shape_basis, n_views, prior)
     else:
         kept, extra = begin.kept, begin.unexplained_sigma**2
+    if motion is not None:
+        model = split(model)
     for turn in range(MAX_ROUNDS):
         used = observations[kept]
         weights = inverse_covariance(used.covariance, extra)
-        problem = Problem(used, weights, stereo_basis, shape_basis, n_views, prior=prior)
-        dof = _degrees_of_freedom(problem, len(used))
+        problem = Problem(used, weights, stereo_basis, shape_basis, n_views, prior=prior, motion=motion)
+        dof: float = _degrees_of_freedom(problem, len(used))
         if dof <= 0:
             raise CalibrationError(
                 f"{len(used)} points in {len(np.unique(used.view))} views are fewer than the parameters to be found: "
                 "take more views, or fewer free terms"
             )
         minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
-        model, total = minimum.model, total + minimum.iterations
+        model, total, moved_as = minimum.model, total + minimum.iterations, motion
+        if motion is not None:
+            motion, determined = learnt(motion, model, minimum.normal.covariances()[1][:n_views])
+            dof -= determined
         if prior is not None:
             disagreement = float(np.nan_to_num(minimum.normal.disagreement(stereo_basis.shape[1])))
             weight = min(max(disagreement, 1.0 / MOST_DISAGREEMENT), MOST_DISAGREEMENT)
@@ -105,6 +109,8 @@ def refine_stereo(
         if turn >= FREE_ROUNDS:
             new_kept &= kept
         settled = abs(new_extra - extra) <= 0.01 * extra + 1e-10 and bool((new_kept == kept).all())
+        if motion is not None and moved_as is not None:
+            settled = settled and motion.is_near(moved_as)
         extra = new_extra
         if settled or turn == MAX_ROUNDS - 1:  # what is returned belongs to the points that were fitted
             break
@@ -112,7 +118,7 @@ def refine_stereo(
     # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that
     # nothing is left of where the rough rounds happened to stop
     for _ in range(2):
-        problem = replace(problem, weights=inverse_covariance(used.covariance, extra), prior=prior)
+        problem = replace(problem, weights=inverse_covariance(used.covariance, extra), prior=prior, motion=motion)
         minimum = minimise(problem, model, tolerance=1e-14, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict_pixels(model, observations)
@@ -143,6 +149,7 @@ def _robust_start(
 ) -> tuple[StereoModel, float]:
     """Huber's fit with the noise set by the median residual, and the extra variance [px^2] it shows."""
     flat = shape_basis[..., :0]
+    model = replace(model, boards_right=None)
     extra = 0.0
     for basis in (flat, shape_basis) if shape_basis.shape[-1] else (flat,):
         for _ in range(2):
@@ -164,7 +171,7 @@ def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
     return quadratic(inverse_covariance(covariance, extra), residuals)
 
 
-def _extra_variance(residuals: Array, covariance: Array, dof: int) -> float:
+def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:
     """Variance per axis [px^2] which, added to the points' own, makes chi-square equal to the degrees of freedom."""
     own, axes = np.linalg.eigh(covariance)  # of each point: along its axes what is added is a plain sum
     squares = np.einsum("mij,mi->mj", axes, residuals) ** 2

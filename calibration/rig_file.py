@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -84,25 +84,35 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         ],
         "assessment": asdict(calibration.assessment),
     }
+    model, observations, apart = r.model, r.observations, calibration.apart
+    if model.boards_right is not None:  # every right image has a place of its own
+        n = len(model.R_left_board)
+        apart = (*apart, *range(n - len(apart)), *apart)
+        observations = replace(observations, view=observations.view + n * observations.camera)
+        R, t = (
+            np.concatenate(both)
+            for both in zip((model.R_left_board, model.t_left_board), model.boards_right, strict=True)
+        )
+        model = replace(model, R_left_board=R, t_left_board=t, boards_right=None)
     return CalibrationRecord(
         board=calibration.board,
         board_points=calibration.board_points,
         table_view=calibration.table_view,
         board_thickness=calibration.board_thickness,
         view_names=tuple((str(a), str(b)) for a, b in calibration.view_names),
-        observations=r.observations,
+        observations=observations,
         kept=r.kept,
         residuals=r.residuals,
         unexplained_sigma=r.unexplained_sigma,
-        R_left_board=r.model.R_left_board,
-        t_left_board=r.model.t_left_board,
+        R_left_board=model.R_left_board,
+        t_left_board=model.t_left_board,
         settings=_plain(asdict(calibration.settings)),
         figures=_plain(figures),
         rejected_views=dict(calibration.rejected_views),
         rejected_corners=tuple(calibration.rejected_corners()),
         warnings=tuple(calibration.warnings),
         versions=versions(),
-        apart=calibration.apart,
+        apart=apart,
     )
 
 

@@ -261,6 +261,12 @@ def calibrate_from_corners(
             *places, board.points, (terms.distortion,), (terms.board,), settings.equal_aspect, report
         )
         candidates = (*candidates, *again)
+    motion = motion_between_exposures(refinement)
+    if motion is not None and motion.is_seen:
+        report("pairs that were not synchronised: with a motion of the board between the exposures")
+        begin = motion.as_random(board.points)
+        refinement, again = choose_terms(*places, board.points, *choice, settings.equal_aspect, report, begin)
+        candidates = (*candidates, *again)
     told = _told_apart(pairs.apart, names, bool(wide))
     warnings += told
     if table_view is not None and table_view in rejected | pairs.apart:
@@ -291,7 +297,6 @@ def calibrate_from_corners(
         shape,
     )
     halves = half_set_differences(refinement, inflation)
-    motion = motion_between_exposures(refinement)
     assessment = assess(refinement, candidates, rig, with_board, table_view, inflation, halves, motion, wide)
     return StereoCalibration(
         rig=with_board,

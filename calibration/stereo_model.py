@@ -60,6 +60,8 @@ class StereoModel:
     R_left_board: Array  # (n_views, 3, 3)
     t_left_board: Array  # (n_views, 3) [m]
     points: Array  # (n, 3) target points in board axes [m], as refined
+    # (n_views, 3, 3) and (n_views, 3) [m] of the boards at the right camera's exposure, where they moved after the left
+    boards_right: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,12 @@ def predict(model: StereoModel, observations: Observations) -> tuple[Array, Arra
 def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:
     """Rotation (m, 3, 3) of the board, its point turned by it (m, 3), and the board's place (m, 3)."""
     R, t = model.R_left_board[observations.view], model.t_left_board[observations.view]
+    if model.boards_right is not None:
+        right = observations.camera == 1
+        R, t = (
+            np.where(right.reshape(-1, *[1] * (one.ndim - 1)), of[observations.view], one)
+            for one, of in zip((R, t), model.boards_right, strict=True)
+        )
     return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
 
 
@@ -176,8 +184,14 @@ def _crossed(arm: Array, d: Array) -> Array:
 
 
 def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
-    """The model after a step: stereo (24,), poses (n_views, 6) rotation vectors and shifts, displacement (n, 3)."""
-    turns = rotation_from_vector(poses[:, :3])
+    """The model after a step: stereo (24,), poses (n_views, 6) rotation vectors and shifts, displacement (n, 3).
+
+    poses : (n_views, 12) where the boards have places of their own at the right camera's exposure, those last
+    """
+    turns, boards_right = rotation_from_vector(poses[:, :3]), None
+    if model.boards_right is not None:
+        R, t = model.boards_right
+        boards_right = rotation_from_vector(poses[:, 6:9]) @ R, t + poses[:, 9:]
     return StereoModel(
         cameras=(
             Camera.from_parameters(model.cameras[0].parameters + stereo[:9], model.cameras[0].image_size),
@@ -186,8 +200,9 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
         R_right_left=rotation_from_vector(stereo[18:21]) @ model.R_right_left,
         t_right_left=model.t_right_left + stereo[21:24],
         R_left_board=turns @ model.R_left_board,
-        t_left_board=model.t_left_board + poses[:, 3:],
+        t_left_board=model.t_left_board + poses[:, 3:6],
         points=model.points + displacement,
+        boards_right=boards_right,
     )
 
 

@@ -36,8 +36,8 @@ def rig_with_covariance(
     basis = refinement.problem.stereo_basis
     n_free = basis.shape[1]
     shared, poses, cross = normal.covariances()
-    free, cross = inflation * shared[:n_free, :n_free], inflation * cross[:, :n_free]
-    poses = inflation * poses
+    free, cross = inflation * shared[:n_free, :n_free], inflation * cross[:, :n_free, :6]
+    poses = inflation * poses[:, :6, :6]  # at the left camera's exposure
     if stereo is not None:
         carried = np.swapaxes(np.linalg.solve(free, cross), 1, 2)  # how far a pose follows the stereo parameters
         poses = poses + carried @ (stereo - free) @ np.swapaxes(carried, 1, 2)

@@ -100,7 +100,11 @@ def as_made(refinement: Refinement, nominal: Array, shape: BoardShape) -> Refine
     scale = 1.0 + _growth(nominal, shape)
     m = refinement.model
     model = replace(
-        m, t_right_left=scale * m.t_right_left, t_left_board=scale * m.t_left_board, points=scale * m.points
+        m,
+        t_right_left=scale * m.t_right_left,
+        t_left_board=scale * m.t_left_board,
+        points=scale * m.points,
+        boards_right=m.boards_right and (m.boards_right[0], scale * m.boards_right[1]),
     )
     return replace(refinement, model=model)
 

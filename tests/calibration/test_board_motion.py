@@ -1,0 +1,161 @@
+"""Boards that moved between the exposures of a pair: cameras as good as each alone gives, and honest sigmas."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration import Board, CalibrationSettings, CornerView, Terms, calibrate_from_corners, refine_stereo
+from calibration.board_motion import BoardMotion, motions, split
+from calibration.normal_equations import Problem
+from calibration.rig_file import read_rig_file, write_rig
+from calibration.stereo_model import board_basis, moved, predict_pixels
+from calibration.tolerances import BoardTolerances
+from tests.oracles import moved_boards
+
+BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
+EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
+SETTINGS = CalibrationSettings(distortion="k1 k2 p1 p2", board="flat", tolerances=EXACT)
+
+
+def corner_view(points, sigma=0.1):
+    n = len(points)
+    covariance = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
+    plain = {"chi_square": np.ones(n), "contrast": np.full(n, 100.0), "blur": np.ones(n), "spacing": 30.0}
+    return CornerView(
+        moved_boards.IMAGE_SIZE, points, covariance, np.ones(n, bool), ("",) * n, noise=(1.0, 0.0), **plain
+    )
+
+
+def calibrated(rig, n, seed, **motion):
+    left, right = moved_boards.pairs(rig, n, seed, **motion)
+    return calibrate_from_corners([corner_view(p) for p in left], [corner_view(p) for p in right], BOARD, SETTINGS)
+
+
+def errors(found, rig):
+    """Of intrinsics, of the pair's rotation and of its translation, and the places of these in the covariance."""
+    intrinsics = [
+        np.array([c.fx, c.fy, c.cx, c.cy]) - [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        for c, K in zip((found.rig.left, found.rig.right), rig.matrices, strict=True)
+    ]
+    turn = cv2.Rodrigues(found.rig.R_right_left @ rig.R.T)[0].ravel()
+    return np.concatenate([*intrinsics, turn, found.rig.t_right_left - rig.t]), [
+        0,
+        1,
+        2,
+        3,
+        9,
+        10,
+        11,
+        12,
+        *range(18, 24),
+    ]
+
+
+def squared(error, covariance):
+    sigma = np.sqrt(np.diag(covariance))
+    z = error / sigma
+    return float(z @ np.linalg.solve(covariance / np.outer(sigma, sigma), z)) / len(z)
+
+
+def test_normal_equations_with_a_motion_have_the_cost_they_say(scene_maker, rng):
+    scene = scene_maker(n_views=3, inner_corners=(4, 3))
+    observations = scene.observations(0.1, rng)
+    observations = observations[np.argsort(observations.view, kind="stable")]
+    deviation = 1e-4 * rng.normal(size=scene.model.points.shape)
+    model = moved(split(scene.model), 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, 12)), deviation)
+    problem = Problem(
+        observations,
+        np.linalg.inv(observations.covariance),
+        Terms("k1").stereo_basis(),
+        board_basis(BOARD.points[:12], "warped"),
+        3,
+        motion=BoardMotion(2e-3, 5e-4),
+    )
+
+    def cost(model):
+        r = observations.pixels - predict_pixels(model, observations)
+        m = motions(model)[0]
+        return np.einsum("mi,mij,mj->", r, problem.weights, r) + np.sum(m**2 * problem.motion.weights)
+
+    normal = problem.linearise(model)
+    assert_allclose(normal.cost, cost(model), rtol=1e-12)
+    s, k = problem.stereo_basis.shape[1] + 5, 12
+    for direction in rng.normal(size=(6, s + 3 * k)):
+        direction[:s] /= np.sqrt(np.diag(normal.shared))
+        direction[s:] /= np.sqrt(np.concatenate([np.diag(block) for block in normal.pose]))
+        shared, poses = direction[:s], direction[s:].reshape(3, k)
+        step = 1e-3
+        there, back = (cost(problem.stepped(model, d * shared, d * poses)) for d in (step, -step))
+        gradient = shared @ normal.gradient.sum(0) + np.sum(poses * normal.pose_gradient)
+        # turns of the motion count to first order: some 1e-3 of it here
+        assert_allclose(-(there - back) / (4 * step), gradient, rtol=5e-3, atol=5e-3 * np.linalg.norm(direction))
+
+
+def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
+    ratios, sizes = [], []
+    for seed in range(6):
+        rig = moved_boards.make_rig(seed)
+        found = calibrated(rig, 10, seed, shift=0.5e-3, turn=0.5e-3)
+        error, places = errors(found, rig)
+        C = found.rig.covariance[np.ix_(places, places)]
+        ratios.append((squared(error[-6:], C[-6:, -6:]), squared(error, C)))
+        sizes.append(found.refinement.problem.motion)
+        assert any("not synchronised" in text for text in found.warnings)
+        assert not found.apart
+        # one place of the board for both images, as of cameras that are triggered together
+        o, model = found.refinement.observations, replace(found.refinement.model, boards_right=None)
+        together = refine_stereo(o, model, BOARD.points, found.refinement.terms)
+        by_one_place = np.array([*together.model.cameras[0].parameters[:2], *together.model.cameras[1].parameters[:2]])
+        truth = np.array([K[i, i] for K in rig.matrices for i in (0, 1)])
+        assert np.linalg.norm(error[[0, 1, 4, 5]]) < 0.8 * np.linalg.norm(by_one_place - truth)
+    pair, everything = np.mean(ratios, axis=0)
+    assert 0.5 < pair < 1.7  # chi-square of 36 at three sigma
+    assert 0.6 < everything < 1.6
+    assert_allclose([np.mean([m.shift for m in sizes]), np.mean([m.turn for m in sizes])], 0.5e-3, rtol=0.25)
+
+
+def test_pairs_that_were_synchronised_have_no_motion():
+    for seed in range(3):
+        rig = moved_boards.make_rig(seed)
+        for correlation in (0.4, 0.0):
+            found = calibrated(rig, 10, seed, correlation=correlation)
+            assert found.refinement.problem.motion is None
+            assert not any("synchronised" in text for text in found.warnings)
+        # and where one is asked for, it is found to be next to nothing: 0.1 px are 0.07 mm here
+        r = found.refinement
+        asked = refine_stereo(r.observations, r.model, BOARD.points, r.terms, motion=BoardMotion(1e-3, 1e-3))
+        assert asked.problem.motion.shift < 0.1e-3
+        assert asked.problem.motion.turn < 0.5e-3
+
+
+def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
+    found = calibrated(moved_boards.make_rig(1), 6, 1, shift=1e-3, turn=1e-3)
+    assert found.refinement.model.boards_right is not None
+    write_rig(tmp_path / "rig.h5", found)
+    record = read_rig_file(tmp_path / "rig.h5").record
+    model = replace(
+        found.refinement.model, R_left_board=record.R_left_board, t_left_board=record.t_left_board, boards_right=None
+    )
+    o = record.observations
+    assert_allclose(o.pixels - predict_pixels(model, o), record.residuals, atol=1e-9)
+    assert [found.view_names[v] for v in record.apart] == list(found.view_names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.1e-3, 2e-3])
+def test_sigmas_hold_for_small_and_large_motions(size):
+    ratios = []
+    for seed in range(12):
+        rig = moved_boards.make_rig(100 + seed)
+        found = calibrated(rig, 12, seed, shift=size, turn=size)
+        error, places = errors(found, rig)
+        C = found.rig.covariance[np.ix_(places, places)]
+        axis = rig.t / np.linalg.norm(rig.t)
+        along = found.rig.baseline - np.linalg.norm(rig.t)
+        ratios.append((squared(error, C), along**2 / (axis @ C[-3:, -3:] @ axis)))
+    everything, baseline = np.mean(ratios, axis=0)
+    assert 0.5 < everything < 2.0
+    assert 0.3 < baseline < 2.3  # chi-square of 12 at three sigma

@@ -1,0 +1,81 @@
+"""Corners of a chessboard that two cameras photograph one after the other, by NumPy and `cv2.projectPoints` alone.
+
+Webcams of 640 x 480 px, 8 to 15 cm apart, before a board of 9 x 6 inner corners of 25 mm that is tilted up to some
+40 deg, 0.4 to 0.75 m away. Between the left and the right exposure the board moves by `shift` [m] and turns about its
+middle by `turn` [rad], normal, per axis.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+INNER_CORNERS, SQUARE, IMAGE_SIZE = (9, 6), 0.025, (640, 480)
+EDGE = 8.0  # [px] that corners keep from the image's rim
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Two cameras as OpenCV describes them."""
+
+    matrices: tuple[NDArray, NDArray]  # (3, 3) [px]
+    distortions: tuple[NDArray, NDArray]  # k1, k2, p1, p2, k3
+    R: NDArray  # (3, 3) left to right
+    t: NDArray  # (3,) [m]
+
+
+def make_rig(seed: int) -> Rig:
+    """A rig of its own for every seed."""
+    rng = np.random.default_rng(seed)
+    matrices, distortions = [], []
+    for _ in range(2):
+        f = rng.uniform(700.0, 1000.0)
+        cx, cy = np.array([320.0, 240.0]) + 8.0 * rng.normal(size=2)
+        matrices.append(np.array([[f, 0.0, cx], [0.0, f * (1 + 3e-4 * rng.normal()), cy], [0.0, 0.0, 1.0]]))
+        tangential = 5e-4 * rng.normal(size=2)
+        distortions.append(np.array([rng.uniform(-0.2, 0.1), rng.uniform(-0.1, 0.2), *tangential, 0.0]))
+    R = cv2.Rodrigues(np.array([0.02 * rng.normal(), rng.uniform(0.1, 0.3), 0.02 * rng.normal()]))[0]
+    centre = np.array([rng.uniform(0.08, 0.15), *(3e-3 * rng.normal(size=2))])
+    return Rig((matrices[0], matrices[1]), (distortions[0], distortions[1]), R, -R @ centre)
+
+
+def board() -> NDArray:
+    """(54, 3) [m] corners, along the first side first."""
+    across, down = INNER_CORNERS
+    return np.concatenate([np.mgrid[:across, :down].T.reshape(-1, 2) * SQUARE, np.zeros((across * down, 1))], axis=1)
+
+
+def pairs(
+    rig: Rig,
+    n: int,
+    seed: int,
+    noise: float = 0.1,
+    shift: float = 0.0,
+    turn: float = 0.0,
+    correlation: float = 0.0,
+) -> tuple[NDArray, NDArray]:
+    """Left and right corners (n, 54, 2) [px] with noise [px]; neighbours' errors correlate by `correlation`."""
+    rng = np.random.default_rng(1000 + seed)
+    points = board()
+    arms = points - points.mean(0)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1) / SQUARE
+    root = np.linalg.cholesky(np.eye(len(points)) if correlation == 0 else correlation**apart)
+    seen: list[tuple[NDArray, NDArray]] = []
+    while len(seen) < n:
+        R = cv2.Rodrigues(rng.normal(size=3) * [0.35, 0.35, 0.15])[0]
+        place = np.array([rng.uniform(-0.12, 0.2), rng.uniform(-0.1, 0.1), rng.uniform(0.4, 0.75)])
+        R_later, later = cv2.Rodrigues(turn * rng.normal(size=3))[0] @ R, place + shift * rng.normal(size=3)
+        left = _image(arms @ R.T + place, rig, 0)
+        right = _image((arms @ R_later.T + later) @ rig.R.T + rig.t, rig, 1)
+        errors = [root @ rng.normal(size=(len(points), 2)) * noise for _ in range(2)]
+        both = np.concatenate([left, right])
+        if np.all(both > EDGE) and np.all(both < np.array(IMAGE_SIZE) - 1 - EDGE):
+            seen.append((left + errors[0], right + errors[1]))
+    left, right = (np.stack(side) for side in zip(*seen, strict=True))
+    return left, right
+
+
+def _image(points: NDArray, rig: Rig, camera: int) -> NDArray:
+    matrix, distortion = rig.matrices[camera], rig.distortions[camera]
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
