@@ -37,11 +37,13 @@ U, V, VAR_U, VAR_V, COV_UV, CHI_SQUARE, FIT_SIGMA, FIT_RADIUS, FIT_LEVEL, FIT_CO
 N_RESULT = 12
 
 # Rows of what is kept of every pixel: place on the plane from the expected centre [px], place in the image from the
-# expected centre [10 px], grey value, distance from the edge and then weight; derivatives by the eight parameters
-# (from _JACOBIAN on) and residual, over the pixel's sigma.
-_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _WEIGHT, _JACOBIAN = range(7)
+# expected centre [10 px], grey value, distance from the edge; derivatives by the eight parameters (from _JACOBIAN on)
+# and residual, over the pixel's sigma; weight, one over that. The rows of the derivatives also hold the pixels that are
+# to be chosen from.
+_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _DISTANCE, _JACOBIAN = range(7)
 _RESIDUAL = _JACOBIAN + 8
-_PIXEL_ROWS = _RESIDUAL + 1
+_WEIGHT = _RESIDUAL + 1
+_PIXEL_ROWS = _WEIGHT + 1
 _PIXELS = (
     4096 + 64
 )  # of a dot of 60 px; more are made room for. No power of two: rows would fall on one another's cache
@@ -214,29 +216,53 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     unit: plane units per pixel; steepest: the longest step that one pixel can mean on the plane, in those units.
     """
     x_lo, x_hi, y_lo, y_hi = window
-    width = x_hi - x_lo + 1
     band = 3.0 * p[SIGMA] + 1.0
     shift_x, shift_y, radius = _f(p[A]), _f(p[B]), _f(p[RADIUS])
-    # bounds on the distance from the centre that need no square root: most pixels of the window are decided by them
     outer = p[RADIUS] + band * steepest
     inner = max(p[RADIUS] - 1.4 * (band + 1.0) * steepest, 0.0)
-    outer2, inner2 = _f(outer * outer), _f(inner * inner)
+    # Of each row the pixels between two ellipses, those of the linear map: its scale changes over the window, and a
+    # pixel is one more in doubt. In the ring of both nothing is decided by branches, so that it is vector code.
+    far = math.hypot(x_hi - x_lo, y_hi - y_lo)
+    doubt = 0.05 * far * math.hypot(G[2, 0], G[2, 1])
+    outer_row = outer * (1.0 + doubt) + steepest
+    inner_row = max(inner * (1.0 - doubt) - steepest, 0.0)
+    xx, xy, yy = (
+        G[0, 0] * G[0, 0] + G[1, 0] * G[1, 0],
+        G[0, 0] * G[0, 1] + G[1, 0] * G[1, 1],
+        G[0, 1] * G[0, 1] + G[1, 1] * G[1, 1],
+    )
     x_from, y_from = start[0] / unit, start[1] / unit
+    X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
+    w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
     n = 0
     for y in range(y_lo, y_hi + 1):
-        for k in range(width):
-            xn, yn = map_x[y, x_lo + k], map_y[y, x_lo + k]
-            w = 1.0 / (unit * (P[2, 0] * xn + P[2, 1] * yn + P[2, 2]))
-            pixels[_JACOBIAN, k] = (P[0, 0] * xn + P[0, 1] * yn + P[0, 2]) * w - x_from
-            pixels[_JACOBIAN + 1, k] = (P[1, 0] * xn + P[1, 1] * yn + P[1, 2]) * w - y_from
-        for k in range(width):
-            X, Y = pixels[_JACOBIAN, k], pixels[_JACOBIAN + 1, k]
-            dx, dy = X - shift_x, Y - shift_y
-            rho2 = dx * dx + dy * dy
-            pixels[_X, n], pixels[_Y, n], pixels[_GREY, n] = X, Y, image[y, x_lo + k]
-            pixels[_OFFSET_X, n], pixels[_OFFSET_Y, n] = 0.1 * (x_lo + k - u0), 0.1 * (y - v0)
-            if inner2 < rho2 < outer2:  # also NaN: a pixel without a ray
-                n += 1
+        dy = y - v0
+        middle = u0 - xy / xx * dy
+        across = (xy * xy - xx * yy) * dy * dy
+        reach2, hole2 = across + xx * outer_row * outer_row, across + xx * inner_row * inner_row
+        if reach2 < 0.0:
+            continue
+        reach, hole = math.sqrt(reach2) / xx, math.sqrt(max(hole2, 0.0)) / xx
+        first, end = max(int(math.ceil(middle - reach)), x_lo), min(int(middle + reach) + 1, x_hi + 1)
+        for part in range(2):
+            if hole2 <= 0.0:
+                lo, hi = (first, end) if part == 0 else (end, end)
+            elif part == 0:
+                lo, hi = first, min(int(math.ceil(middle - hole)), end)
+            else:
+                lo, hi = max(int(middle + hole) + 1, first), end
+            if lo >= hi:
+                continue
+            # views, for an index that is a sum might be negative, and is looked at one by one
+            xs, ys, greys = map_x[y, lo:hi], map_y[y, lo:hi], image[y, lo:hi]
+            X_row, Y_row = pixels[_JACOBIAN, n:], pixels[_JACOBIAN + 1, n:]
+            x_row, y_row, grey_row = pixels[_JACOBIAN + 2, n:], pixels[_JACOBIAN + 3, n:], pixels[_JACOBIAN + 4, n:]
+            for k in range(hi - lo):  # one loop, of few pixels at a time: there are some ten
+                w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
+                X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
+                Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w - y_from
+                x_row[k], y_row[k], grey_row[k] = 0.1 * (lo + k - u0), 0.1 * (y - v0), greys[k]
+            n += hi - lo
     # which of the dot's surroundings can come near any pixel at all
     reach = unit * (outer + math.hypot(p[A], p[B]))
     blur = p[SIGMA] * steepest * unit
@@ -247,33 +273,31 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     g00, g01, g10, g11 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1])
     for i in range(n):
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[_X, i] - shift_x, pixels[_Y, i] - shift_y, radius, g00, g01, g10, g11, _0
+            pixels[_JACOBIAN, i] - shift_x, pixels[_JACOBIAN + 1, i] - shift_y, radius, g00, g01, g10, g11, _0
         )
-        pixels[_WEIGHT, i], pixels[_JACOBIAN, i] = d, inv_g
-    kept, well_inside = 0, min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)
-    inside_sum, inside_n, outside_sum, outside_n = 0.0, 0, 0.0, 0
+        pixels[_JACOBIAN + 5, i], pixels[_JACOBIAN + 6, i] = d, inv_g
+    kept, nearest, farthest = 0, _f(-band - 1.0), _f(band)
     for i in range(n):
-        d = pixels[_WEIGHT, i]
-        if not -band - 1.0 < d < band:
-            continue
-        if crowded:
-            X, Y = start[0] + unit * pixels[_X, i], start[1] + unit * pixels[_Y, i]
-            blur = p[SIGMA] * unit / pixels[_JACOBIAN, i]
-            near = math.hypot(X, Y) > rim - 2.5 * blur
+        d = pixels[_JACOBIAN + 5, i]
+        good = nearest < d < farthest  # not so for NaN either: a pixel without a ray
+        if crowded and good:
+            X, Y = start[0] + unit * pixels[_JACOBIAN, i], start[1] + unit * pixels[_JACOBIAN + 1, i]
+            blur = p[SIGMA] * unit / pixels[_JACOBIAN + 6, i]
+            good = math.hypot(X, Y) <= rim - 2.5 * blur
             for j in range(neighbours.shape[0]):
-                near |= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] < 3.0 * blur
-            if near:
-                continue
-        grey = pixels[_GREY, i]
+                good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] >= 3.0 * blur
         for row in range(_JACOBIAN):
-            pixels[row, kept] = pixels[row, i]
-        kept += 1
-        if d < -well_inside:
-            inside_sum += grey
-            inside_n += 1
-        elif d > 1.2 * p[SIGMA]:
-            outside_sum += grey
-            outside_n += 1
+            pixels[row, kept] = pixels[_JACOBIAN + row, i]
+        kept += 1 if good else 0
+    inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
+    well_inside, well_outside = _f(-min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)), _f(1.2 * p[SIGMA])
+    for i in range(kept):
+        d, grey = pixels[_DISTANCE, i], pixels[_GREY, i]
+        is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
+        inside_n += is_in
+        outside_n += is_out
+        inside_sum += is_in * grey
+        outside_sum += is_out * grey
     inside = inside_sum / inside_n if inside_n >= 3 else np.nan
     outside = outside_sum / outside_n if outside_n >= 8 else np.nan
     return kept, inside, outside
@@ -568,11 +592,13 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
+        distance, weight, grey = pixels[_DISTANCE], pixels[_WEIGHT], pixels[_GREY]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
-            s, bell = _edge_profile(pixels[_WEIGHT, i] * inv_sigma)
-            pixels[_WEIGHT, i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
-            pixels[_GREY, i] *= in_light  # a product in double precision, rounded once
+            s, bell = _edge_profile(distance[i] * inv_sigma)
+            weight[i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
+        for i in range(n):
+            grey[i] *= in_light  # a product in double precision, rounded once
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
             converged, chi2, n_clipped = _descend(

