@@ -61,6 +61,23 @@ def test_a_wrong_gravity_is_named_with_the_true_one(gravity, hint, honest):
     assert hint in finding.sentence
 
 
+@pytest.mark.parametrize("factor", [2.0, 10.0])
+def test_a_wrong_radius_is_named_before_the_rate_where_the_rim_says_so(factor, honest):
+    """The balance of moments alone knows radius / rate^2: that the rim is on the table tells which of the two it is."""
+    disc = replace(honest.disc, radius=factor * honest.disc.radius)
+    found = {finding.check: finding for finding in contradictions(replace(honest, disc=disc))}
+    first = found["gravity and rate"].suspects[0]
+    assert first.key == "[disc] radius_mm"
+    assert abs(float(first.would_be) / (1e3 * honest.disc.radius) - 1) < 2e-3
+
+
+@pytest.mark.parametrize("key", ["mass", "half_thickness"])
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_a_disc_of_no_known_density_is_told(key, factor, honest):
+    disc = replace(honest.disc, **{key: factor * getattr(honest.disc, key)})
+    assert "density" in [finding.check for finding in contradictions(honest, disc)]
+
+
 def test_departures_that_a_table_or_an_edge_may_make_are_no_contradiction(honest):
     assert contradictions(at_another_rate(honest, 1.03)) == ()
     assert contradictions(replace(honest, gravity=9.81 * 0.95)) == ()
