@@ -110,7 +110,8 @@ caption{{text-align:left;color:var(--soft);padding-bottom:.35rem}}
 th,td{{text-align:left;padding:.28rem .9rem .28rem 0;border-bottom:1px solid var(--line);white-space:nowrap;
 font-variant-numeric:tabular-nums}}
 td:first-child{{white-space:normal;min-width:14em}}
-th{{color:var(--soft);font-weight:600}}tr.failed td,tr.not td{{color:var(--bad)}}
+th{{color:var(--soft);font-weight:600;white-space:normal;vertical-align:bottom}}
+tr.failed td,tr.not td{{color:var(--bad)}}
 details{{margin:.6rem 0}}summary{{cursor:pointer;color:var(--mark)}}
 @media (max-width:40rem){{main{{padding:1rem .8rem 3rem}}section{{padding:1rem .9rem}}h1{{font-size:1.35rem}}
 .gallery{{columns:1}}}}

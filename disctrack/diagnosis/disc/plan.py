@@ -57,13 +57,13 @@ class Proposal:
             start = f"start at {self.theta_deg:g} deg with omega_3 = {self.omega3:g} rad/s"
         changes = [f"film {self.duration:.2g} s"] if self.duration is not None else []
         for factor, what in (
-            (self.mass, "a disc {} times as heavy"), (self.radius, "a disc {} times as large"),
-            (self.pressure, "air at {} of the pressure"), (self.rate, "{} times the frame rate"),
+            (self.mass, "with a disc {} times as heavy"), (self.radius, "with a disc {} times as large"),
+            (self.pressure, "in air at {} of the pressure"), (self.rate, "at {} times the frame rate"),
         ):  # fmt: skip
             changes += [what.format(f"{factor:g}")] if factor != 1.0 else []
         if self.numbers != 1.0:
-            changes.append("twice the dots" if self.numbers == 2.0 else "a third view")
-        return f"{start} and {', '.join(changes)}" if changes else f"{start}, the same again"
+            changes.append("with twice the dots" if self.numbers == 2.0 else "with a third view")
+        return f"{start}, {', '.join(changes)}" if changes else f"{start}, the same again"
 
 
 def starts() -> Iterator[Proposal]:

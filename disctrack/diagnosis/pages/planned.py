@@ -8,12 +8,11 @@ import numpy as np
 
 from disctrack.diagnosis.disc.plan import ENOUGH, UPPER, Plan, Question
 from disctrack.diagnosis.pages.words import quantity_text
-from disctrack.pages.html import paragraph, table
+from disctrack.pages.html import bullets, details, paragraph, table
 
-SHOWN = 24  # proposals in the table
 SAID = (
     "Computed from the fitted model: each recording is simulated with the same cameras and noise, and put beside "
-    "this one; laws, cameras and dots are shared, the initial state is its own. With another disc the laws' "
+    "what there is; laws, cameras and dots are shared, the initial state is its own. With another disc the laws' "
     "coefficients are taken to stay, with another pressure air drag to go with the density as its law says. More dots "
     "and a third view count as numbers of the same kind."
 )
@@ -51,20 +50,26 @@ def html(plan: Plan | None) -> list[str]:
     """For the page."""
     if plan is None or not plan.questions:
         return []
-    header = ("recording", "s", *(question_text(q) for q in plan.questions))
-    rows = [("this one alone", "", *(_answer(q, x) for q, x in zip(plan.questions, plan.now, strict=True)))]
     best = {id(plan.best(i)) for i in range(len(plan.questions))}
-    shown = sorted(plan.rows, key=lambda r: id(r) not in best)[:SHOWN]
-    rows += [
-        (
-            r.proposal.text,
-            f"{r.duration:.2g}",
-            *(_answer(q, x) for q, x in zip(plan.questions, r.answers, strict=True)),
-        )
-        for r in shown
-    ]
-    said = " ".join(_sentence(plan, i) for i in range(len(plan.questions)))
-    return [paragraph(said), paragraph(SAID), table("", header, rows)]
+    different = {r.answers: r for r in reversed(plan.rows)}.values()  # a disc at rest is filmed to no purpose
+    rows = [(id(r) in best, (r.proposal.text, f"{r.duration:.2g}", *map(_cell, r.answers))) for r in different]
+    header = ("one more recording", "lasts [s]", *map(_heading, plan.questions))
+    now = ("none: what there is", "", *map(_cell, plan.now))
+    first = table("", header, [now, *(cells for is_best, cells in rows if is_best)])
+    others = table("", header, [cells for is_best, cells in rows[::-1] if not is_best])
+    said = [_sentence(plan, i) for i in range(len(plan.questions))]
+    return [bullets(said), paragraph(SAID), first, details("All other recordings that were looked at", [others])]
+
+
+def _heading(q: Question) -> str:
+    if q.rival is not None:
+        return f"{question_text(q)} [sigmas]"
+    unit = q.effect.quantities[0].unit
+    return f"sigma of {q.effect.name}" + (f" [{unit}]" if unit != "1" else "")
+
+
+def _cell(value: float) -> str:
+    return f"{value:.2g}" if np.isfinite(value) else "unseen"
 
 
 def _sentence(plan: Plan, i: int) -> str:
@@ -73,11 +78,15 @@ def _sentence(plan: Plan, i: int) -> str:
         return f"For {question_text(q)} no recording looked at can be made."
     if q.rival is None:
         unit = q.effect.quantities[0].unit
-        limit = quantity_text(UPPER * best.answers[i], 0.0, unit)
-        return f"The {question_text(q)} would be known to {limit} (95 %): {best.proposal.text}."
+        limit, now = (_limit(x, unit) for x in (best.answers[i], plan.now[i]))
+        return f"The {question_text(q)} is known to {now} (95 %), and would be to {limit}: {best.proposal.text}."
     if best.answers[i] < ENOUGH:
         return f"No recording looked at tells {q.effect.name} from {q.rival.name}."
     return f"To tell {q.effect.name} from {q.rival.name}: {best.proposal.text} ({best.answers[i]:.3g} sigmas)."
+
+
+def _limit(sigma: float, unit: str) -> str:
+    return quantity_text(float(f"{UPPER * sigma:.2g}"), 0.0, unit) if np.isfinite(sigma) else "nothing"
 
 
 def as_json(plan: Plan | None) -> dict[str, Any] | None:

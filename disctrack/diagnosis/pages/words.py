@@ -34,7 +34,10 @@ def quantity_text(value: float, sigma: float, unit: str) -> str:
         return f"{value:.4g}{unit}"
     digits = int(max(0, 1 - np.floor(np.log10(sigma))))
     if digits > 7 or abs(value) >= 1e6:
-        return f"({value:.5g} +- {sigma:.2g}){unit}"
+        places = (
+            int(np.floor(np.log10(max(abs(value), sigma))) - np.floor(np.log10(sigma))) + 2
+        )  # down to sigma's second
+        return f"({value:.{places}g} +- {sigma:.2g}){unit}"
     return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
 
 

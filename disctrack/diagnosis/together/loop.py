@@ -25,7 +25,7 @@ from disctrack.diagnosis.together.crew import Crew
 from disctrack.diagnosis.together.fitting_in import Blocks, FitsIn, apart
 from disctrack.diagnosis.together.joint import JointSystem
 from disctrack.diagnosis.together.recordings import Alone, Item, Recorded, Say, build, in_common, labels_of
-from disctrack.diagnosis.together.sharing import Member, Sharing
+from disctrack.diagnosis.together.sharing import EACH, Member, Sharing
 from disctrack.errors import AnalysisError, DiscTrackError
 
 TEST_EVERY = 3  # of the recordings, every so many is foretold from the others
@@ -154,7 +154,18 @@ def _search(
     progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
     n = len(members)
     training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0
-    return system, diagnose(system, sharing.start(), settings, training)
+    return system, _without_variants(diagnose(system, sharing.start(), settings, training))
+
+
+def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
+    """With one value for all, a value for each group is no rival: it contains it."""
+    found = [
+        replace(f, cannot_be_told_from=tuple(
+            r for r in f.cannot_be_told_from if r.candidate.name != f"{f.candidate.name} ({EACH})"
+        ))
+        for f in diagnosis.found
+    ]  # fmt: skip
+    return replace(diagnosis, found=tuple(found))
 
 
 def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Alone | None]]:
@@ -306,6 +317,8 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
         values = np.array([after.values[n] for n in names])
         covariance = after.covariance[np.ix_(index, index)]
         q = after.quantities[index[0]]
+        if np.isfinite(q.prior_sigma):  # a tolerance, no law
+            continue
         tested = hypotheses(values, covariance, sharing.covariates_of(local))
         shown = {g: (after.values[n], after.sigma(n)) for g, n in groups.items()}
         found.append(Dependence(local, q.unit, shown, tuple(tested)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.output import effect_json, tried_json
 from disctrack.diagnosis.pages.words import effect_text, quantity_text
 from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
+from disctrack.diagnosis.together.sharing import EACH
 from disctrack.files.json_text import plain
 from disctrack.pages.figures import Drawn, panels
 from disctrack.pages.html import bullets, details, page, paragraph, section, table, warning
@@ -39,14 +41,15 @@ def sentence(answer: TogetherDiagnosis) -> str:
     else:
         effects = "; and ".join(_effect_text(f, d) for f in d.found)
         falls = (
-            f"chi-square per degree of freedom {d.before.reduced_chi_square:.4g} -> {d.after.reduced_chi_square:.4g}"
+            f"chi-square per degree of freedom falls from {d.before.reduced_chi_square:.4g} to "
+            f"{d.after.reduced_chi_square:.4g}"
         )
         if d.verdict == "found":
-            text = f"{of_all}: missing in the model: {effects} ({falls})."
+            text = f"{of_all}. Missing in the model: {effects}; {falls}."
         elif effects:
-            text = f"{of_all}: something is missing that the catalogue does not name; nearest is {effects} ({falls})."
+            text = f"{of_all}. Something is missing that the catalogue does not name; nearest is {effects}; {falls}."
         else:
-            text = f"{of_all}: something is missing that no effect of the catalogue describes; {left}."
+            text = f"{of_all}. Something is missing that no effect of the catalogue describes; {left}."
     apart = [r.name for r in left_out if r.reason.startswith("does")]
     if apart:
         text += f" {_listed(apart)} {'does' if len(apart) == 1 else 'do'} not fit the others."
@@ -215,7 +218,7 @@ def _dependence_table(x: Dependence) -> str:
     rows = [
         (
             h.text,
-            ", ".join(f"{k} {v:.4g} +- {s:.2g}" for k, (v, s) in h.numbers.items()),
+            ", ".join(f"{k} {quantity_text(*vs, x.unit if k == 'constant' else '1')}" for k, vs in h.numbers.items()),
             f"{h.chi_square:.3g} / {h.degrees}",
             f"{h.p_value:.2g}" if h.degrees > 0 else "",
             "holds" if h.holds else "refused",
@@ -223,7 +226,11 @@ def _dependence_table(x: Dependence) -> str:
         for h in x.hypotheses
     ]
     groups = table("", (x.quantity, "value"), [(g, quantity_text(*vs, x.unit)) for g, vs in x.groups.items()])
-    return groups + table(x.quantity, ("hypothesis", "numbers", "chi-square / degrees", "p", ""), rows)
+    return groups + table(
+        f"How these values of {x.quantity} hang together",
+        ("hypothesis", "numbers", "chi-square / degrees", "p", ""),
+        rows,
+    )
 
 
 def _recordings(answer: TogetherDiagnosis) -> str:
@@ -254,23 +261,33 @@ def _by_number(answer: TogetherDiagnosis) -> str:
     rows = []
     for b in shown:
         q = b.candidate.quantities[0]
-        sigma = [_number(float(b.by_number[k][0]), q.unit) for k in numbers]
-        upper = "" if b.upper is None else _number(b.upper, q.unit)
-        rows.append([b.candidate.title, q.name, *sigma, _value(b), upper])
-    header = ["effect", "number", *(f"sigma of {k}" for k in numbers), "all together", "at most (95 %)"]
+        sigma = [f"{x:.2g}" if np.isfinite(x := float(b.by_number[k][0])) else "unseen" for k in numbers]
+        name = q.name + (f" [{q.unit}]" if q.unit != "1" else "")
+        rows.append([_short(b.candidate.title), name, *sigma, *_in_all(b, "1")])
+    of = [f"{k}" if k > 1 else "sigma from 1 recording" for k in numbers]
+    header = ["effect", "number", *of, "all together", "at most (95 %)"]
     said = (
         "Standard deviation of an effect's size from the first so many recordings, once initial states, laws, "
         "calibration and dots have taken their share. It falls with the root of their number until what they have in "
-        "common, calibration or dots, sets the limit. What was not found is smaller than the last column."
+        "common, calibration or dots, sets the limit. What was not found is smaller than the last column says."
     )
     rest = [b for b in answer.bounds if b not in shown]
     others = [
-        [b.candidate.title, b.candidate.quantities[0].name, _value(b),
-         "" if b.upper is None else _number(b.upper, b.candidate.quantities[0].unit)]
-        for b in rest
-    ]  # fmt: skip
+        [b.candidate.title, b.candidate.quantities[0].name, *_in_all(b, b.candidate.quantities[0].unit)] for b in rest
+    ]
     more = table("", ("effect", "number", "all together", "at most (95 %)"), others)
     return paragraph(said) + table("", header, rows) + details("All other effects", [more])
+
+
+def _short(title: str) -> str:
+    """Without the formula."""
+    return re.split(r", (?=\S+ (?:=|<=) )", title)[0]
+
+
+def _in_all(b: Bound, unit: str) -> list[str]:
+    """Its size from all recordings, and its upper limit."""
+    value = quantity_text(float(b.values[0]), float(b.sigma[0]), unit) if np.isfinite(b.sigma[0]) else "unseen"
+    return [value, "" if b.upper is None else quantity_text(float(f"{b.upper:.2g}"), 0.0, unit)]
 
 
 def _of_interest(answer: TogetherDiagnosis) -> list[Bound]:
@@ -288,17 +305,8 @@ def _of_interest(answer: TogetherDiagnosis) -> list[Bound]:
         sigma, typical = b.by_number[max(b.by_number)][0], b.candidate.quantities[0].typical
         return bool(np.isfinite(sigma)) and sigma <= UNSEEN * typical
 
-    usable = [b for b in answer.bounds if seen(b)]
+    usable = [b for b in answer.bounds if seen(b) and not (b.candidate.name.endswith(f"({EACH})") and rank(b)[0])]
     return sorted(usable, key=rank)[:SHOWN]
-
-
-def _number(value: float, unit: str) -> str:
-    return quantity_text(value, 0.0, unit) if np.isfinite(value) else "unseen"
-
-
-def _value(b: Bound) -> str:
-    q = b.candidate.quantities[0]
-    return quantity_text(float(b.values[0]), float(b.sigma[0]), q.unit) if np.isfinite(b.sigma[0]) else "unseen"
 
 
 def _tried(answer: TogetherDiagnosis) -> str:
@@ -328,16 +336,17 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
             continue
         figure, (axes,) = panels(9.5, 2.6)
         x, y, s = (np.array(c) for c in zip(*points, strict=True))
+        of_group = x if len(names) > NAMED else np.arange(len(x))
         value, sigma = after.values[q.name], after.sigma(q.name)
         axes.axhspan(value - 2 * sigma, value + 2 * sigma, color=AMBER, alpha=0.35, lw=0)
         axes.axhline(value, color=AMBER, lw=1)
-        axes.errorbar(x, y, s, fmt="o", ms=3, lw=1, color=BLUE, ecolor=MUTED)
+        axes.errorbar(of_group, y, s, fmt="o", ms=3, lw=1, color=BLUE, ecolor=MUTED)
         if len(names) <= NAMED:
-            axes.set_xticks(range(len(names)), names)
+            axes.set_xticks(of_group, [names[i] for i in x])
         else:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlabel("recording, from 0")
-        axes.set_ylabel(f"{q.name.partition('.')[2]} [{q.unit}]" if q.unit != "1" else q.name.partition(".")[2])
+        axes.set_ylabel(q.name.partition(".")[2].partition("[")[0] + (f" [{q.unit}]" if q.unit != "1" else ""))
         caption = "Each recording alone with its standard deviation; the band is two of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
     return tuple(drawn)
