@@ -1,11 +1,13 @@
 """Boards that moved between the left and the right exposure of a pair: a random motion, as large as the pairs tell.
 
 Where the cameras are not triggered together, every right image shows the board a little elsewhere. Its motion, a turn w
-about the board's middle and a shift s of it, is taken for normal with mean zero and one variance for w, one for s, the
-same for all pairs. So a pair still tells how the cameras stand, as well as the motion lets it, and each image tells of
-its own camera in full. The variances are those of restricted maximum likelihood (Patterson and Thompson 1971), found by
-the fixed point sigma^2 = sum m^2 / gamma, gamma the number of motions that the pairs determine (MacKay 1992, Neural
-Computation 4, 415): what cameras not yet known leave open is not counted as motion.
+about the board's middle and a shift s of it, has mean zero, one variance for w, one for s, and Student's distribution:
+of boards in a hand some are still and some are not. So a pair still tells how the cameras stand, as well as its motion
+lets it, and each image tells of its own camera in full. The variances are those of restricted maximum likelihood
+(Patterson and Thompson 1971), found by the fixed point sigma^2 = sum m^2 / (gamma - 2), gamma the number of motions
+that the pairs determine (MacKay 1992, Neural Computation 4, 415): what cameras not yet known leave open is not counted
+as motion; and gamma - 2 makes it the mean of what sigma^2 may be, as few motions tell it, not its likeliest value. How
+much a pair is heeded follows as by Lange, Little and Taylor (1989, J. Am. Stat. Assoc. 84, 881).
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import numpy as np
 from calibration.arrays import Array
 from calibration.stereo_model import StereoModel
 
+TAILS = 4.0  # degrees of freedom of Student's distribution, as usual where few pairs would have to tell them
 LEAST = 1e-6  # [rad], and of the board's distance: far below what any view tells of a pose
 
 
@@ -26,11 +29,16 @@ class BoardMotion:
 
     turn: float  # [rad]
     shift: float  # [m]
+    heeded: Array | None = None  # (n_views,) inverse variances of the pairs, in those of all: some are held still
 
     @property
     def weights(self) -> Array:
         """(6,) inverse variances of turn and shift."""
         return np.repeat([self.turn**-2.0, self.shift**-2.0], 3)
+
+    def weights_of(self, n: int) -> Array:
+        """(n, 6) inverse variances of each pair."""
+        return self.weights * (np.ones((n, 1)) if self.heeded is None else self.heeded[:, None])
 
     def is_near(self, other: BoardMotion) -> bool:
         """True if both differ by some percent at most: they are never known better."""
@@ -73,10 +81,14 @@ def learnt(motion: BoardMotion, model: StereoModel, covariance: Array) -> tuple[
     """
     m, J = motions(model)
     C = np.einsum("vij,vjk,vik->vi", J, covariance, J)
-    determined = np.clip(1.0 - C * motion.weights, 0.0, 1.0)
+    weights = motion.weights_of(len(m))
+    determined = np.clip(1.0 - C * weights, 0.0, 1.0)
+    heeded = weights[:, 0] / motion.weights[0]
     sizes = []
     distance = float(np.median(np.linalg.norm(model.t_left_board, axis=1)))
     for part, least in ((slice(0, 3), LEAST), (slice(3, 6), LEAST * distance)):
-        square = float(np.sum(m[:, part] ** 2)) / max(float(determined[:, part].sum()), 1e-3)
+        square = float(np.sum(heeded[:, None] * m[:, part] ** 2)) / max(float(determined[:, part].sum()) - 2.0, 1.0)
         sizes.append(max(float(np.sqrt(square)), least))
-    return BoardMotion(*sizes), float(determined.sum())
+    found = BoardMotion(sizes[0], sizes[1])
+    heeded = (TAILS + 6.0) / (TAILS + np.sum((m**2 + C) * found.weights, axis=1))
+    return replace(found, heeded=heeded), float(determined.sum())

@@ -101,7 +101,7 @@ def _reduced(
         between, by_poses = (values[view] for values in motions(refinement.model))
         more = np.zeros((6, rows.shape[1]))
         more[:, -k - 1 : -1], more[:, -1] = by_poses, -between
-        rows = np.concatenate([rows, np.sqrt(problem.motion.weights)[:, None] * more])
+        rows = np.concatenate([rows, np.sqrt(problem.motion.weights_of(problem.n_views)[view])[:, None] * more])
     Q, _ = np.linalg.qr(rows[:, -k - 1 : -1])
     rows = rows - Q @ (Q.T @ rows)
     return rows[:, : -k - 1], rows[:, -1]

@@ -209,10 +209,11 @@ class Problem:
             normal.pose[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = squares[k, :, s1:-1, s1:-1]
         if self.motion is not None:
             between, by_poses = motions(model)
-            weighted = by_poses * self.motion.weights[:, None]
+            weights = self.motion.weights_of(n_views)
+            weighted = by_poses * weights[..., None]
             normal.pose[:n_views] += np.swapaxes(by_poses, 1, 2) @ weighted
             normal.pose_gradient[:n_views] -= np.einsum("vij,vi->vj", weighted, between)
-            normal.costs[:n_views] += between**2 @ self.motion.weights
+            normal.costs[:n_views] += np.sum(between**2 * weights, axis=1)
         unseen = np.bincount(o.view, minlength=V) == 0
         normal.pose[unseen], normal.pose_gradient[unseen] = np.eye(6 * exposures), 0.0
         normal.costs[unseen] = 0.0
