@@ -29,6 +29,7 @@ from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
+from disctrack.track.summary import left_out
 from disctrack.track.tracking import BlockOfPairs, Tracking, TrackingSettings, track
 from disctrack.trajectory import MarkerStatus, Trajectory
 
@@ -168,9 +169,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
     advice = "" if level == "fine" else "the whole board must be in view of both cameras, with a light rim round it"
     seen.say(level, "chessboard", f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all), "
              f"rms {found.rms_px:.3f} px, baseline {1e3 * found.rig.baseline:.1f} mm", advice)  # fmt: skip
-    for view, why in found.rejected_views.items():
-        seen.say("look", "chessboard", f"view {chosen[view]} is not used: {why}")
-    for text in (*problems, *found.warnings):
+    for text in (*left_out(found.rejected_views), *problems, *found.warnings):
         seen.say("look", "chessboard", text)
     return found.rig
 

@@ -87,8 +87,8 @@ def warnings_of(
     for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
         if saturation is not None:
             warnings.append(
-                f"{camera} camera: the light round the dots is clipped at grey value {saturation}, which hides part of "
-                "their edges and of the noise: positions may be off by a micrometre. Expose for a shorter time"
+                f"{camera} camera: the brighter side of the dots' edges is clipped at grey value {saturation}, which "
+                "hides part of them and of the noise: positions may be off by a micrometre. Expose for a shorter time"
             )
     if misplaced := misplaced_in_words(follower.setup.disc, trajectory.disc.marker_centres_body):
         warnings.append(f"{misplaced}. Poses rest on these; that their middle is the disc's is as declared")

@@ -92,6 +92,29 @@ def test_cameras_are_told_apart_by_their_names(names, pairs, tmp_path):
     assert [(pair.left.pattern, pair.right.pattern) for pair in found] == pairs
 
 
+def test_folders_behind_links_are_looked_into_once(tmp_path):
+    for name in ("kept/views/left", "kept/views/right", "take/left", "take/right"):
+        (tmp_path / name).mkdir(parents=True)
+        for i in range(2):
+            (tmp_path / name / f"{i}.png").touch()
+    os.symlink(tmp_path / "kept/views", tmp_path / "take/calibration")
+    os.symlink(tmp_path / "take", tmp_path / "take/again")  # leads back to where it lies
+    found = {(pair.left.pattern, pair.right.pattern) for pair in pair_cameras(find_sequences(tmp_path / "take"))}
+    assert found == {("left/*.png", "right/*.png"), ("calibration/left/*.png", "calibration/right/*.png")}
+
+
+def test_check_names_the_file_of_a_view_that_is_not_used(sample_clip, tmp_path, capsys):
+    folder = linked(sample_clip, tmp_path / "clip")
+    views = sorted((folder / "calibration/right").glob("*.png"))
+    blank = np.full_like(cv2.imread(str(views[-1]), cv2.IMREAD_UNCHANGED), 90)
+    views[-1].unlink()
+    cv2.imwrite(str(views[-1]), blank)
+    main(["check", str(folder)])
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "left out" in line)
+    assert str(views[-1]) in line
+    assert not re.search(r"view \d", line)  # a number among those that were looked at means nothing to a reader
+
+
 def test_stacks_in_one_hdf5_file_are_the_two_cameras(tmp_path, rng):
     with h5py.File(tmp_path / "frames.h5", "w") as file:
         for name in ("right", "left"):
