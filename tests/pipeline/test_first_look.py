@@ -194,14 +194,14 @@ def declare(folder: Path, old: str, new: str) -> None:
     file.write_text(text.replace(old, new))
 
 
-def renumber_right(folder: Path) -> None:
-    """The right camera one frame late: its frame i shows what the left one's shows in i - 1."""
+def renumber_right(folder: Path, by: int = 1) -> None:
+    """The right camera late by some frames: its frame i shows what the left one's shows in i - by."""
     files = sorted((folder / "right").glob("*.png"))
     targets = [file.resolve() for file in files]
     for file in files:
         file.unlink()
     for i, file in enumerate(files):
-        os.symlink(targets[max(i - 1, 0)], file)
+        os.symlink(targets[max(i - by, 0)], file)
 
 
 FAULTS = {
@@ -221,6 +221,7 @@ FAULTS = {
         or declare(f, 'left = "_', 'left = "right/'), "left and right are exchanged", 1,
     ),
     "one frame late": (renumber_right, "right frame i+1 show the same instant", 1),
+    "three frames late": (lambda f: renumber_right(f, 3), "right frame i+3 show the same instant", 1),
 }  # fmt: skip
 
 
@@ -235,3 +236,5 @@ def test_check_names_the_fault(fault, sample_clip, tmp_path, capsys):
     assert re.search(r"(^| )(look|fix) ", told), told
     if expected is not None:
         assert code == expected, told
+    if "late" in fault:  # and it is told once, not by every place looked at and by all that follows from it
+        assert len(re.findall(r"(^| )(look|fix) +(clock|cameras|physics)", told)) == 1, told
