@@ -11,6 +11,7 @@ from calibration.brief import Brief
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
+from disctrack.diagnosis.disc.form_misfit import with_form
 from disctrack.diagnosis.disc.learned_law import LearnedLaw, learn, with_law, without_idle_terms
 from disctrack.diagnosis.disc.left_over import LeftOver, left_over
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
@@ -82,7 +83,9 @@ def diagnose_trajectory(
     assert held_before is not None
     assert held_after is not None
     if learned is not None:
-        learned = replace(learned, fit=with_memory(_judged(diagnosis, system), learned.fit))
+        remembering = with_memory(_judged(diagnosis, system), learned.fit)
+        wider, course = with_form(system, remembering, learned.law, diagnosis.noise)
+        learned = replace(learned, fit=wider, course=course)
         left = left_over(system, learned.fit, diagnosis.noise)
     else:
         diagnosis = replace(diagnosis, after=with_memory(_judged(diagnosis, system), diagnosis.after))

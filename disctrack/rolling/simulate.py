@@ -22,6 +22,8 @@ RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
 _N_STATE = {ROLLING: 8, SLIPPING: 10, FLYING: 12}
 MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
+MAX_SLIP_STEPS = 10**9  # of the integrator in slip, over all stretches, and ...
+MAX_STEPS = 200_000  # ... in each
 
 
 def time_grid(duration: float, rate: float = 1000.0, start: float = 0.0) -> Array:
@@ -91,9 +93,17 @@ class Path:
     end: EndReason
     end_time: Any
     end_state: NDArray[Any]
+    slip_steps: int = 0  # of the integrator in slip, which is stiff where it creeps
 
 
-def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_switches: int = MAX_SWITCHES) -> Path:
+def follow(
+    assembly: Assembly,
+    y: NDArray[Any],
+    grid: Array,
+    rtol: float,
+    max_switches: int = MAX_SWITCHES,
+    max_slip_steps: int = MAX_SLIP_STEPS,
+) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
     t: Any = grid[0] * y.dtype.type(1.0)
@@ -101,11 +111,17 @@ def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_sw
     pieces: list[MotionSamples] = []
     switches: list[Switch] = []
     end: EndReason | None = None
-    i = 0
+    i, slip_steps = 0, 0
     while end is None:
         event = _event_at_start(assembly, regime, t, y)
         if event is None:
-            stretch = integrate.integrate(assembly.system(regime), t, y, grid[i:], rtol, ATOL[: len(y)])
+            system, atol = assembly.system(regime), ATOL[: len(y)]
+            if regime == SLIPPING:
+                left = min(max(max_slip_steps - slip_steps, 0), MAX_STEPS)
+                stretch = integrate.integrate(system, t, y, grid[i:], rtol, atol, left)
+                slip_steps += stretch.n_steps
+            else:
+                stretch = integrate.integrate(system, t, y, grid[i:], rtol, atol)
             pieces.append(_sample(assembly, regime, grid[i : i + stretch.n_filled], stretch.y[: stretch.n_filled]))
             i += stretch.n_filled
             t, y = stretch.t_last, stretch.y_last
@@ -126,7 +142,7 @@ def follow(assembly: Assembly, y: NDArray[Any], grid: Array, rtol: float, max_sw
                     end = EndReason.CHATTER
     if not pieces:  # over at its start
         pieces.append(_sample(assembly, regime, grid[:1], y[None]))
-    return Path(_join(pieces), switches, end, t, y)
+    return Path(_join(pieces), switches, end, t, y, slip_steps)
 
 
 def _join(pieces: list[MotionSamples]) -> MotionSamples:

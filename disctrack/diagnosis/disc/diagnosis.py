@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from calibration.brief import Brief
 from disctrack.diagnosis.disc.errors import Errors
+from disctrack.diagnosis.disc.form_misfit import LawCourse
 from disctrack.diagnosis.disc.learned_law import LearnedLaw
 from disctrack.diagnosis.disc.plan import Plan, Separation
 from disctrack.diagnosis.disc.regimes import Regimes
@@ -25,6 +26,7 @@ class Learned:
     gain: float  # decrease of chi-square in units of the noise found
     held_out_gain: float
     power: float  # mean over the recording [W]; negative where it takes energy from the disc
+    course: LawCourse | None = None  # of the moment about the contact, with what the law's form may be off by
 
 
 @dataclass(frozen=True, repr=False)

@@ -114,6 +114,7 @@ def _places() -> Iterator[Family]:
     yield Family("a force of constant size towards the origin", (thread, *constant), kind="place")
     yield Family("a drag that grows as the speed squared", ({c: f"-v_{c[-1]} * {_SPEED}" for c in ("X_n", "X_m")},))
     yield Family("a drag of constant size", ({c: f"-v_{c[-1]} / {_SPEED}" for c in ("X_n", "X_m")},), kind="drag")
+    yield Family("a drag that differs with the direction", (*_by_velocity(),), kind="drag")
     lateral = {"X_n": "-v_m * omega_z", "X_m": "v_n * omega_z"}
     yield Family("a force across the velocity, by omega_z", (lateral,), kind="drag")
     across = {"X_n": "-v_m", "X_m": "v_n"}
@@ -124,6 +125,15 @@ def _places() -> Iterator[Family]:
     body = ("cos(psi + phi)", "sin(psi + phi)")
     turning = tuple(f(g) for f in (along_x, along_y) for g in body)
     yield Family("a force that turns with the face", turning, kind="force")
+
+
+def _by_velocity() -> Iterator[Parts]:
+    """Forces by a symmetric matrix times the velocity, in axes of the world."""
+    v_x, v_y = "(v_n * cos(psi) - v_m * sin(psi))", "(v_n * sin(psi) + v_m * cos(psi))"
+    yield along_x(f"-{v_x}")
+    yield along_y(f"-{v_y}")
+    across = along_x(f"-{v_y}"), along_y(f"-{v_x}")
+    yield {c: f"{across[0][c]} + {across[1][c]}" for c in ("X_n", "X_m")}
 
 
 def _drifts(time: Array) -> Iterator[Family]:

@@ -43,6 +43,7 @@ MAX_ITERATIONS = 15  # of a law that describes the data; others wander
 WIDTHS = ("width", "softness")  # shapes of a law that go with its amount
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the residual is large
+UNLIKELY = 1e-3  # odds below which a law does not count
 ALIKE = 10.0  # chi-square with its price, by which two laws differ that both describe the residual
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
@@ -70,6 +71,7 @@ class LearnedLaw:
     values: Values = field(default_factory=dict)  # of everything, where its fit ended
     share: tuple[float, ...] = ()  # of the resamples in which each family gains more than its price
     alike: tuple[str, ...] = ()  # other laws that describe the data as well
+    rivals: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their likelihood
 
     @property
     def formulas(self) -> dict[str, str]:
@@ -291,6 +293,7 @@ def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None)
     rate = float(1.0 / np.median(np.diff(system.time)))
     law: LearnedLaw | None = None
     current, length, alike = base, base.cost / noise, tuple[str, ...]()
+    rivals = tuple[tuple[LearnedLaw, float], ...]()
     at_noise = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
     most_terms = MAX_TERMS if rival is None else 1
     while law is None or (len(law.families) < most_terms and current.reduced_chi_square > at_noise):
@@ -312,10 +315,15 @@ def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None)
         best = int(np.argmin(lengths))
         near = [one.title for (one, _), other in zip(trials, lengths, strict=True) if other - lengths[best] < ALIKE]
         alike = tuple(title for title in dict.fromkeys(near) if title != trials[best][0].title)
+        # how short a law is decides which is named; what the recording determines is what all that fit it agree in
+        least = trials[best][1].cost
+        odds = [float(np.exp(-0.5 * max(t.cost - least, 0.0) / noise)) if t.converged else 0.0 for _, t in trials]
+        others = [i for i in range(len(trials)) if i != best and odds[i] > UNLIKELY]
+        rivals = tuple((trials[i][0], odds[i]) for i in others)
         (law, current), length = trials[best], lengths[best]
     if law is None:
         return None
-    law = replace(law, alike=alike, share=_stability(system, law, current, noise))
+    law = replace(law, alike=alike, rivals=rivals, share=_stability(system, law, current, noise))
     return without_idle_terms(law, current)
 
 
@@ -488,7 +496,7 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     if not kept or len(values) == len(law.candidate.quantities):
         return law
     shorter = _law(kept, np.array(values), law.candidate.name)
-    return replace(shorter, values=fitted.values, share=tuple(share), alike=law.alike)
+    return replace(shorter, values=fitted.values, share=tuple(share), alike=law.alike, rivals=law.rivals)
 
 
 def _acts(fitted: Fit, names: Sequence[str]) -> bool:

@@ -18,18 +18,22 @@ from disctrack.diagnosis.disc.large_faults import Assumed, find_clock, find_larg
 from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, slip_candidate
 from disctrack.diagnosis.disc.start import first_slip
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc.system import MOST_SLIP_STEPS, DiscSystem, Patience
 from disctrack.diagnosis.disc.systematic import find_systematic, with_noise_of_frames
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
-from disctrack.diagnosis.engine.system import Candidate
+from disctrack.diagnosis.engine.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
 from disctrack.rolling import CATALOGUE, Model
 from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
 MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
+CREEPS = (
+    "slip with Coulomb's friction was given up: with so little of it the disc creeps, for longer than can be followed; "
+    "it is taken to roll"
+)
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
@@ -74,16 +78,44 @@ def diagnose_motion(
         assumed = find_clock(rolling, faults)
         if assumed is not None:
             return _with_large(assumed, settings)
+    rolling.patience = Patience(MOST_SLIP_STEPS)
+    try:
+        answer = _rolling_or_slipping(trajectory, model, faults, settings, rolling, base)
+        answer.system.patience.without_end()
+        return answer
+    except GivenUp:
+        # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
+        others = _without_slip(rolling)
+        rolling = DiscSystem(trajectory, model, others, stretch=stretch, systematic=rolling.systematic)
+        notes = (*stretch.notes, CREEPS)
+        return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=notes)
+
+
+def _rolling_or_slipping(
+    trajectory: Trajectory,
+    model: Model,
+    faults: Mapping[str, float],
+    settings: Settings,
+    rolling: DiscSystem,
+    base: Fit,
+) -> SlipDiagnosis:
+    """The diagnosis of a motion without large faults. Raises GivenUp where slip would take too long to follow."""
+    stretch, systematic = rolling.stretch, rolling.systematic
     may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
         return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
         slipping = DiscSystem(trajectory, model, stretch=stretch, starts_in_slip=True, systematic=systematic)
+        slipping.patience = rolling.patience
         alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
             return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
+
+
+def _without_slip(system: DiscSystem) -> tuple[Candidate, ...]:
+    return tuple(c for c in system.candidates if c.effect != "slip")
 
 
 def _with_large(assumed: Assumed, settings: Settings) -> SlipDiagnosis:
@@ -115,6 +147,7 @@ def _slipping(
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     systematic = rolling.systematic
     system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
+    system.patience = rolling.patience
     diagnosis = diagnose(system, system.start(faults), settings)
     if diagnosis.verdict == "unexplained" and np.isfinite(onset.high):
         later = _after_slip(rolling, faults, settings, onset, diagnosis)
@@ -143,9 +176,16 @@ def _after_slip(
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
         stretch = free_stretch(rolling.trajectory, onset.high)
-        system = DiscSystem(rolling.trajectory, rolling.model, stretch=stretch, systematic=rolling.systematic)
+        system = DiscSystem(
+            rolling.trajectory,
+            rolling.model,
+            _without_slip(rolling),  # the beginning has shown that its law is not Coulomb's
+            stretch=stretch,
+            systematic=rolling.systematic,
+        )
     except AnalysisError:
         return None
+    system.patience = rolling.patience
     diagnosis = diagnose(system, system.start(faults), settings)
     if diagnosis.verdict == "unexplained":
         return None

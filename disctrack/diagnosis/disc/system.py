@@ -25,10 +25,11 @@ from disctrack.diagnosis.disc.sought import sought
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.diagnosis.engine.fit import triangle
-from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.diagnosis.engine.system import Candidate, GivenUp, Quantity, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
+from disctrack.rolling.simulate import MAX_SLIP_STEPS
 from disctrack.track.pose import whitening
 from disctrack.track.table_contact import ASSUMED_THICKNESS as MICROMETER
 from disctrack.track.table_contact import thickness_tolerance
@@ -38,6 +39,7 @@ RTOL = 1e-10  # of the integration: a millionth of the noise
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
+MOST_SLIP_STEPS = 5_000_000  # of the integrator, about 40 s; 300 pairs with slip at every extremum are answered in 4e6
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 
@@ -50,6 +52,27 @@ class _Path:
     qdot: Array  # (2, n, 6)
     names: tuple[str, ...]
     by_motion: Array  # (n, 6, k) pose components (rotation vector) by `names`
+
+
+class Patience:
+    """Steps of the integrator that slip may still take while an answer is sought; shared by all parts of a system.
+
+    Slip that hardly exceeds friction creeps: its direction follows within v / (3 mu g), and an explicit method has to
+    take as short a step. A count of steps, and not of seconds, so that an answer does not depend on the machine.
+    """
+
+    def __init__(self, steps: int = MAX_SLIP_STEPS) -> None:
+        self.left = steps
+
+    def take(self, steps: int) -> None:
+        """Count. Raises GivenUp when the last is taken."""
+        self.left = max(self.left - steps, 0)
+        if self.left == 0:
+            raise GivenUp
+
+    def without_end(self) -> None:
+        """An answer has been found: what is still asked of it is asked to the end."""
+        self.left = MAX_SLIP_STEPS
 
 
 @dataclass(frozen=True)
@@ -91,6 +114,7 @@ class DiscSystem:
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
+        self.patience = Patience()
         self.stretch = stretch or free_stretch(trajectory)
         self.starts_in_slip = starts_in_slip
         rows = self.stretch.rows
@@ -370,7 +394,9 @@ class DiscSystem:
         if not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest:
             return _nowhere(len(times))
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
-        found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit)
+        left = self.patience.left
+        found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit, left)
+        self.patience.take(found.slip_steps)
         axes = euler_rate_axes_world(found.q[:, 3], found.q[:, 4])
         by_motion = found.dq.copy()
         by_motion[:, 3:] = axes @ found.dq[:, 3:]

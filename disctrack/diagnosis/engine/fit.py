@@ -17,6 +17,7 @@ MAX_ITERATIONS = 40
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less
 NEAR = 1e-3  # sigmas from a bound, within which a quantity stands at it
 _HALVINGS = 8
+NO_DERIVATIVE = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -143,8 +144,10 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
         for halving in range(_HALVINGS):
             factor = 0.5**halving
             trial = values | dict(zip(names, np.clip(x + factor * step, lower, upper).tolist(), strict=True))
-            new_residual, new_derivative = system.linearise(trial, names)
             new_prior, _ = prior_rows(moved, trial)
+            if halving and not _cost(system.linearise(trial, ())[0], new_prior, NO_DERIVATIVE, common) < cost:
+                continue  # derivatives cost many times more, and a step that failed once may well fail again
+            new_residual, new_derivative = system.linearise(trial, names)
             new_cost = _cost(new_residual, new_prior, new_derivative, common)
             if np.isfinite(new_cost) and new_cost < cost:
                 break

@@ -24,6 +24,8 @@ MAX_TRIALS = 24  # values of a shape at which the rest is refitted
 ENOUGH = 0.01  # of chi-square: a tenth of a sigma, beyond which a shape is not pursued
 STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour says nothing of the valley's floor
 NARROW = 1e-6  # of a shape's size: as close as two values need to be
+MAX_STARTED = 12  # iterations at each shape of the grid, and ...
+WORTH_A_SHAPE = 0.5  # ... share of what exceeds the noise that the best of them may leave, for its shape to be sought
 DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
 
 
@@ -174,7 +176,7 @@ def _grid(candidate: Candidate) -> list[dict[str, float]]:
 
 
 def _started(system: System, base: Fit, candidate: Candidate, shape: dict[str, float]) -> Fit:
-    return fit(system, (*base.quantities, *candidate.quantities), base.values | shape)
+    return fit(system, (*base.quantities, *candidate.quantities), base.values | shape, MAX_STARTED)
 
 
 def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate) -> Diagnosis | None:
@@ -182,6 +184,9 @@ def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate)
     starts = [dict(zip(_names(candidate.shape), s, strict=True)) for s in system.starts(candidate, base.values)]
     fits = [_started(system, base, candidate, shape) for shape in starts or _grid(candidate)]
     first = min(fits, key=lambda f: f.cost)
+    excess = [f.chi_square / diagnosis.noise - f.degrees_of_freedom for f in (base, first)]
+    if not excess[1] < WORTH_A_SHAPE * excess[0]:
+        return None
     expected = {q.name: _first_order(system, first, q) for q in candidate.shape}
     free = tuple(q for q in candidate.shape if np.isfinite(expected[q.name]))
     fitted = first

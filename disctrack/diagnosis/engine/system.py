@@ -89,6 +89,10 @@ class System(Protocol):
         """
 
 
+class GivenUp(Exception):
+    """A hypothesis would take too long to follow: the one who put it forward goes on without it."""
+
+
 class Wrapped:
     """A system as another sees it: all as it is, but for what a subclass changes."""
 

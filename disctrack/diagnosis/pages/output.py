@@ -22,6 +22,7 @@ from disctrack.frames import COORDINATES, POSE_COMPONENTS
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
+    from disctrack.diagnosis.disc.form_misfit import LawCourse
     from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
 
 GROUP = "diagnosis"
@@ -148,10 +149,23 @@ def _learned(learned: Learned) -> dict[str, Any]:
         "share_of_resamples": list(law.share),
         "phase_locked": law.locked,
         "mean_power_W": learned.power,
+        "moment_about_contact": _course(learned.course),
         "parameters": _parameters(law.candidate.quantities, learned.fit),
         "class": [],
         "score": learned.gain,
         "held_out_gain": learned.held_out_gain,
+    }
+
+
+def _course(course: LawCourse | None) -> dict[str, Any]:
+    """The moment of all laws about the contact, with what the learned law's form may be off by."""
+    if course is None:
+        return {}
+    return {
+        "time_s": course.time.tolist(),
+        "N_m": course.moment.tolist(),
+        "sigma_N_m": course.sigma.tolist(),
+        "misfit_of_form": course.misfit,
     }
 
 

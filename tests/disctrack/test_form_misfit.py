@@ -1,0 +1,55 @@
+"""Sigmas that know of a law's form being another than the truth's, and slip that is not followed for ever."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis.disc import form_misfit
+from disctrack.diagnosis.disc.system import Patience
+from disctrack.diagnosis.engine.system import GivenUp
+from disctrack.rolling import Model, sensitivities, steady_precession
+from disctrack.scene.description import Scene
+
+
+def test_numbers_beside_a_misfit_scatter_as_generalised_least_squares_has_it(rng, monkeypatch):
+    """Right = A p + f B u + noise: about the plain estimate, GLS' covariance and the square of what it moves by."""
+    A, B, right = rng.standard_normal((40, 3)), rng.standard_normal((40, 6)), rng.standard_normal(40)
+    monkeypatch.setattr(form_misfit, "SIZES", np.array([0.7]))
+    U, inverse = form_misfit._solver(A)
+    taken = inverse @ (U.T @ B)
+    second, misfit = form_misfit._second_moment(B - U @ (U.T @ B), right - U @ (U.T @ right))
+    found = np.linalg.inv(A.T @ A) + taken @ second @ taken.T
+    weight = np.linalg.inv(np.eye(40) + 0.49 * B @ B.T)
+    covariance = np.linalg.inv(A.T @ weight @ A)
+    moved = covariance @ A.T @ weight @ right - np.linalg.lstsq(A, right, rcond=None)[0]
+    assert_allclose(found, covariance + np.outer(moved, moved), rtol=1e-9)
+    assert misfit == pytest.approx(0.7)
+
+
+def test_the_size_of_a_misfit_is_read_from_the_residual(rng):
+    """Where the residual holds none, next to nothing is allowed for; where it holds one, its size."""
+    B = 1e3 * rng.standard_normal((400, 60))
+    noise = rng.standard_normal(400)
+    none = form_misfit._second_moment(B, noise)[1]
+    some = form_misfit._second_moment(B, noise + 0.1 * B @ rng.standard_normal(60))[1]
+    assert none < 0.003
+    assert some == pytest.approx(0.1, rel=0.3)
+
+
+def test_slip_that_takes_too_long_is_not_followed():
+    """A friction just below what rolling needs: thousands of steps for a tenth of a second, and no derivative."""
+    disc = Scene().declared_disc
+    start = steady_precession(np.radians(14.0), disc, omega3=1.0, nutation_amplitude=np.radians(0.5))
+    model, times = Model(disc).with_values({"slip.mu": 0.06}), np.linspace(0.0, 0.3, 30)
+    whole = sensitivities(model, start, times, components=["theta"])
+    assert np.isfinite(whole.dq).all()
+    assert whole.slip_steps > 1000
+    cut = sensitivities(model, start, times, components=["theta"], max_slip_steps=whole.slip_steps // 4)
+    assert not np.isfinite(cut.dq).all()
+    assert cut.slip_steps <= whole.slip_steps // 4
+    patience = Patience(100)
+    patience.take(99)
+    with pytest.raises(GivenUp):
+        patience.take(1)
+    patience.without_end()
+    patience.take(100)
