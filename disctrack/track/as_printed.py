@@ -36,6 +36,8 @@ SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
 ITERATIONS = 4
 MIN_FRAMES = 10
+MANY_DOTS = 5  # from which one may be left out
+SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,37 @@ def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
     motions = _pattern_motions(disc).reshape(-1, 3)
     own = shift.reshape(-1) - motions @ (np.linalg.pinv(motions) @ shift.reshape(-1))
     return float(max(0.0, 1.0 - np.sum(sigma**2) / max(float(own @ own), 1e-30)))
+
+
+def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]:
+    """Variances of the pattern's displacement, per axis [m^2], and of its turn [rad^2]: what the gauge leaves open.
+
+    shift : (m, 3) [m] of the dots from their declared places as `declared_places_kept` has them; sigma (m, 2) [m]
+
+    Dots that lie off their places against each other by s, rms per axis, lie off them as a whole by s / sqrt(m). The
+    dot that is off most is left out of s: one that was declared wrongly says nothing of the others. A sum of lengths is
+    less efficient than one of squares, and s has few degrees of freedom (both by simulation, test_shared_faults.py).
+    """
+    m = disc.n_markers
+    squares = np.sort(np.sum(shift[:, :2] ** 2, axis=1))
+    freedom = 2 * m - 3
+    if m >= MANY_DOTS:
+        # of the sum of m exponentially distributed squares, the largest is this share
+        squares = squares[:-1] / (1.0 - np.sum(1.0 / np.arange(1, m + 1)) / m)
+        freedom -= 2
+    found = float(squares.sum()) / (2 * m - 3)
+    variance = max(0.0, found - float(np.mean(sigma**2))) * SUM_OF_LENGTHS * freedom / (freedom - 2)
+    return variance / m, variance / float(np.sum(_from_middle(disc) ** 2))
+
+
+def motions_of_pattern(R: Array, disc: Disc) -> Array:
+    """(n, 6, 3) how poses R (n, 3, 3) change when the pattern is displaced along e1, e2 and turned about its middle."""
+    x, y = disc.marker_centres_body[:, :2].mean(axis=0)
+    motions = np.zeros((len(R), 6, 3))
+    motions[:, :3, :2] = R[:, :, :2]
+    motions[:, :3, 2] = y * R[:, :, 0] - x * R[:, :, 1]
+    motions[:, 3:, 2] = R[:, :, 2]
+    return motions
 
 
 def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, float]:

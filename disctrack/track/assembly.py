@@ -13,7 +13,7 @@ from calibration.camera import StereoRig
 from calibration.causes import causes
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.track.as_printed import AsBuilt, refine_as_built, share_of_places
+from disctrack.track.as_printed import AsBuilt, motions_of_pattern, pattern_place, refine_as_built, share_of_places
 from disctrack.track.dots import NoiseModel, TemplateLimits
 from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
 from disctrack.track.exposure import shift_by_exposure
@@ -121,8 +121,10 @@ def assemble(
     )
     fits.covariance[...] *= verdicts.factor[:, None, None]
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
+    placed = _by_pattern(as_built, fits.R_world_body)
+    systematic += placed
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
-    shared = _shared_sigma(fits, systematic, rig)
+    shared = _shared_sigma(fits, systematic, placed, rig)
     as_built = replace(as_built, rig=rig)
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     warnings = warnings_of(first, factor, faults, scatter, table, trajectory)
@@ -207,14 +209,22 @@ def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFi
     return PoseFits(**whole)
 
 
-def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig) -> tuple[tuple[float, str], ...]:
+def _by_pattern(as_built: AsBuilt, R: Array) -> Array:
+    """(n, 6, 6) covariance of poses whose dots are misplaced, as far as seen, as a whole, too."""
+    place, turn = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)
+    J = motions_of_pattern(R, as_built.disc)
+    return np.asarray(J * [place, place, turn] @ J.swapaxes(1, 2))
+
+
+def _shared_sigma(fits: PoseFits, systematic: Array, placed: Array, rig: StereoRig) -> tuple[tuple[float, str], ...]:
     """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what."""
     rows = np.flatnonzero(fits.converged & np.isfinite(systematic).all(axis=(1, 2)))
     if not rows.size:
         return ()
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(SHARED_FRAMES, len(rows))).astype(int))]
-    repeats = np.mean(np.diagonal(systematic[rows], axis1=1, axis2=2), axis=0)
-    sigma, most = causes(rig, fits.sensitivity[rows], {"what repeats in the dots": repeats})
+    whole, by_pattern = (np.mean(np.diagonal(part[rows], axis1=1, axis2=2), axis=0) for part in (systematic, placed))
+    further = {"what repeats in the dots": whole - by_pattern, "where the dots are on the disc": by_pattern}
+    sigma, most = causes(rig, fits.sensitivity[rows], further)
     return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
 
 

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
 from disctrack.disc import MA_2014
-from disctrack.frames import rotation_from_quaternion
+from disctrack.frames import rotation_from_euler, rotation_from_quaternion, rotation_from_vector, vector_from_rotation
 from disctrack.scene.description import CameraFault, Faults
-from disctrack.track.as_printed import declared_places_kept
+from disctrack.track.as_printed import declared_places_kept, motions_of_pattern, pattern_place
 from disctrack.track.own_scatter import split_scatter, without_shared_faults
 from disctrack.track.pose import fit_poses
 from tests.oracles.measured_disc import SIGMA_PX, measured
@@ -112,3 +112,51 @@ def test_pattern_is_left_where_most_dots_say(rng):
     assert_allclose(kept[:, :2], moved(best.x), atol=2e-9)  # the sum of lengths is flat to 1e-10 there
     turned = 1e-4 * np.column_stack([-places[:, 1], places[:, 0]]) + [3e-5, -1e-5]
     assert_allclose(declared_places_kept(MA_2014, turned), 0.0, atol=2e-9)
+
+
+@pytest.mark.parametrize("m", [4, 6, 12])
+def test_the_place_of_a_pattern_is_as_uncertain_as_its_dots_are_misplaced(m, rng):
+    """Dots off at random: by how much the gauge then misses the pattern's place, over the variance stated for it."""
+    angle = 2 * np.pi * np.arange(m) / m
+    radius = 0.02 + 0.006 * (np.arange(m) % 3)
+    centres = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle])
+    disc = replace(MA_2014, marker_centres_body=centres)
+    off = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
+    ratios = []
+    for _ in range(400):
+        shift = 3e-5 * rng.normal(size=(m, 2))
+        kept = declared_places_kept(disc, shift)
+        moved = shift - kept[:, :2]
+        turn = float(np.sum(off[:, 0] * moved[:, 1] - off[:, 1] * moved[:, 0]) / np.sum(off**2))
+        place_variance, turn_variance = pattern_place(disc, kept, np.full((m, 2), 6e-7))
+        ratios.append([*(moved.mean(axis=0) ** 2 / place_variance), turn**2 / turn_variance])
+    trimmed = np.sort(ratios, axis=0)[:-4]  # few dots may agree by chance: of 400 the four worst
+    assert np.all((trimmed.mean(axis=0) > 0.5) & (trimmed.mean(axis=0) < 1.5)), trimmed.mean(axis=0)
+
+
+def test_dots_as_declared_and_one_that_is_not_leave_the_pattern_where_it_is(rng):
+    sigma = np.full((6, 2), 6e-7)
+    assert pattern_place(MA_2014, np.column_stack([0.5 * sigma * rng.normal(size=(6, 2)), np.zeros(6)]), sigma) == (
+        0,
+        0,
+    )
+    one = np.zeros((6, 3))
+    one[2, 0] = 1e-3
+    assert pattern_place(MA_2014, one, sigma) == (0, 0)
+
+
+def test_poses_move_with_the_pattern(rng):
+    """Against poses fitted to dots that were displaced and turned together."""
+    disc, R = MA_2014, rotation_from_euler(0.3, 0.4, 1.1)
+    displaced, turn = np.array([2e-5, -1e-5]), 3e-4
+    c = disc.marker_centres_body
+    middle = c.mean(axis=0)
+    true = middle + (c - middle) @ rotation_from_vector(np.array([0, 0, turn])).T + [*displaced, 0]
+    seen = true @ R.T
+    a, b = c - middle, seen - seen.mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R_found = (U @ Vt).T
+    t_found = seen.mean(axis=0) - R_found @ middle
+    expected = motions_of_pattern(R[None], disc)[0] @ [*displaced, turn]
+    np.testing.assert_allclose(t_found, expected[:3], atol=1e-8)
+    np.testing.assert_allclose(vector_from_rotation(R_found @ R.T), expected[3:], atol=1e-7)

@@ -46,3 +46,13 @@ def test_errors_in_an_ideal_laboratory_are_as_large_as_stated():
     assert np.all((ratio > 0.3) & (ratio < 2.0)), ratio
     assert 0.5 < ratio.mean() < 1.5, ratio
     assert np.all(rms < 0.8), rms
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("misprint", [3e-5, 1e-4])
+def test_errors_with_dots_off_their_places_are_as_large_as_stated(misprint):
+    """Office printers and rulers: the pattern as a whole is off as well, by what only the dots' scatter tells."""
+    ratio, _ = errors_of_many(laboratory.Imperfections(misprint=misprint), Geometry())
+    # nine degrees of freedom tell the scatter in each of ten laboratories
+    assert np.all((ratio > 0.15) & (ratio < 2.5)), ratio
+    assert 0.4 < ratio.mean() < 1.7, ratio
