@@ -24,14 +24,20 @@ def run(arguments: argparse.Namespace) -> int:
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
     origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))
-    told = None if arguments.overwrite else reusable(folder, origin)
-    if told is not None:
+    told = reusable(folder, origin)
+    more = arguments.figures and not (folder / "figures").is_dir()
+    if told is not None and not (arguments.overwrite or more):
         reused = f"{'reused':<13} {folder}: complete result of the same trajectory, model and version"
         print("\n".join([reused, *told]))
         return DONE
     with stage("diagnose"):
         outcome = run_diagnose(
-            path, folder, model=arguments.model, overwrite=arguments.overwrite, settle=arguments.plan
+            path,
+            folder,
+            model=arguments.model,
+            overwrite=arguments.overwrite or told is not None,
+            settle=arguments.plan,
+            figures=arguments.figures,
         )
     files = [outputs.relative(file) for file in (path, *outcome.files, *outputs.write_times(folder, "diagnose"))]
     lines = [*outcome.summary, *summary.file_lines(files)]

@@ -133,6 +133,9 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("trajectory", type=_trajectory, nargs="+", help=files)
     models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
     parser.add_argument("--model", default="paper", help=models)
+    parser.add_argument(
+        "--figures", action="store_true", help="also write every figure of the report as PNG and PDF, into figures/"
+    )
     where = "folder for the results (default: NAME_diagnosis beside it; of several: together_diagnosis)"
     parser.add_argument("-o", "--output", type=Path, help=where)
     plan = "also compute which further recordings would settle what is left open"

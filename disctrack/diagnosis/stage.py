@@ -187,12 +187,19 @@ def _also(diagnosis: Diagnosis, law: LearnedLaw, fitted: Fit) -> tuple[str, ...]
 
 
 def run_diagnose(
-    path: Path, output: Path | None = None, *, model: str = PAPER, overwrite: bool = False, settle: bool = False
+    path: Path,
+    output: Path | None = None,
+    *,
+    model: str = PAPER,
+    overwrite: bool = False,
+    settle: bool = False,
+    figures: bool = False,
 ) -> DiagnoseOutcome:
     """Diagnose a trajectory file; write diagnosis.json, diagnosis.html with figures, model.toml, and the file's group.
 
     output : folder; without it `<name>_diagnosis` beside the file
     settle : also compute which further recordings would settle what is left open
+    figures : also write every figure of the page as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
     from disctrack.diagnosis.disc.free_runs import evidence
@@ -220,6 +227,6 @@ def run_diagnose(
     toml = folder / "model.toml"
     text = model_toml(result.system, result.after_fit.values, provenance.recording)
     write_whole(toml, text.encode())
-    pages = write_report(folder, result, beside, provenance.recording)
+    pages = write_report(folder, result, beside, provenance.recording, figures)
     said = lines(result, beside)
     return DiagnoseOutcome(result, (report, toml, *pages), tuple(said))

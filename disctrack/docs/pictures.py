@@ -2,8 +2,8 @@
 
 python disctrack/docs/pictures.py CLIP SECRET [FOLDER]
 
-CLIP : results of `disctrack run sample_data/clip`; SECRET : results of the tour's recording, diagnosed; FOLDER : where
-the pictures go (default: beside this file, in `pictures`)
+CLIP : results of `disctrack run sample_data/clip`; SECRET : results of the tour's recording, diagnosed with --figures;
+FOLDER : where the pictures go (default: beside this file, in `pictures`)
 """
 
 from __future__ import annotations

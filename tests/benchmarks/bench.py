@@ -3,10 +3,10 @@
     [--rig RIG] [--pairs 3000] [--repeats 3] [--grow 1 10 100 1000 10000 100000] [--no-starts]
 
 Takes a recording of image files, plays it forth and back until it has the pairs asked for, and measures it as the
-command line does (first look at the images, reading, tracking, poses), from its files and from frames in memory-mapped
-files, on one core and on two; beside it a copy of the frames' bytes, decoding alone, a plain OpenCV + SciPy script;
-what the machine could do at most (roofline); how time and memory grow with the number of pairs; and the command line
-from its first start, with nothing compiled, to a later one.
+command line does (first look at the images, reading, tracking, poses), from its files, from memory-mapped files and
+from one array in memory (`measure_pairs`), on one core and on two; beside it a copy of the frames' bytes, decoding
+alone, a plain OpenCV + SciPy script; what the machine could do at most (roofline); how time and memory grow with the
+number of pairs; and the command line from its first start, with nothing compiled, to a later one.
 
 Elapsed and processor time are the shortest of the repeats; on a busy machine trust ratios of the processor's time. With
 --json the figures are kept, and a file that is there is compared with first. Not a test: nothing fails here.
@@ -40,7 +40,8 @@ from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vec
 from disctrack.readers.file_numbers import NumberedFiles
 from disctrack.readers.images import ImageSequence
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.track.stage import ImagePairs, measure, open_pairs
+from disctrack.track.arrays import measure_pairs
+from disctrack.track.stage import ImagePairs, Measurement, measure, open_pairs
 from disctrack.trajectory import Trajectory
 
 # Counted in track/_kernels.py: +, -, *, / and roots for a pixel of a dot, each time its model and the normal equations
@@ -85,14 +86,20 @@ def rates(recording: Recording, rig: StereoRig, played: Played, n: int, repeats:
     k, (height, width) = len(images), images.shape[2:]
     target = images.copy()
     trajectory = measure(recording, rig, played.mapped(k), threads=1).trajectory  # compiles
+    memory = images[played.order(n)]  # each pair in a place of its own, as a camera would leave them
+
+    def in_memory(threads: int) -> Measurement:
+        return measure_pairs(memory, rig, recording.disc, recording.frame_rate, threads=threads)
+
     ways: dict[str, tuple[Callable[[], object], int]] = {
         "a copy of the frames' bytes in memory": (lambda: np.copyto(target, images), k),
         "decoding alone: cv2.imread, 1 core": (lambda: decode_alone(played.files(n), 1), n),
         "decoding alone: cv2.imread, 2 cores": (lambda: decode_alone(played.files(n), 2), n),
         "measured from files, 1 core": (lambda: measure(recording, rig, played.compressed(n), threads=1), n),
         "measured from files, 2 cores": (lambda: measure(recording, rig, played.compressed(n), threads=2), n),
-        "measured from memory, 1 core": (lambda: measure(recording, rig, played.mapped(n), threads=1), n),
-        "measured from memory, 2 cores": (lambda: measure(recording, rig, played.mapped(n), threads=2), n),
+        "measured from mapped files, 1 core": (lambda: measure(recording, rig, played.mapped(n), threads=1), n),
+        "measured from memory, 1 core": (lambda: in_memory(1), n),
+        "measured from memory, 2 cores": (lambda: in_memory(2), n),
         "plain OpenCV + SciPy, frames in memory": (lambda: plain_script(recording, rig, images, trajectory), k),
     }
     print(f"{recording.name}: {n} pairs of {width} x {height} px, of {k} different ones")
@@ -252,21 +259,22 @@ class Played:
         self.images = np.stack([[self.pairs.left.read(i), self.pairs.right.read(i)] for i in range(k)])
         self._folder = folder
 
-    def _order(self, n: int) -> np.ndarray:
+    def order(self, n: int) -> np.ndarray:
+        """Numbers of n pairs, forth and back."""
         k = len(self.images)
         return np.resize(np.r_[0:k, k - 2 : 0 : -1], n)
 
     def mapped(self, n: int) -> ImagePairs:
         """Frames in memory-mapped files."""
         left, right = (
-            MappedFrames(self._folder / name, self.images[:, camera], self._order(n))
+            MappedFrames(self._folder / name, self.images[:, camera], self.order(n))
             for camera, name in enumerate(("left", "right"))
         )
         return dataclasses.replace(self.pairs, left=left, right=right, start=0, stop=n)
 
     def files(self, n: int) -> list[list[str]]:
         """Of each camera."""
-        return [[str(reader.files[i]) for i in self._order(n)] for reader in (self.pairs.left, self.pairs.right)]
+        return [[str(reader.files[i]) for i in self.order(n)] for reader in (self.pairs.left, self.pairs.right)]
 
     def compressed(self, n: int) -> ImagePairs:
         """The files, opened anew, so that nothing is known of them yet."""

@@ -23,7 +23,7 @@ def diagnosed(tmp_path_factory):
     path = folder / "trajectory.h5"
     trajectory = measured({"centre_of_mass.c_1": 1e-4}, seed=31, n=300)
     write_trajectory(path, trajectory, Provenance("unbalanced", {}, {}))
-    assert main(["diagnose", str(path)]) == 0
+    assert main(["diagnose", str(path), "--figures"]) == 0
     return path, folder / "trajectory_diagnosis"
 
 
@@ -103,7 +103,7 @@ def test_table_holds_every_error_before_and_after(diagnosed):
 def test_page_shows_the_figures_and_says_the_sentence(diagnosed):
     page = (diagnosed[1] / "diagnosis.html").read_text()
     assert "Missing in the model" in page
-    assert page.count("<figure>") == len(list((diagnosed[1] / "figures").iterdir())) >= 7
+    assert page.count("<figure>") == len(list((diagnosed[1] / "figures").glob("*.png"))) >= 7
 
 
 def test_enlarged_model_simulates_the_measured_motion(diagnosed):
@@ -120,6 +120,7 @@ def test_enlarged_model_simulates_the_measured_motion(diagnosed):
 def test_against_the_enlarged_model_nothing_is_missing(diagnosed, tmp_path):
     model = str(diagnosed[1] / "model.toml")
     assert main(["diagnose", str(diagnosed[0]), "--model", model, "-o", str(tmp_path / "again")]) == 0
+    assert not (tmp_path / "again" / "figures").exists()  # on request only
     document = json.loads((tmp_path / "again" / "diagnosis.json").read_text())
     assert document["verdict"] == "nothing missing"
 

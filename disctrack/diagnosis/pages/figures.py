@@ -17,7 +17,7 @@ from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForce
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
-from disctrack.pages.figures import Drawn, dress, panels
+from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels
 from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -91,7 +91,7 @@ def _frame(axes: Axes, values: Array) -> None:
 def residuals(result: DiscDiagnosis) -> Drawn:
     """Measured minus fitted pose, before and after, with the band of the noise."""
     system, diagnosis = result.system, result.diagnosis
-    figure, grid = panels(9.5, 6.2, 4, 2, sharex=True)
+    figure, grid = panels(9.5, 6.2, 4, 2, (0.95, 0.15, 0.55, 0.3), sharex=True)
     rows = [("x", 1e6, "um"), ("y", 1e6, "um"), ("z", 1e6, "um"), ("theta", 1e3 * np.degrees(1), "mdeg")]
     for column, (fit, name, colour) in enumerate(
         ((diagnosis.before, "before", RED), (result.after_fit, "after", BLUE))
@@ -114,7 +114,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
 def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
     """Error of the free run over the part that the fit has not seen."""
     system = result.system
-    figure, (left, right) = panels(9.5, 3.4, 1, 2)
+    figure, (left, right) = panels(9.5, 3.4, 1, 2, NO_TITLE)
     last = system.time[~before.test_rows & (system.weights > 0)].max()
     for held, colour, name in ((before, RED, "before"), (after, BLUE, "after")):
         delta, sigma = system.pose_difference(held.train.values)
@@ -157,7 +157,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
 
 def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment | None) -> Drawn:
     """Moment that the model fails to supply, with its two-sigma band, and what the effects found add to it."""
-    figure, grid = panels(9.5, 5.4, 3, sharex=True)
+    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
     law = None if of_law is None else (of_law.time, of_law.moment)
     if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
         law = result.system.time, learned_moment(result.system, result.learned.fit, result.learned.law)
@@ -192,7 +192,7 @@ def force(result: DiscDiagnosis, measured: ModelFreeForces) -> Drawn:
     """Force on the disc that the model fails to supply, from the accelerations alone, and what was found adds to it."""
     system = result.system
     before, after = force_of(system, result.diagnosis.before), force_of(system, result.after_fit)
-    figure, grid = panels(9.5, 5.4, 3, sharex=True)
+    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
         value, sigma = 1e3 * (measured.force - before)[:, i], 1e3 * measured.force_sigma[:, i]
         axes.fill_between(system.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
@@ -217,7 +217,7 @@ def spectrum(result: DiscDiagnosis) -> Drawn:
     system = result.system
     present = system.weights >= 6
     rate = float(1.0 / np.median(np.diff(system.time)))
-    figure, (axes,) = panels(9.5, 3.2)
+    figure, (axes,) = panels(9.5, 3.2, margins=NO_TITLE)
     for fit, colour, name in ((result.diagnosis.before, RED, "before"), (result.after_fit, BLUE, "after")):
         residual = system.pose_residual(fit.values)[present]
         if np.isfinite(residual).all():

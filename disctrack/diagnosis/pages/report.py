@@ -20,11 +20,11 @@ from disctrack.pages.html import Markup, bullets, page, paragraph, section, tabl
 
 
 def write_report(
-    folder: Path, result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: str
+    folder: Path, result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: str, as_files: bool = False
 ) -> tuple[Path, ...]:
-    """Write diagnosis.html and figures/*.png; returns the files. Raises OutputError."""
+    """Write diagnosis.html, and on request figures/*.png, *.pdf; returns the files. Raises OutputError."""
     figures = all_figures(result, beside)
-    files, pictures = draw(folder, figures, ["png"])
+    files, pictures = draw(folder, figures, ("png", "pdf") if as_files else ())
     written = folder / "diagnosis.html"
     write_whole(written, _page(result, beside, recording, gallery(figures, pictures)).encode())
     return (written, *files)
