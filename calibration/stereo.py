@@ -18,7 +18,7 @@ from calibration.assessment import (
     stereo_covariance,
 )
 from calibration.board import Board, Target
-from calibration.brief import Brief, ranges
+from calibration.brief import Brief
 from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
@@ -275,8 +275,9 @@ def calibrate_from_corners(
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
         also = f"{'; '.join(wide)}. " if wide else ""
+        reasons = {where: why for where, _, why in (text.partition(": ") for text in rejected.values())}
         raise CalibrationError(
-            f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(rejected)}"
+            f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
         )
     report("trying a field of the lenses")
     lens = fit_lens_field(refinement, board.points)
@@ -326,13 +327,17 @@ def _views_not_found(
     alone: dict[str, list[str]] = {}
     for v, pair in enumerate(zip(*views, strict=True)):
         missing = [(c, view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
-        text = "; ".join(f"{names[v][c]}: {reason}" for c, reason in missing)
         if len(missing) == 2:
-            rejected[v] = text
+            (_, left), (_, right) = missing
+            one, other = names[v]
+            rejected[v] = f"{one} and {other}: {left}" if left == right else f"{one}: {left}; {other}: {right}"
         elif missing:
             camera, reason = missing[0]
-            alone.setdefault(reason, []).append(f"view {v} is used in one camera only: {names[v][camera]}")
-    warnings = [f"{'; '.join(which)}: {reason}" for reason, which in alone.items()]
+            alone.setdefault(reason, []).append(names[v][camera])
+    warnings = [
+        f"{', '.join(which)}: left out, the other image of the pair is used for its own camera: {reason}"
+        for reason, which in alone.items()
+    ]
     notes = sorted({note for side in views for view in side if isinstance(view, CornerView) for note in view.notes})
     return rejected, warnings + notes
 
@@ -348,7 +353,8 @@ def _require_views(
     for camera, side in enumerate(views):
         found = sum(isinstance(view, CornerView) for view in side)
         if found < MIN_VIEWS:
-            reasons = {v: view.reason for v, view in enumerate(side) if isinstance(view, BoardNotFound)}
+            missing = ((name[camera], view) for name, view in zip(names, side, strict=True))
+            reasons = {name: view.reason for name, view in missing if isinstance(view, BoardNotFound)}
             raise CalibrationError(
                 f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
                 f"are needed (10 to 20 are good). {_listed(reasons)}"
@@ -360,12 +366,15 @@ def _require_views(
         )
 
 
-def _listed(reasons: dict[int, str]) -> str:
-    """Each reason once with its views; three reasons at most."""
-    views: dict[str, list[int]] = {}
-    for v, reason in reasons.items():
-        views.setdefault(reason, []).append(v)
-    shown = [f"view {ranges(which)}: {reason}" for reason, which in list(views.items())[:3]]
+def _listed(reasons: dict[str, str]) -> str:
+    """Each reason once, with the first of the views (by name) that it holds for; three reasons at most."""
+    views: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        views.setdefault(reason, []).append(name)
+    shown = [
+        f"{which[0]}{f' and {len(which) - 1} more' if len(which) > 1 else ''}: {reason}"
+        for reason, which in list(views.items())[:3]
+    ]
     more = sum(len(which) for which in list(views.values())[3:])
     return "; ".join(shown) + (f"; and {more} more" if more else "")
 
@@ -426,7 +435,7 @@ def _without_images(
         if camera == 0 and view in pairs.right_poses:
             R[view], t[view] = pairs.right_poses[view]
         if np.any(observations.view == view):
-            warnings.append(f"view {view} is used in the {CAMERA_NAMES[1 - camera]} camera only: {text}")
+            warnings.append(f"{text}: left out, the other image of the pair is used for its own camera")
         else:
             rejected[view] = text
     pairs = replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart, bad_images={})
@@ -437,7 +446,7 @@ def _told_apart(apart: dict[int, str], names: Sequence[tuple[str, str]], wide: b
     """A warning about pairs whose images are used each for its own camera."""
     if not apart:
         return []
-    shown = [f"view {v} ({names[v][0]}, {names[v][1]}: {why})" for v, why in list(apart.items())[:3]]
+    shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]
     more = f" and {len(apart) - 3} more" if len(apart) > 3 else ""
     return [
         f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "

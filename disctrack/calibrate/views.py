@@ -162,14 +162,11 @@ def calibrate_views(
     used, problems = [], []
     for i, pair in enumerate(zip(views.left, views.right, strict=True)):
         try:
-            left, right = (
-                _pixels(view, f"{view} (calibration view {i})", flat)
-                for view, flat in zip(pair, views.fields, strict=True)
-            )
+            left, right = (_pixels(view, str(view), flat) for view, flat in zip(pair, views.fields, strict=True))
         except RecordingError as error:
             if i == table_view:
                 raise RecordingError(f"{error} It is the table view: without it there is no lab frame.") from error
-            problems.append(f"calibration view {i} is left out: {error}")
+            problems.append(f"left out: {error}")
             continue
         used.append(i)
         images[0].append(left)

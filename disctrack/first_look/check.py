@@ -6,6 +6,7 @@ Each step looks at one thing and adds remarks: `fix` would stop a run or spoil i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,14 +28,17 @@ from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.dots import locate_on_disc
+from disctrack.track.doubts import LOWEST_POINT, MISFIT
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
+from disctrack.track.summary import left_out
 from disctrack.track.tracking import BlockOfPairs, Tracking, TrackingSettings, track
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
 PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
 FRAMES_AT_EACH = 40  # twice what the free refinement of the clock needs
+OF_A_LAG = (MISFIT, LOWEST_POINT)  # what a check also sees of images paired wrongly
 SLIPS = (-3, -2, -1, 1, 2, 3)  # frames that one camera may be ahead of the other
 SLIP_FRAMES = 12
 CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
@@ -168,9 +172,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
     advice = "" if level == "fine" else "the whole board must be in view of both cameras, with a light rim round it"
     seen.say(level, "chessboard", f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all), "
              f"rms {found.rms_px:.3f} px, baseline {1e3 * found.rig.baseline:.1f} mm", advice)  # fmt: skip
-    for view, why in found.rejected_views.items():
-        seen.say("look", "chessboard", f"view {chosen[view]} is not used: {why}")
-    for text in (*problems, *found.warnings):
+    for text in (*left_out(found.rejected_views), *problems, *found.warnings):
         seen.say("look", "chessboard", text)
     return found.rig
 
@@ -229,14 +231,19 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         level = "fix" if finding.spoils or finding.check == "dot" else "look"
         seen.say(level, "declaration", finding.sentence)
     _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
-    _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
-    doubts = {text[:40]: text for _, tracking in done for text in tracking.doubts}  # numbers differ from place to place
-    for text in doubts.values():
-        seen.say("fix", "cameras", text)
-    told = {text[:40]: text for _, tracking in done for text in tracking.warnings}
-    for text in told.values():
-        if text[:40] not in doubts:
-            seen.say("look", "physics", text)
+    out_of_step = _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
+    doubts, told = (
+        {_without_numbers(text): text for _, tracking in done for text in texts(tracking)}
+        for texts in (lambda tracking: tracking.doubts, lambda tracking: tracking.warnings)
+    )
+    for kind, text in (told | doubts).items():
+        if not (out_of_step and text.startswith(OF_A_LAG)):
+            seen.say(*(("fix", "cameras") if kind in doubts else ("look", "physics")), text)
+
+
+def _without_numbers(text: str) -> str:
+    """What the text says, the same of every place looked at."""
+    return re.sub(r"[-+]?\d[\d.]*", "#", text)
 
 
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:
@@ -332,12 +339,12 @@ def _sharpness(
 
 def _synchronisation(
     seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, tracking: Tracking
-) -> None:
+) -> bool:
     trajectory = tracking.trajectory
     rms = float(np.sqrt(np.nanmean(trajectory.reprojection_rms_px**2)))
     motion = np.linalg.norm(np.diff(trajectory.markers_px, axis=0), axis=-1)
     if not np.isfinite(motion).any():
-        return
+        return False
     speed = float(np.nanmedian(motion))
     if tracking.variance_factor > 4.0:  # dots disagree with every pose by more than twice their noise
         better = _slip(recording, rig, pairs, frames, rms)
@@ -346,7 +353,7 @@ def _synchronisation(
             seen.say("fix", "clock", f"left frame i and right frame i{slip:+d} show the same instant: that leaves "
                      f"{its_rms:.3f} px, the declared pairing {rms:.3f} px",
                      "export the same instants of both cameras")  # fmt: skip
-            return
+            return True
     moving = trajectory.rig.world_is_table and speed > 0.2
     faults = None
     if moving:
@@ -355,7 +362,7 @@ def _synchronisation(
                                        R, trajectory.q[:, :3])  # fmt: skip
     if faults is None:
         seen.say("fine", "clock", f"dots move by {speed:.2f} px per frame here: too few or too slow to tell a delay")
-        return
+        return False
     offset = abs(faults.delay) * speed  # in pixels, against what the dots' noise leaves open
     noise = float(np.sqrt(np.nanmedian(np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1)) / 2))
     unsure = offset < 3 * max(noise, 0.02)  # 0.02 px: what a rig within its calibration leaves
@@ -364,6 +371,7 @@ def _synchronisation(
         seen.say("fine", "clock", f"no delay between the cameras shows ({text})")
     else:
         seen.say("look", "clock", text, "are both cameras triggered by one signal, with one exposure time?")
+    return False
 
 
 def _slip(

@@ -88,11 +88,17 @@ def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
 
 
 def _folders(folder: Path) -> Iterable[tuple[Path, list[str]]]:
-    for place, inside, names in os.walk(folder):
+    """Folders and their files, through links, too: views are often kept beside several recordings."""
+    seen: set[str] = set()
+    for place, inside, names in os.walk(folder, followlinks=True):
         depth = len(Path(place).relative_to(folder).parts)
         inside[:] = sorted(
             name for name in inside if depth < DEEPEST and not name.startswith(".") and not _OWN_FOLDERS.match(name)
         )
+        if (real := os.path.realpath(place)) in seen:  # a link to a folder that holds it
+            inside[:] = []
+            continue
+        seen.add(real)
         yield Path(place), sorted((name for name in names if not name.startswith(".")), key=natural_key)
 
 

@@ -21,6 +21,7 @@ HOPELESS = 25.0  # times the variance of the noise: no result of such dots is ri
 ONE_SIDED = "the dots of only one camera make sense"
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 MISFIT = "the dots miss their fitted places"
+LOWEST_POINT = "the disc's lowest point"
 
 
 def repeats_in_words(repeated: Mask, pairs: range) -> tuple[str, ...]:
@@ -87,8 +88,8 @@ def warnings_of(
     for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
         if saturation is not None:
             warnings.append(
-                f"{camera} camera: the light round the dots is clipped at grey value {saturation}, which hides part of "
-                "their edges and of the noise: positions may be off by a micrometre. Expose for a shorter time"
+                f"{camera} camera: the brighter side of the dots' edges is clipped at grey value {saturation}, which "
+                "hides part of them and of the noise: positions may be off by a micrometre. Expose for a shorter time"
             )
     if misplaced := misplaced_in_words(follower.setup.disc, trajectory.disc.marker_centres_body):
         warnings.append(f"{misplaced}. Poses rest on these; that their middle is the disc's is as declared")
@@ -105,14 +106,14 @@ def warnings_of(
         )
     if table is not None and table.probability < DISAGREE:
         warnings.append(
-            f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
+            f"{LOWEST_POINT} does not roll on the board's table: {table.sentence}. They differ by more than "
             "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
             "is, the cameras moved together since the table view, or a long exposure is not declared (exposure_us)"
         )
     gap = _table_gap(trajectory)
     if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:
         warnings.append(
-            f"the disc's lowest point lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
+            f"{LOWEST_POINT} lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
             f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
             "this recording, the cameras moved together, or the disc is in the air"
         )

@@ -180,7 +180,10 @@ class Follower:
     measured: bool = False  # blur and noise known
     acquisitions: int = 0
     first_reason: str = ""
-    saturated: tuple[int | None, int | None] = (None, None)  # grey value at which the dots' background is clipped
+    saturated: tuple[int | None, int | None] = (
+        None,
+        None,
+    )  # grey value at which the brighter side of the dots' edges is clipped
     given: Callable[[], Law | None] = lambda: None  # noise and blur that an earlier stretch has measured
     told: Future[Law | None] = field(default_factory=Future)  # what this stretch measured; None if it did not
     first_row: int | None = None  # of the tables
@@ -513,9 +516,9 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
 
 
 def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:
-    """Grey value at which the background of the dots (n, m, 12) is clipped; None where it is not."""
+    """Grey value at which the brighter side of the edges of dots (n, m, 12) is clipped; None where it is not."""
     saturation = saturation_level(images)
-    light = results[..., kernels.FIT_LEVEL]
+    light = results[..., kernels.FIT_LEVEL] * (1.0 - np.minimum(results[..., kernels.FIT_CONTRAST], 0.0))
     if saturation is None or not np.isfinite(light).any():
         return None
     level = float(np.nanmedian(light))

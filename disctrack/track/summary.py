@@ -40,7 +40,7 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
     corners = len(found.rejected_corners())
     if corners:
         lines.append(_line("", f"{corners} corners were found but not used"))
-    lines += [_line("", text) for text in _left_out(found.rejected_views)]
+    lines += [_line("", text) for text in left_out(found.rejected_views)]
     lines += [_line("warning", text) for text in (*problems, *found.warnings)]
     return lines
 
@@ -83,13 +83,13 @@ def _model_text(found: StereoCalibration) -> str:
     return f"{text}: views left out fit at {own:.4f} px ({listed}); the simplest that is not clearly worse is taken"
 
 
-def _left_out(rejected: Mapping[int, str]) -> list[str]:
+def left_out(rejected: Mapping[int, str]) -> list[str]:
     """One line for each reason, with the views that it holds for."""
     groups: dict[str, list[str]] = {}
     for view, why in rejected.items():
         where, _, reason = why.partition(": ")
-        groups.setdefault(reason or where, []).append(str(view))
-    return [f"view{'s' if len(views) > 1 else ''} {', '.join(views)} not used: {why}" for why, views in groups.items()]
+        groups.setdefault(reason or where, []).append(where if reason else f"view {view}")
+    return [f"not used: {', '.join(views)}: {why}" for why, views in groups.items()]
 
 
 def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> list[str]:

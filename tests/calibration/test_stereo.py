@@ -150,8 +150,11 @@ def test_views_without_a_board_are_left_out_with_the_reason(drawn):
     blank = np.full_like(left[0], 90)
     found = calibrate_stereo([*left[:6], blank, left[7]], [*right[:5], blank, blank, right[7]], BOARD, FLAT)
     assert list(found.rejected_views) == [6]
-    assert "left 6: no board of 7 x 4" in found.rejected_views[6]
-    assert any("view 5 is used in one camera only: right 5" in w for w in found.warnings)
+    assert "left 6 and right 6: no board of 7 x 4" in found.rejected_views[6]
+    assert any(
+        w.startswith("right 5: left out, the other image of the pair is used for its own camera: no board")
+        for w in found.warnings
+    )
     assert np.isnan(found.rms_per_view_px[5, 1])
     assert np.isfinite(found.rms_per_view_px[5, 0])
 
@@ -159,7 +162,7 @@ def test_views_without_a_board_are_left_out_with_the_reason(drawn):
 def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
     _, (left, right) = drawn
     blank = np.full_like(left[0], 90)
-    with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*view 0-7: no board"):
+    with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*left 0 and 7 more: no board"):
         calibrate_stereo([blank] * 8, right, BOARD)
     with pytest.raises(CalibrationError, match="not found in the table view 0"):
         calibrate_stereo([blank, *left[1:]], [blank, *right[1:]], BOARD, FLAT, table_view=0)
@@ -179,7 +182,7 @@ def test_exchanged_images_are_found_out(scene_maker, rng, tmp_path):
     right[2], right[7] = right[7], right[2]
     found = calibrate_from_corners(left, right, BOARD, FLAT)
     assert found.apart == (2, 7)
-    assert any("not a pair" in text and "view 2 " in text and "view 7 " in text for text in found.warnings)
+    assert any("not a pair" in text and "left 2 " in text and "left 7 " in text for text in found.warnings)
     assert not found.rejected_views  # each image still says all that it can of its own camera
     assert found.assessment.pairs == 8
     assert found.rms_px < 0.05
@@ -200,7 +203,7 @@ def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng)
     assert not found.rejected_views
     assert found.apart == (4,)
     assert found.assessment.pairs == 9
-    assert any(text.startswith("view 4 (left 4, right 4: ") and "moved" in text for text in found.warnings)
+    assert any(text.startswith("left 4 and right 4 (") and "moved" in text for text in found.warnings)
     assert found.rms_px < 0.05
     # as if the pair had been left out for how the cameras stand, and not for the cameras
     left[4] = right[4] = BoardNotFound("left out")

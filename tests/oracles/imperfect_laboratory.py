@@ -73,7 +73,7 @@ class Trouble:
     def before(self, camera, radiance, poses, dots, frame, frame_rate):
         """The scene's light as it reaches the sensor."""
         radiance = 110 + self.contrast * (radiance - 110)
-        R, t, _ = poses[1]
+        R, t, _ = poses[len(poses) // 2]
         y, x = np.mgrid[: camera.size, : camera.size]
         if frame in self.hand:
             centre = camera.project(t[None])[0]
@@ -113,6 +113,10 @@ class Plan:
     ink: float = 25.0
     blur: float = 0.62  # [px]
     trouble: Trouble = Trouble()
+    board_heights: tuple = (5e-3, 40e-3)  # [m] of the board's middle over the target
+    half_thickness: float = HALF_THICKNESS
+    lag: float = 0.0  # [s] by which the right camera is late
+    wrong_dot: float = 0.0  # [m] by which dot 1 is not where it is declared, along x
 
 
 class Camera:
@@ -154,12 +158,12 @@ class Camera:
     def rays(self):
         """(size SUB, size SUB, 2) of the sub-pixels: only images need them."""
         fine = (np.arange(self.size * SUB) + 0.5) / SUB - 0.5
-        return self._rays(np.stack(np.meshgrid(fine, fine), -1))
+        return self.slopes(np.stack(np.meshgrid(fine, fine), -1))
 
     @cached_property
     def coarse(self):
         """(size, size, 2) of the pixels."""
-        return self._rays(np.stack(np.meshgrid(np.arange(self.size), np.arange(self.size)), -1).astype(float))
+        return self.slopes(np.stack(np.meshgrid(np.arange(self.size), np.arange(self.size)), -1).astype(float))
 
     def _raw_field(self, pixels):
         turns = np.einsum("...j,kj->...k", pixels, self.waves)
@@ -169,7 +173,8 @@ class Camera:
         """Displacement [px] of an image point at these pixels (..., 2) from where the polynomial has it."""
         return (self._raw_field(pixels) - self.field_mean) * self.field_scale
 
-    def _rays(self, pixels):
+    def slopes(self, pixels):
+        """Directions (..., 2) of the rays of pixels (..., 2): x and y where z is 1."""
         smooth = pixels - self.field(pixels)
         distorted = (smooth - self.middle) / self.focal
         ray = distorted.copy()
@@ -256,9 +261,9 @@ def _deeper(camera, R, t, height):
 
 
 def disc_image(camera, plan, poses, dots, rng, frame=0):
-    """One image; poses: (R, t, weight) over the exposure, the middle one second."""
+    """One image; poses: (R, t, weight) over the exposure, in the order of time."""
     size, soft = plan.size, camera.table.copy()
-    R, t, _ = poses[1]
+    R, t, _ = poses[len(poses) // 2]
     rim = np.column_stack([np.cos(np.linspace(0, 6.3, 40)), np.sin(np.linspace(0, 6.3, 40))]) * RADIUS
     faces = np.concatenate([np.column_stack([rim, np.full(40, h)]) for h in (HALF_THICKNESS, -HALF_THICKNESS)])
     outline = camera.project(faces @ R.T + t)
@@ -305,7 +310,7 @@ def motion(plan):
     """Spline of (x, y, z, psi, theta, phi) over time."""
     changes = dict(EFFECTS[plan.effect])
     laws = (newton_euler.precession_friction(K_M), *changes.pop("laws", ()))
-    body = newton_euler.Disc(RADIUS, HALF_THICKNESS, MASS, laws=laws, **changes)
+    body = newton_euler.Disc(RADIUS, plan.half_thickness, MASS, laws=laws, **changes)
     theta = np.radians(plan.theta_deg)
     omega2 = np.sqrt(4 * G * np.sin(theta) / RADIUS)
     psi0 = 0.7 + 1.9 * plan.seed
@@ -327,13 +332,18 @@ def pose_at(spline, time):
     return newton_euler.matrix_of(newton_euler.quaternion_from_angles(*q[3:])), q[:3]
 
 
-def write(folder, plan):
-    """A recording's folder, with truth.npz beside recording.toml. Returns the folder."""
+def write(folder, plan, board_image=board_image, disc_image=disc_image, nodes=3):
+    """A recording's folder, with truth.npz beside recording.toml. Returns the folder.
+
+    board_image, disc_image : what draws a view and a frame
+    nodes : instants of an exposure
+    """
     folder, faults = Path(folder), plan.imperfections
     rng = np.random.default_rng([plan.seed, 7])
     target = np.array([0.032, 0.02, 0.004]) + rng.normal(0, 5e-4, 3)
     cameras = [Camera(rng, plan, azimuth, target) for azimuth in (-122.0, -53.0)]
     dots = DOTS + faults.misprint * rng.normal(size=DOTS.shape)
+    dots[1, 0] += plan.wrong_dot
     thickness = 3e-3
     for name in ("left", "right", "calibration/left", "calibration/right"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -349,17 +359,19 @@ def write(folder, plan):
             tilted = cv2.Rodrigues(tilt * np.array([np.cos(axis), np.sin(axis), 0]))[0]
             R = tilted @ cv2.Rodrigues(np.array([0, 0, turn]))[0]
             middle = np.array([4, 2.5, 0]) * plan.square
-            place = target + np.array([*rng.uniform(-0.022, 0.022, 2), rng.uniform(5e-3, 40e-3)])
+            place = target + np.array([*rng.uniform(-0.022, 0.022, 2), rng.uniform(*plan.board_heights)])
             t = place - R @ middle
         for name, camera in zip(("left", "right"), cameras, strict=True):
             save(f"calibration/{name}/{view:04d}.png", board_image(camera, plan, R, t, rng))
     spline = motion(plan)
     times = np.arange(plan.n_frames) / plan.frame_rate
+    instants = np.polynomial.legendre.leggauss(nodes) if faults.exposure else ([0.0], [2.0])
     for i, time in enumerate(times):
-        poses = [(*pose_at(spline, time + 0.5 * faults.exposure * x), weight) for x, weight in GAUSS]
-        if not faults.exposure:
-            poses = [(*poses[1][:2], w) for w in (0.0, 1.0, 0.0)]
-        for name, camera in zip(("left", "right"), cameras, strict=True):
+        for name, camera, late in zip(("left", "right"), cameras, (0.0, plan.lag), strict=True):
+            middle = time + late
+            poses = [
+                (*pose_at(spline, middle + 0.5 * faults.exposure * x), 0.5 * w) for x, w in zip(*instants, strict=True)
+            ]
             save(f"{name}/{i:06d}.png", disc_image(camera, plan, poses, dots, rng, i))
     centres = ", ".join(f"[{x * 1e3:.4f}, {y * 1e3:.4f}]" for x, y in DOTS)
     (folder / "recording.toml").write_text(
@@ -372,7 +384,7 @@ right = "right/*.png"
 
 [disc]
 radius_mm = {RADIUS * 1e3}
-thickness_mm = {HALF_THICKNESS * 2e3}
+thickness_mm = {plan.half_thickness * 2e3}
 mass_g = {MASS * 1e3}
 
 [markers]

@@ -17,7 +17,6 @@ from disctrack.cli import main as disctrack_cli
 from disctrack.diagnosis import diagnose_trajectory
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.files.trajectory_file import read_findings, read_trajectory
-from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import newton_euler, point_laboratory
 
@@ -87,12 +86,17 @@ HEAD = (
 )
 
 
+def truth_of(folder):
+    """What is planted, and the poses R (n, 3, 3), t (n, 3) of a rendered recording."""
+    truth = np.load(folder / "truth.npz")
+    q = truth["q"]
+    R = np.stack([newton_euler.matrix_of(newton_euler.quaternion_from_angles(*angles)) for angles in q[:, 3:]])
+    return str(truth["effect"]), R, q[:, :3]
+
+
 def row_of(name, effect, trajectory, findings, R, t):
     """Errors of a trajectory, and its diagnosis."""
-    turn = vector_from_rotation(rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(R, 1, 2))
-    error = np.concatenate([trajectory.q[:, :3] - t, turn], 1)[trajectory.measured]
-    whole = trajectory.pose_covariance + trajectory.calibration_covariance
-    variance = np.diagonal(whole, axis1=1, axis2=2)[trajectory.measured]
+    error, variance = point_laboratory.errors_and_variances(trajectory, R, t)
     began = time.process_time()
     result = diagnose_trajectory(with_declared_dots(trajectory, findings), separate=False)
     seconds = time.process_time() - began
@@ -124,11 +128,9 @@ def rendered(folder):
     if not (out / "trajectory.h5").exists():
         with redirect_stdout(StringIO()):
             assert disctrack_cli(["run", str(folder), "-o", str(out), "--no-figures", "--no-video"]) == 0
-    truth = np.load(folder / "truth.npz")
-    q = truth["q"]
-    R = np.stack([newton_euler.matrix_of(newton_euler.quaternion_from_angles(*angles)) for angles in q[:, 3:]])
+    effect, R, t = truth_of(folder)
     file = out / "trajectory.h5"
-    return row_of(folder.name, str(truth["effect"]), read_trajectory(file), read_findings(file), R, q[:, :3])
+    return row_of(folder.name, effect, read_trajectory(file), read_findings(file), R, t)
 
 
 def by_points(seed, effect, frames=300, frame_rate=500.0):

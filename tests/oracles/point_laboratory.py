@@ -139,9 +139,9 @@ def tracked(px, R, t, times, rig, frame_rate):
     return assemble([follower], tables, TrackingSettings(), frame_rate, laboratory.G, times, range(n))
 
 
-def errors_and_variances(tracking, R, t):
-    """(n, 6) error of every pose in the lab frame, and its stated variance, calibration and table included."""
-    trajectory = tracking.trajectory
+def errors_and_variances(trajectory, R, t):
+    """(n, 6) error of every measured pose in the lab frame, and its stated variance, calibration and table included."""
     turn = vector_from_rotation(rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(R, 1, 2))
+    error = np.concatenate([trajectory.q[:, :3] - t, turn], 1)[trajectory.measured]
     whole = trajectory.pose_covariance + trajectory.calibration_covariance
-    return np.concatenate([trajectory.q[:, :3] - t, turn], 1), np.diagonal(whole, axis1=1, axis2=2)
+    return error, np.diagonal(whole, axis1=1, axis2=2)[trajectory.measured]

@@ -103,3 +103,24 @@ def test_what_is_hidden_in_images_of_an_independent_motion_is_found(name, tmp_pa
     scene = small_scene(50 + len(name), 150, 400.0)
     recording = hide(tmp_path, scene=scene, body=body_of(scene, **changes), faults=faults, note=name)
     assert_found(diagnosis_of(recording), truth)
+
+
+TABLES_AND_RIMS = {
+    "spring": ({"laws": (newton_euler.spring(0.8),)}, {"spring": {"k": 0.8, "F_x": 0.0, "F_y": 0.0}}),
+    "adhesion": ({"laws": (newton_euler.adhesive_rolling_friction(1e-4),)}, {"rolling_adhesive": {"a": 1e-4}}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TABLES_AND_RIMS)
+def test_what_a_table_or_a_rim_does_is_found_in_images(name, tmp_path):
+    changes, truth = TABLES_AND_RIMS[name]
+    scene = small_scene(80 + len(name), 250, 500.0)
+    recording = hide(tmp_path, scene=scene, body=body_of(scene, **changes), note=name)
+    document = diagnosis_of(recording)
+    assert document["verdict"] == "found", document["sentence"]
+    assert [e["name"] for e in document["effects"]] == list(truth), document["sentence"]
+    for effect, numbers in truth.items():
+        for parameter, (value, sigma) in sizes(document, effect).items():
+            assert abs(value - numbers[parameter]) < 3 * sigma, (parameter, value, sigma)
+    assert document["after"]["reduced_chi_square"] < 1.1

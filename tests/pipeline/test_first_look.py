@@ -92,6 +92,29 @@ def test_cameras_are_told_apart_by_their_names(names, pairs, tmp_path):
     assert [(pair.left.pattern, pair.right.pattern) for pair in found] == pairs
 
 
+def test_folders_behind_links_are_looked_into_once(tmp_path):
+    for name in ("kept/views/left", "kept/views/right", "take/left", "take/right"):
+        (tmp_path / name).mkdir(parents=True)
+        for i in range(2):
+            (tmp_path / name / f"{i}.png").touch()
+    os.symlink(tmp_path / "kept/views", tmp_path / "take/calibration")
+    os.symlink(tmp_path / "take", tmp_path / "take/again")  # leads back to where it lies
+    found = {(pair.left.pattern, pair.right.pattern) for pair in pair_cameras(find_sequences(tmp_path / "take"))}
+    assert found == {("left/*.png", "right/*.png"), ("calibration/left/*.png", "calibration/right/*.png")}
+
+
+def test_check_names_the_file_of_a_view_that_is_not_used(sample_clip, tmp_path, capsys):
+    folder = linked(sample_clip, tmp_path / "clip")
+    views = sorted((folder / "calibration/right").glob("*.png"))
+    blank = np.full_like(cv2.imread(str(views[-1]), cv2.IMREAD_UNCHANGED), 90)
+    views[-1].unlink()
+    cv2.imwrite(str(views[-1]), blank)
+    main(["check", str(folder)])
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "left out" in line)
+    assert str(views[-1]) in line
+    assert not re.search(r"view \d", line)  # a number among those that were looked at means nothing to a reader
+
+
 def test_stacks_in_one_hdf5_file_are_the_two_cameras(tmp_path, rng):
     with h5py.File(tmp_path / "frames.h5", "w") as file:
         for name in ("right", "left"):
@@ -171,14 +194,14 @@ def declare(folder: Path, old: str, new: str) -> None:
     file.write_text(text.replace(old, new))
 
 
-def renumber_right(folder: Path) -> None:
-    """The right camera one frame late: its frame i shows what the left one's shows in i - 1."""
+def renumber_right(folder: Path, by: int = 1) -> None:
+    """The right camera late by some frames: its frame i shows what the left one's shows in i - by."""
     files = sorted((folder / "right").glob("*.png"))
     targets = [file.resolve() for file in files]
     for file in files:
         file.unlink()
     for i, file in enumerate(files):
-        os.symlink(targets[max(i - 1, 0)], file)
+        os.symlink(targets[max(i - by, 0)], file)
 
 
 FAULTS = {
@@ -198,6 +221,7 @@ FAULTS = {
         or declare(f, 'left = "_', 'left = "right/'), "left and right are exchanged", 1,
     ),
     "one frame late": (renumber_right, "right frame i+1 show the same instant", 1),
+    "three frames late": (lambda f: renumber_right(f, 3), "right frame i+3 show the same instant", 1),
 }  # fmt: skip
 
 
@@ -212,3 +236,5 @@ def test_check_names_the_fault(fault, sample_clip, tmp_path, capsys):
     assert re.search(r"(^| )(look|fix) ", told), told
     if expected is not None:
         assert code == expected, told
+    if "late" in fault:  # and it is told once, not by every place looked at and by all that follows from it
+        assert len(re.findall(r"(^| )(look|fix) +(clock|cameras|physics)", told)) == 1, told

@@ -17,7 +17,7 @@ from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, triangle
-from disctrack.diagnosis.engine.score import Linearisation, score
+from disctrack.diagnosis.engine.score import Linearisation, cleared, score, span
 from disctrack.diagnosis.engine.search import Diagnosis
 from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.reduction import Reduction
@@ -184,8 +184,8 @@ class Planner:
         matrix = self._with_priors(rows)
         signal = matrix[:, self._columns(effect)] @ self.amounts(effect)
         base = [j for n, j in self.column.items() if n not in {q.name for q in self.tested}]
-        alone = _cleared(signal, matrix[:, base])
-        beside = _cleared(signal, matrix[:, [*base, *self._columns(rival)]])
+        alone = cleared(signal, span(matrix[:, base]))
+        beside = cleared(signal, span(matrix[:, [*base, *self._columns(rival)]]))
         length = float(np.linalg.norm(alone))
         sigmas = float(np.linalg.norm(beside))
         return sigmas, float(np.arcsin(min(sigmas / length, 1.0))) if length > 0 else 0.0
@@ -196,7 +196,7 @@ class Planner:
         mine, *rest = self._columns(candidate)
         base = [j for n, j in self.column.items() if n not in {q.name for q in self.tested}]
         column = matrix[:, mine]
-        left = float(np.linalg.norm(_cleared(column, matrix[:, [*base, *rest]])))
+        left = float(np.linalg.norm(cleared(column, span(matrix[:, [*base, *rest]]))))
         return 1.0 / left if left > SEEN * float(np.linalg.norm(column)) else float("inf")
 
     def _columns(self, candidate: Candidate) -> list[int]:
@@ -302,17 +302,6 @@ def _changed(disc: Disc, proposal: Proposal) -> Disc:
         radius=disc.radius * proposal.radius,
         marker_centres_body=disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0],
     )
-
-
-def _cleared(column: Array, others: Array) -> Array:
-    """The column without what the others can absorb."""
-    length = np.linalg.norm(others, axis=0)
-    scaled = others[:, length > 0] / length[length > 0]
-    U, singular, _ = np.linalg.svd(scaled, full_matrices=False)
-    U = U[:, singular > 1e-9 * singular[0]] if singular.size else U
-    for _ in range(2):
-        column = column - U @ (U.T @ column)
-    return column
 
 
 def separations(

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from calibration.arrays import Array
+from disctrack.diagnosis.engine.score import cleared, span
 from disctrack.diagnosis.engine.system import Candidate, Values
 
 if TYPE_CHECKING:
@@ -33,29 +34,29 @@ def sought(system: DiscSystem, candidate: Candidate, values: Values) -> list[tup
     places = 2 * np.pi * np.arange(ANGLES) / ANGLES if first.unit == "rad" else _frequencies(system, values)
     residual, derivative = system.linearise(values, [q.name for q in system.base])
     priors = np.diag([1.0 / q.prior_sigma for q in system.base])
-    base = np.concatenate([derivative.reshape(-1, len(priors)), priors])
-    length = np.linalg.norm(base, axis=0)
-    Q = np.linalg.qr(base / np.where(length > 0, length, 1.0))[0][: residual.size]
-    r = residual.ravel()
+    basis = span(np.concatenate([derivative.reshape(-1, len(priors)), priors]))
+    r, no_prior = residual.ravel(), np.zeros((len(priors), len(candidate.names)))
     gains = []
     for place in places:
         own = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values) | {first.name: float(place)}
         columns = system.linearise(own, candidate.names)[1].reshape(len(r), -1)
-        cleared = columns - Q @ (Q.T @ columns)
-        amounts, *_ = np.linalg.lstsq(cleared, r, rcond=1e-10)
+        left = cleared(np.concatenate([columns, no_prior]), basis)[: len(r)]
+        amounts, *_ = np.linalg.lstsq(left, r, rcond=1e-10)
         inside = all(q.lower <= q.null + a <= q.upper for q, a in zip(candidate.quantities, amounts, strict=True))
-        gains.append(float(r @ r - np.sum((r - cleared @ amounts) ** 2)) if inside else 0.0)
+        gains.append(float(r @ r - np.sum((r - left @ amounts) ** 2)) if inside else 0.0)
     best = np.argsort(gains)[::-1][:REFITS]
     return [(float(places[i]), *(q.null for q in rest)) for i in best if gains[i] > 0]
 
 
 def _frequencies(system: DiscSystem, values: Values) -> Array:
-    """Peaks [Hz] in the spectrum of measured less predicted positions, in units of their noise; highest first."""
+    """Peaks [Hz] in the spectrum of measured less predicted positions, in units of their noise, and beside them."""
     difference, sigma = (x[:, :3] for x in system.pose_difference(values))
     left = np.nan_to_num(difference / sigma)
     n, rate = len(left), 1.0 / float(np.median(np.diff(system.time)))
-    spectrum = np.abs(np.fft.rfft((left - left.mean(axis=0)) * np.hanning(n)[:, None], PADDED * n, axis=0))
+    spectrum = np.abs(np.fft.rfft(left - left.mean(axis=0), PADDED * n, axis=0))
     power, frequency = np.sum(spectrum**2, axis=1), np.fft.rfftfreq(PADDED * n, 1 / rate)
     power[frequency < SLOW * rate / n] = 0.0
     peaks, _ = find_peaks(power)
-    return np.asarray(frequency[peaks[np.argsort(power[peaks])[::-1][:PEAKS]]], float)
+    highest = frequency[peaks[np.argsort(power[peaks])[::-1][:PEAKS]]]
+    # noise moves and splits peaks by as much
+    return np.ravel(highest[:, None] + 0.5 * rate / n * np.array([0.0, -1.0, 1.0]))

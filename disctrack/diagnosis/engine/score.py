@@ -17,6 +17,7 @@ from disctrack.diagnosis.engine.fit import Fit, compress, prior_rows, solve_boun
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System
 
+DEPENDENT = 1e-9  # singular value over the largest, below which columns are combinations of the others
 INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
 
 
@@ -69,9 +70,7 @@ class Linearisation:
 
     def cleared(self, columns: Array) -> Array:
         """Columns without what the fitted quantities can absorb."""
-        for _ in range(2):  # twice is enough (Kahan): the first pass leaves rounding of the size of what it removes
-            columns = columns - self._basis @ (self._basis.T @ columns)
-        return columns
+        return cleared(columns, self._basis)
 
     def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
         """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
@@ -88,6 +87,20 @@ class Linearisation:
 
 def _frees(q: Quantity, fitted: Quantity) -> bool:
     return not np.isfinite(q.prior_sigma) and bool(np.isfinite(fitted.prior_sigma))
+
+
+def cleared(columns: Array, basis: Array) -> Array:
+    """Columns (m,) or (m, k) without what an orthonormal basis (m, b) can absorb."""
+    for _ in range(2):  # twice is enough (Kahan): the first pass leaves rounding of the size of what it removes
+        columns = columns - basis @ (basis.T @ columns)
+    return columns
+
+
+def span(columns: Array) -> Array:
+    """(m, b) orthonormal basis of what columns (m, k) of any sizes span."""
+    length = np.linalg.norm(columns, axis=0)
+    U, singular, _ = np.linalg.svd(columns[:, length > 0] / length[length > 0], full_matrices=False)
+    return np.asarray(U[:, singular > DEPENDENT * singular[0]] if singular.size else U, float)
 
 
 def _normalised(columns: Array) -> Array:

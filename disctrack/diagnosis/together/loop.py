@@ -17,7 +17,7 @@ from calibration.arrays import Array
 from disctrack.diagnosis.disc.model_file import PAPER
 from disctrack.diagnosis.disc.plan import Plan, Question
 from disctrack.diagnosis.engine.fit import Fit, triangle
-from disctrack.diagnosis.engine.score import Linearisation, score_all
+from disctrack.diagnosis.engine.score import Linearisation, cleared, score_all, span
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses
@@ -290,17 +290,11 @@ def _plan(system: JointSystem, diagnosis: Diagnosis, bounds: Sequence[Bound], cr
 
 def _spread(base: Array, mine: Array) -> Array:
     """Standard deviations of the numbers of `mine` with those of `base` free; infinite where they are not seen."""
-    length = np.linalg.norm(base, axis=0)
-    scaled = base[:, length > 0] / length[length > 0]
-    U, singular, _ = np.linalg.svd(scaled, full_matrices=False)
-    U = U[:, singular > 1e-10 * singular[0]] if singular.size else U
-    before = np.linalg.norm(mine, axis=0)
-    cleared = mine - U @ (U.T @ mine)
-    cleared = cleared - U @ (U.T @ cleared)
-    seen = np.linalg.norm(cleared, axis=0) > 1e-6 * np.maximum(before, 1e-300)
+    before, left = np.linalg.norm(mine, axis=0), cleared(mine, span(base))
+    seen = np.linalg.norm(left, axis=0) > 1e-6 * np.maximum(before, 1e-300)
     sigma = np.full(mine.shape[1], np.inf)
     if seen.any():
-        normal = (cleared[:, seen] / before[seen]).T @ (cleared[:, seen] / before[seen])
+        normal = (left[:, seen] / before[seen]).T @ (left[:, seen] / before[seen])
         sigma[seen] = np.sqrt(np.diag(np.linalg.pinv(normal))) / before[seen]
     return sigma
 

@@ -1,0 +1,71 @@
+"""The whole instrument on recordings that a path tracer made: shadows, soft light and a lens that it has never seen."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.rig_file import read_rig
+from disctrack.cli import main as disctrack_cli
+from disctrack.files.trajectory_file import read_trajectory
+from disctrack.trajectory import FrameStatus
+from tests.oracles.imperfect_table import truth_of
+from tests.oracles.point_laboratory import errors_and_variances
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(importlib.util.find_spec("mitsuba") is None, reason="needs Mitsuba 3: pip install mitsuba"),
+]
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("traced") / "plain"
+    command = [sys.executable, "-m", "tests.oracles.path_traced", str(folder)]
+    # apart, so that neither LLVM nor the tracer's threads enter this process
+    subprocess.run([*command, "--scene", "plain", "--frames", str(FRAMES)], check=True, cwd=Path(__file__).parents[2])
+    return folder
+
+
+def measured(folder, out):
+    assert disctrack_cli(["run", str(folder), "-o", str(out), "--no-figures", "--no-video"]) == 0
+    return read_trajectory(out / "trajectory.h5")
+
+
+def test_a_path_traced_recording_is_measured_within_its_sigmas(recording, tmp_path):
+    trajectory = measured(recording, tmp_path)
+    assert np.all(trajectory.frame_status == FrameStatus.MEASURED)
+    error, variance = errors_and_variances(trajectory, *truth_of(recording)[1:])
+    shared = np.diagonal(trajectory.calibration_covariance, axis1=1, axis2=2).mean(0)
+    noise = variance.mean(0) - shared
+    assert np.all(np.abs(error.mean(0)) < 4 * np.sqrt(shared + noise / FRAMES))
+    # 24 frames of one recording: their scatter is known within 30 % (two sigma), the correlated part of the dots aside
+    assert np.all(error.std(0) ** 2 < 2.0 * noise)
+    assert np.all(error.std(0) ** 2 > 0.4 * noise)
+
+
+def test_the_lenses_of_a_path_traced_rig_are_found_within_their_sigmas(recording, tmp_path):
+    measured(recording, tmp_path)
+    rig, truth = read_rig(tmp_path / "rig.h5"), np.load(recording / "truth.npz")
+    for side, camera, i in (("left", rig.left, 0), ("right", rig.right, 9)):
+        sigma = np.sqrt(np.diagonal(rig.covariance)[i : i + 4])  # fx, fy, cx, cy
+        f, cx, cy = truth[f"{side}_intrinsics"][:3]
+        assert np.all(np.abs(np.array([camera.fx, camera.fy, camera.cx, camera.cy]) - [f, f, cx, cy]) < 4 * sigma)
+        assert np.all(sigma < 3)  # px
+
+
+def test_squares_declared_too_large_are_errors_beyond_the_sigmas(recording, tmp_path):
+    """Negative control: the same images with squares of 6.5325 mm for 6.5, known to 1 um."""
+    declared = recording / "recording.toml"
+    text = declared.read_text()
+    try:
+        declared.write_text(text.replace("square_mm = 6.5", "square_mm = 6.5325\nsquare_tolerance_mm = 0.001"))
+        trajectory = measured(recording, tmp_path)
+    finally:
+        declared.write_text(text)
+    error, variance = errors_and_variances(trajectory, *truth_of(recording)[1:])
+    assert np.max(np.mean(error**2 / variance, axis=0)) > 9
