@@ -218,7 +218,8 @@ class _Scan:
         self._absorbed = np.swapaxes(basis.reshape(n, w, -1), 1, 2) @ D
         self._right = np.einsum("nw,nwk->nk", left[: residual.size].reshape(n, w), D)
         self.chi_square = float(left @ left)
-        k = kinematics(self.motion.q, self.motion.qdot, system.disc, system.model.gravity, self.motion.time)
+        model, m = system.model, self.motion
+        k = kinematics(m.q, m.qdot, system.disc, model.gravity, m.time, model.air_density)
         space: dict[str, Any] = {name: np.asarray(k[name]) for name in k.dtype.names or ()}
         space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
         space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
