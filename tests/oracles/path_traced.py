@@ -51,7 +51,7 @@ class Setup(laboratory.Plan):
     hole: float = 0.0  # [m] radius of a hole through the disc
     dot_scale: tuple = (1.0,) * 6  # of the dots' radii
     dust: int = 0  # specks on the face
-    table: str = "plain"  # or cloth, wood, mirror
+    table: str = "plain"  # or cloth, wood, gloss
     second_disc: bool = False  # lying on the table
     covered: range = range(0)  # frames with a hand over half of the disc
     held: bool = False  # the board, by fingers at its rim
@@ -83,7 +83,7 @@ SCENES = {
     "flicker": {"trouble": laboratory.Trouble(flicker=0.2), "table": "wood"},
     "dust": {"dust": 400, "gloss": 0.3},
     "second_disc": {"second_disc": True, "size": 400, "mm_per_px": 0.48, "table": "wood"},
-    "mirror": {"table": "mirror", "bounces": 2},
+    "gloss": {"table": "gloss", "bounces": 2},
     "flat": {"theta_deg": 2.0, "omega3": 0.2},
     "steep": {"theta_deg": 60.0, "omega3": 3.0},
     "small": {  # to be diagnosed
@@ -326,7 +326,7 @@ class Studio:
     def table_surface(self):
         """What the disc rolls on."""
         plan = self.plan
-        if plan.table == "mirror":
+        if plan.table == "gloss":
             return {"type": "roughplastic", "alpha": 0.03, "diffuse_reflectance": 0.1}
         rng, n = np.random.default_rng([plan.seed, 13]), 2048
         grain = cv2.GaussianBlur(rng.normal(size=(n, n)), (0, 0), 3)
