@@ -30,7 +30,7 @@ from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.propagation import state_of
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
-from disctrack.trajectory import MarkerStatus, Trajectory, part
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
 if TYPE_CHECKING:
     from disctrack.recording.declaration import Recording
@@ -348,8 +348,9 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
     pixels = np.where(good[:, None, :, None], trajectory.markers_px[rows], np.nan)
     n, _, dots, _ = pixels.shape
-    if not np.isfinite(pixels).any():
-        return ()
+    contradicted = trajectory.frame_status == FrameStatus.CONTRADICTED
+    if not np.isfinite(pixels).any() or contradicted.sum() > trajectory.measured.sum():
+        return ()  # cameras that do not fit together tell no size
     seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), trajectory.rig).reshape(n, dots, 3)
     i, j = np.triu_indices(dots, 1)
     expected = np.linalg.norm(declared.marker_centres_body[i] - declared.marker_centres_body[j], axis=1)

@@ -122,15 +122,16 @@ def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquis
     return Acquisition(best[1], best[2], best[3], "")
 
 
-def blobs_of_one_camera(
+def seen_by_one_camera(
     image: NDArray[np.generic], camera: int, diameter_px: float, rig: StereoRig, disc: Disc
-) -> Array:
-    """Blobs of about that diameter that are the dots by one camera alone: x, y [px], area [px^2], (n_markers, 3).
+) -> tuple[Array, Array, Array]:
+    """Blobs of about that diameter that are the dots by one camera alone, and the pose R_world_body, t_world_body.
 
-    NaN for dots that are not seen. What one camera sees is the same on every scale: neither baseline nor table matter.
+    The blobs are x, y [px], area [px^2], (n_markers, 3), NaN for dots that are not seen. What one camera sees is the
+    same on every scale: neither baseline nor table matter.
     """
     blobs = _sized_blobs(image, diameter_px)
-    best = np.full((disc.n_markers, 3), np.nan)
+    best = np.full((disc.n_markers, 3), np.nan), np.eye(3), np.zeros(3)
     R_cw, t_cw = rig.camera_poses()[camera]
     for R, t in _candidates_from_one_camera(blobs[:, :2], camera, rig, disc):
         pixels = rig.project(disc.marker_centres_body @ R.T + t)[camera]
@@ -138,8 +139,8 @@ def blobs_of_one_camera(
         reach = INLIER_DIAMETERS * rig.cameras[camera].fx * disc.marker_diameter / float(R_cw[2] @ t + t_cw[2])
         seen, nearest = gap.min(axis=1) < reach, gap.argmin(axis=1)
         one_each = len(set(nearest[seen])) == seen.sum()  # a disc far off, or edge on, has many dots in one blob
-        if one_each and seen.sum() > np.isfinite(best[:, 0]).sum():
-            best = np.where(seen[:, None], blobs[nearest], np.nan)
+        if one_each and seen.sum() > np.isfinite(best[0][:, 0]).sum():
+            best = np.where(seen[:, None], blobs[nearest], np.nan), R, t
     return best
 
 

@@ -1,7 +1,7 @@
-"""Images that do not show the disc as declared: exchanged, mirrored or turned, do they, or with other dots?
+"""Images that do not show the disc as declared: exchanged, mirrored or turned, do they?
 
 Tried only where the dots make no sense as declared: each way in which a camera's setup or an export program may have
-arranged the images is undone, and the disc searched for anew; then dots unlike the declared ones are.
+arranged the images is undone, and the disc searched for anew.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from calibration.camera import StereoRig
 from disctrack.disc import Disc, has_mirror_axis
 from disctrack.frames import CAMERAS
 from disctrack.track.acquisition import acquire
-from disctrack.track.unlike_declared import unlike_declared
 
 Turn = Callable[[NDArray], NDArray]
 MIRRORED: dict[str, Turn] = {
@@ -27,14 +26,14 @@ MIRRORED: dict[str, Turn] = {
 
 
 def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
-    """What was done to the images or is declared wrongly, in words, where undoing it shows the disc; otherwise "".
+    """What was done to the images, in words, where undoing it shows the disc; "" where nothing does.
 
     pair : (2, height, width). All but one of the dots must be found in both cameras, and more than as declared.
     """
     enough = max(acquire(pair[0], pair[1], rig, disc).n_explained + 1, 2 * disc.n_markers - 2)
     found = [(acquire(left, right, rig, layout).n_explained, told) for told, left, right, layout in _ways(pair, disc)]
     dots, told = max(found)
-    return told if dots >= enough else unlike_declared(pair, rig, disc)
+    return told if dots >= enough else ""
 
 
 def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, NDArray, NDArray, Disc]]:

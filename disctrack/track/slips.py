@@ -13,11 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
+from calibration.brief import ranges
 from calibration.camera import StereoRig
 from disctrack.frames import CAMERAS
 from disctrack.track.pose import PoseFits, marker_pixels, whitening
 
 SHORTEST = 4  # frames: a gleam or a hand is told by the frames' own status
+LEFT_OUT = "it left out"
+REFUSED = "are refused: the dots of the two cameras contradict each other"
 EXPLAINED = 0.9  # of the square of the misfit
 
 
@@ -30,20 +33,24 @@ def slips_in_words(
     centres: Array,
     pairs: range,
 ) -> tuple[str, ...]:
-    """A sentence for each long stretch of frames refused (n,) for their dots; the other arguments as in `fit_poses`."""
-    said = []
+    """Sentences on long stretches of frames refused (n,) for their dots; the other arguments as in `fit_poses`."""
+    said: list[str] = []
+    unexplained: list[int] = []
     edges = np.flatnonzero(np.diff(np.r_[False, refused, False].astype(int))).reshape(-1, 2)
     for first, end in edges[edges[:, 1] - edges[:, 0] >= SHORTEST]:
-        told = f"frames {pairs[first]}-{pairs[end - 1]} are refused: the dots of the two cameras contradict each other"
         delay, explained = delay_of_right(fits, markers_px, covariance_px2, rig, centres, np.arange(first, end))
         ahead = round(abs(delay)) if explained > EXPLAINED else 0
-        if ahead:
-            camera, other = CAMERAS[::-1] if delay > 0 else CAMERAS
-            told += (
-                f", as if the {camera} camera were {abs(delay):.2f} frames ahead of the {other}: it left out {ahead} "
-                f"image(s) at frame {pairs[first]}. Number its images from there on higher by {ahead}"
-            )
-        said.append(told)
+        if not ahead:
+            unexplained += pairs[first:end]
+            continue
+        camera, other = CAMERAS[::-1] if delay > 0 else CAMERAS
+        said.append(
+            f"frames {pairs[first]}-{pairs[end - 1]} {REFUSED}, as if the {camera} camera were {abs(delay):.2f} frames "
+            f"ahead of the {other}: {LEFT_OUT} {ahead} image(s) at frame {pairs[first]}. "
+            f"Number its images from there on higher by {ahead}"
+        )
+    if unexplained:
+        said.append(f"frames {ranges(unexplained)} {REFUSED}")
     return tuple(said)
 
 

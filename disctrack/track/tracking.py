@@ -39,10 +39,15 @@ from disctrack.track.following import (
     follow_block,
 )
 from disctrack.track.following import prepare as prepare
+from disctrack.track.moved_camera import moved_camera
+from disctrack.track.slips import LEFT_OUT
+from disctrack.track.unlike_declared import unlike_declared
 from disctrack.trajectory import FrameStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
+MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
+PAIRS_TRIED = 5  # where no disc is found, for what else is wrong
 STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
@@ -169,9 +174,12 @@ def track(
         timestamps = np.array(pairs) / frame_rate
     tracking = assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
     tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
-    if any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts):
-        one_sided = np.flatnonzero(tracking.trajectory.frame_status == FrameStatus.ONE_CAMERA)
-        if arranged := _arrangement(read_blocks, rig, disc, pairs[one_sided[0] :]):
+    status = tracking.trajectory.frame_status
+    one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)
+    left_out = any(LEFT_OUT in doubt for doubt in tracking.doubts)  # which makes cameras contradict each other
+    if one_sided or (np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY and not left_out):
+        first = np.flatnonzero((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))[0]
+        if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
             told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
             tracking = replace(tracking, doubts=(told, *tracking.doubts))
     return tracking
@@ -180,12 +188,21 @@ def track(
 def _arrangement(
     read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], rig: StereoRig, disc: Disc, pairs: range
 ) -> str:
-    """Whether the images are mirrored or exchanged, in words: by the first of the pairs, and by one in their middle."""
-    for pair in dict.fromkeys([pairs[0], pairs[len(pairs) // 2]]):
-        for block in read_blocks(pair, pair + 1):
-            if block.readable.all() and (told := arrangement_found(block.images[0], rig, disc)):
-                return told
-    return ""
+    """Why the disc is not seen as declared, in words, by some of the pairs; "" if nothing explains it.
+
+    Images are mirrored or exchanged, a camera was moved, or the dots are others.
+    """
+    chosen = dict.fromkeys(pairs[round(place * (len(pairs) - 1))] for place in np.linspace(0, 1, PAIRS_TRIED))
+    blocks = [block for pair in chosen for block in read_blocks(pair, pair + 1)]
+    images = [block.images[0] for block in blocks if block.readable.all()]
+    if not images:
+        return ""
+    few = images[:: max(1, len(images) // 2)][:2]
+    return (
+        next(filter(None, (arrangement_found(image, rig, disc) for image in few)), "")
+        or moved_camera(np.array(images), rig, disc)
+        or next(filter(None, (unlike_declared(image, rig, disc) for image in few)), "")
+    )
 
 
 def stretch_edges(pairs: range, disc: Disc) -> list[int]:

@@ -18,8 +18,8 @@ from disctrack.track.acquisition import (
     EPIPOLAR_PX,
     MIN_EXPLAINED,
     SIDE_TOLERANCE,
-    blobs_of_one_camera,
     rigid_motions,
+    seen_by_one_camera,
 )
 from disctrack.track.as_printed import declared_places_kept
 from disctrack.track.doubts import misplaced_in_words
@@ -28,6 +28,7 @@ DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those 
 UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
+MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
 RIM = 64  # points of a dot's outline
 
 
@@ -39,6 +40,7 @@ class SeenDots:
     points: Array  # (k, 3) [m] in the rig's world and unit
     areas: Array  # (2, k) [px^2] of their blobs
     scale: float  # their distances over those declared
+    misfit_px: float  # largest, of the blobs against one point in space
 
 
 def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
@@ -55,7 +57,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
     diameter = disc.marker_diameter * float(np.median(np.sqrt(seen.areas / _areas(seen, R, rig, disc))))
     if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
         return f"[markers] diameter_mm is about {1e3 * diameter:.2g}, not {1e3 * disc.marker_diameter:g}"
-    if not seen.which.all():
+    if not seen.which.all() or seen.misfit_px > MEETING_PX:
         return ""
     shift = (seen.points - t) @ R - disc.marker_centres_body
     return misplaced_in_words(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
@@ -63,7 +65,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
 
 def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> SeenDots | None:
     for diameter in DOT_DIAMETERS_PX:
-        blobs = np.stack([blobs_of_one_camera(pair[camera], camera, diameter, rig, disc) for camera in (0, 1)])
+        blobs = np.stack([seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)])
         which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
         if which.sum() < MIN_EXPLAINED:
             continue
@@ -72,12 +74,9 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> SeenDots | None:
         one, other = np.triu_indices(which.sum(), 1)
         ratios = _distances(points, one, other) / _distances(disc.marker_centres_body[which], one, other)
         scale = float(np.median(ratios))
-        if (
-            np.abs(rig.project(points) - pixels).max() < EPIPOLAR_PX
-            and scale > 0
-            and np.abs(ratios / scale - 1).max() < MISPLACED
-        ):
-            return SeenDots(which, points, blobs[:, which, 2], scale)
+        misfit = float(np.abs(rig.project(points) - pixels).max())
+        if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
+            return SeenDots(which, points, blobs[:, which, 2], scale, misfit)
     return None
 
 

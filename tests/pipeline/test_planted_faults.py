@@ -14,6 +14,7 @@ from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.readers.blocks import PairBlock
 from disctrack.recording.declaration import read_recording
+from disctrack.track.moved_camera import moved_camera
 from disctrack.track.own_scatter import MIN_FRAMES
 from disctrack.track.stage import open_pairs
 from disctrack.track.tracking import TrackingSettings, track
@@ -166,6 +167,34 @@ def test_dots_declared_too_far_off_to_be_followed_are_told(clip, shift, diameter
         true = 1e3 * clip.disc.marker_centres_body[:, :2]
         distance, expected = (np.linalg.norm(places[i] - places[j], axis=1) for places in (centres, true))
         np.testing.assert_allclose(distance, expected, atol=0.25)  # blobs err by up to 0.5 px, 0.2 mm
+
+
+CAMERA_MOVED = {  # turn [deg] about its own axes, shift [mm]
+    "turned by 1 deg up": ((1, 0, 0), (0, 0, 0)),
+    "turned by 1 deg aside": ((0, 1, 0), (0, 0, 0)),
+    "turned by 0.2 deg": ((0.2, 0, 0), (0, 0, 0)),
+    "shifted by 2 mm": ((0, 0, 0), (0, 2, 0)),
+}
+
+
+@pytest.mark.parametrize("motion", CAMERA_MOVED)
+def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion):
+    turn, shift = np.radians(CAMERA_MOVED[motion][0]), 1e-3 * np.array(CAMERA_MOVED[motion][1])
+    dR = frames.rotation_from_vector(turn)
+    rig = replace(clip.rig, R_right_left=dR @ clip.rig.R_right_left, t_right_left=dR @ clip.rig.t_right_left + shift)
+    try:
+        told = " ".join(measure(clip.images, rig, clip.disc).doubts)
+    except TrackingError as error:
+        told = str(error)
+    found = re.search(r"the right camera was turned by about ([0-9.]+) deg and shifted by ([0-9.]+) mm", told)
+    assert found, told
+    # each makes up for the other: a shift of 1 mm, 0.5 m away, is a turn of 0.1 deg
+    assert abs(float(found[1]) - np.degrees(np.linalg.norm(turn))) < 0.25
+    assert abs(float(found[2]) - 1e3 * np.linalg.norm(shift)) < 4.5
+
+
+def test_no_camera_is_said_to_have_moved_where_none_did(clip):
+    assert moved_camera(clip.images[[0, 20, 40]], clip.rig, clip.disc) == ""
 
 
 def test_no_scale_is_told_where_no_dots_are(clip):
