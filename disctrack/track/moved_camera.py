@@ -64,8 +64,8 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
         return ""
     return (
         f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm against "
-        f"the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to {rms[0]:.1f} as "
-        "calibrated); calibrate again"
+        f"the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
+        f"{rms[0]:.1f} as calibrated); calibrate again"
     )
 
 
