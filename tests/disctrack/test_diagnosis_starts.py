@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis.disc import slip_start
 from disctrack.diagnosis.disc.stretch import free_stretch
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.errors import AnalysisError
@@ -108,6 +109,15 @@ def test_an_effect_is_found_behind_slip_at_the_start():
     fit = result.after_fit
     assert abs(fit.values["kz.k_z"] - 6e-5) < 4 * fit.sigma("kz.k_z")
     assert result.after.reduced_chi_square < 1.1
+
+
+@pytest.mark.slow
+def test_slip_alone_is_an_answer_where_effects_beside_it_take_too_long(monkeypatch):
+    monkeypatch.setattr(slip_start, "MOST_SLIP_STEPS", 1000)
+    result = diagnose_trajectory(measured(motion=sliding(0.2, (0.08, 0.04)), seed=41, n=220))
+    assert [found.candidate.name for found in result.diagnosis.found] == ["slip_start"]
+    assert result.after.reduced_chi_square < 0.1 * result.before.reduced_chi_square
+    assert slip_start.CREEPS_BESIDE in result.notes
 
 
 @pytest.mark.slow

@@ -34,6 +34,10 @@ CREEPS = (
     "slip with Coulomb's friction was given up: with so little of it the disc creeps, for longer than can be followed; "
     "it is taken to roll"
 )
+CREEPS_BESIDE = (
+    "slip with Coulomb's friction is all that was fitted: with so little of it the disc creeps, and other effects "
+    "beside it would take too long to try"
+)
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
@@ -148,17 +152,23 @@ def _slipping(
     systematic = rolling.systematic
     system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
     system.patience = rolling.patience
-    diagnosis = diagnose(system, system.start(faults), settings)
-    if diagnosis.verdict == "unexplained" and np.isfinite(onset.high):
+    crept: tuple[str, ...] = ()
+    try:
+        diagnosis = diagnose(system, system.start(faults), settings)
+    except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
+        system = DiscSystem(trajectory, model, (), stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
+        diagnosis, crept = diagnose(system, system.start(faults), settings), (CREEPS_BESIDE,)
+    if not crept and diagnosis.verdict == "unexplained" and np.isfinite(onset.high):
         later = _after_slip(rolling, faults, settings, onset, diagnosis)
         if later is not None:
             return later
     if diagnosis.held_out_after is None or not _declares(system):
-        return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis)))
+        return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis), *crept))
     rows = training_rows(system, settings.train_fraction)
     judged = diagnosis.judged or system
     slip = SlipStart(base, held_out(judged, base.quantities, base.values, rows), _candidate(system))
-    return SlipDiagnosis(system, diagnosis, slip, (*system.stretch.notes, *_in_words(system, diagnosis)))
+    notes = (*system.stretch.notes, *_in_words(system, diagnosis), *crept)
+    return SlipDiagnosis(system, diagnosis, slip, notes)
 
 
 def _declares(system: DiscSystem) -> bool:
