@@ -51,6 +51,8 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
         )
         R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
         t = np.where(fits.converged[:, None], fits.t_world_body, t)
+        if not fits.used.any():
+            return ""
         if observed is left_alone:
             continue
         rms.append(float(np.sqrt(np.mean(fits.residuals_px[fits.used] ** 2))))
@@ -60,7 +62,7 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
         moved = moved.perturbed(step)
     motion = _motion(rig, moved)
     turn, shift = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
-    if rms[-1] > FITS_PX or rms[0] < BETTER * rms[-1] or max(turn / TURN, shift / SHIFT) > MOST_SIGMAS:
+    if not (rms[-1] < FITS_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS):
         return ""
     return (
         f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm against "

@@ -5,6 +5,7 @@ import re
 import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from disctrack.track.moved_camera import moved_camera
 from disctrack.track.own_scatter import MIN_FRAMES
 from disctrack.track.stage import open_pairs
 from disctrack.track.tracking import TrackingSettings, track
+from disctrack.track.unlike_declared import unlike_declared
 from disctrack.trajectory import FrameStatus
 from tests.oracles.planted_faults import FAULTS, gleam
 
@@ -195,6 +197,19 @@ def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion)
 
 def test_no_camera_is_said_to_have_moved_where_none_did(clip):
     assert moved_camera(clip.images[[0, 20, 40]], clip.rig, clip.disc) == ""
+
+
+def test_blobs_at_random_are_no_disc_of_any_kind(clip, rng):
+    """Neither a camera that moved nor other dots are read into pictures of something else."""
+    for _ in range(15):
+        pairs = np.full((3, 2, 272, 272), 190, np.uint8)
+        for image in pairs.reshape(-1, 272, 272):
+            for _ in range(rng.integers(0, 12)):
+                place, size = ([int(v) for v in rng.integers(low, high, 2)] for low, high in ((0, 272), (2, 30)))
+                angle, ink = float(rng.uniform(0, 180)), int(rng.integers(0, 120))
+                cv2.ellipse(image, place, size, angle, 0, 360, ink, -1, cv2.LINE_AA)
+        assert moved_camera(pairs, clip.rig, clip.disc) == ""
+        assert unlike_declared(pairs[0], clip.rig, clip.disc) == ""
 
 
 def test_no_scale_is_told_where_no_dots_are(clip):
