@@ -166,7 +166,8 @@ def track(
             carry_on(followers[k - 1], followers[k], edges[k], edges[k + 1])
     if not np.isfinite(tables.t).any():
         reason = next((f.first_reason for f in followers if f.first_reason), "")
-        told = f"First search: {reason.rstrip('.')}. {MOVED}" if reason else "No image could be read"
+        stop = "" if reason.endswith("?") else "."
+        told = f"First search: {reason.rstrip('.')}{stop} {MOVED}" if reason else "No image could be read"
         if arranged := _arrangement(read_blocks, rig, disc, pairs):
             told = f"It is there if {arranged}"
         raise TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}")
