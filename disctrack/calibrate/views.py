@@ -181,7 +181,7 @@ def calibrate_views(
             seen_left, seen_right, target, settings, position, board_thickness, names, progress
         )
     except CalibrationError as error:
-        if other := other_board(*images, target):
+        if other := other_board([*images[0], *images[1]], [*seen_left, *seen_right], target):
             raise CalibrationError(f"{str(error).rstrip('.')}. {other}") from error
         raise
     return found, tuple(problems)

@@ -14,8 +14,11 @@ from numpy.testing import assert_allclose
 
 from calibration import BoardNotFound, CalibrationError, CornerView
 from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target, target_of
+from calibration.camera import Camera
 from calibration.charuco import find_charuco
+from disctrack.calibrate import targets
 from disctrack.calibrate.circles import find_circles
+from disctrack.calibrate.targets import other_board
 from disctrack.calibrate.views import calibrate_recording
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
@@ -278,3 +281,32 @@ def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(declared, sa
     (tmp_path / "recording.toml").write_text(DECLARED % declared)
     with pytest.raises(RecordingError, match=said):
         read_recording(tmp_path)
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """Sizes (height, width) of the images in which a board of any size is looked for."""
+    shapes = []
+    search = cv2.findChessboardCornersSBWithMeta
+    monkeypatch.setattr(
+        targets.cv2,
+        "findChessboardCornersSBWithMeta",
+        lambda image, *more: shapes.append(image.shape) or search(image, *more),
+    )
+    return shapes
+
+
+def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_declared_one_is_not(board_drawer, searched):
+    camera = Camera(2800.0, 2800.0, 500.0, 370.0, (0.0,) * 5, (1000, 750))
+    board, R = Board((9, 6), 8e-3), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
+    image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.36]), board, rng=np.random.default_rng(1))
+    found, refused = object(), BoardNotFound("no board of 10 x 7 inner corners")
+    told = other_board([image] * 12, [refused] * 12, Board((10, 7), 8e-3))
+    assert told == "Shown are 9 x 6 inner corners, in 4 of 4 images looked at: inner_corners = [9, 6]"
+    assert searched == [(600, 800)] * 4
+    blank = np.random.default_rng(2).integers(0, 255, image.shape).astype(np.uint8)
+    # the images in which the declared board is are not looked at, and most of them having it is enough
+    assert not other_board([image] * 4 + [blank] * 5, [found] * 4 + [refused] * 5, Board((10, 7), 8e-3))
+    assert len(searched) == 8
+    assert not other_board([image] * 12, [found] * 7 + [refused] * 5, Board((10, 7), 8e-3))
+    assert len(searched) == 8
