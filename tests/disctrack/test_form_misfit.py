@@ -1,5 +1,8 @@
 """Sigmas that know of a law's form being another than the truth's, and slip that is not followed for ever."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -7,7 +10,7 @@ from numpy.testing import assert_allclose
 from disctrack.diagnosis.disc import form_misfit
 from disctrack.diagnosis.disc.system import Patience
 from disctrack.diagnosis.engine.system import GivenUp
-from disctrack.rolling import Model, sensitivities, steady_precession
+from disctrack.rolling import Model, sensitivities, simulate, steady_precession
 from disctrack.scene.description import Scene
 
 
@@ -34,6 +37,19 @@ def test_the_size_of_a_misfit_is_read_from_the_residual(rng):
     some = form_misfit._second_moment(B, noise + 0.1 * B @ rng.standard_normal(60))[1]
     assert none < 0.003
     assert some == pytest.approx(0.1, rel=0.3)
+
+
+def test_the_moment_of_a_law_of_the_air_is_that_of_the_air_of_the_recording():
+    """In a third of the air, a third of the moment on the same motion."""
+    disc = Scene().declared_disc
+    thick = Model(disc, air_density=1.2).with_values({"air_quadratic.a": 0.5})
+    motion = simulate(thick, steady_precession(np.radians(14.0), disc), times=np.linspace(0.0, 0.1, 10))
+    moments = [
+        form_misfit.moment_about_contact(SimpleNamespace(disc=disc, model_with=lambda _, m=model: m), {}, motion)
+        for model in (thick, replace(thick, air_density=0.4))
+    ]
+    assert np.abs(moments[0]).max() > 1e-8
+    assert_allclose(moments[1], moments[0] / 3, rtol=1e-12)
 
 
 def test_slip_that_takes_too_long_is_not_followed():

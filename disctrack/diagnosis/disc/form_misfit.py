@@ -42,7 +42,7 @@ def moment_about_contact(system: DiscSystem, values: Values, motion: Motion, onl
     A sharp edge on a flat table, as the arm goes.   only : the effect of this name
     """
     model = system.model_with(values)
-    k = kinematics(motion.q, motion.qdot, system.disc, model.gravity, motion.time)
+    k = kinematics(motion.q, motion.qdot, system.disc, model.gravity, motion.time, model.air_density)
     r, h = system.disc.radius, system.disc.half_thickness
     s, c = np.sin(motion.q[:, 4]), np.cos(motion.q[:, 4])
     arm = np.stack([0.0 * s, h * s - r * c, -r * s - h * c], axis=1)
