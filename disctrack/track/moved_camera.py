@@ -1,21 +1,22 @@
 """A camera that was moved or turned after its calibration, from images in which no disc is found for that reason.
 
-Each camera alone still sees the dots as declared. From blobs in a few pairs, one pose for each pair and one turn and
-shift of the right camera for all are fitted: to a tenth of a degree and a millimetre or two, as the two make up for
-each other; enough to say what happened.
+Each camera alone still sees the dots as declared. From blobs in some pairs, one pose for each pair and one turn and
+shift of the right camera for all are fitted (`as_printed`, with a rig of which nothing else is open): to a tenth of a
+degree and a millimetre or two, as the two make up for each other; enough to say what happened.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
 from calibration.camera import N_RIG, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import vector_from_rotation
 from disctrack.track.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
-from disctrack.track.as_printed import shared_normal_equations
+from disctrack.track.as_printed import MIN_FRAMES, refine_as_built
 from disctrack.track.pose import fit_poses
 
 BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
@@ -23,45 +24,42 @@ TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without an
 MOST_SIGMAS = 4.0  # beyond, it is something else
 FITS_PX = 1.0  # rms of blobs about the fit
 BETTER = 3.0  # times, than with the camera where it was
-ITERATIONS = 8
-_POSE = slice(18, 24)  # of RIG_PARAMETERS: the right camera's turn and shift
+_POSE = np.arange(18, 24)  # of RIG_PARAMETERS: the right camera's turn and shift
 
 
 def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
     """How the right camera moved against the left one, in words; "" where that does not explain what is seen.
 
-    pairs : (n, 2, height, width), from all over the recording
+    pairs : (n, 2, height, width), from all over the recording; fewer than MIN_FRAMES with dots tell nothing
     """
     diameters = expected_diameter_px(rig, disc)
     seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
     pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
     good = np.isfinite(pixels).all(-1).sum(axis=2).min(axis=1, initial=disc.n_markers) >= MIN_EXPLAINED
-    if not good.any():
+    if good.sum() < MIN_FRAMES:
         return ""
     pixels = pixels[good]
     R, t = (np.array([pair[0][k] for pair in seen])[good] for k in (1, 2))
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2))
-    free = np.isin(np.arange(N_RIG + 2 * disc.n_markers), np.arange(N_RIG)[_POSE])
-    prior = np.diag(np.repeat([TURN**-2, SHIFT**-2], 3))
     left_alone = np.where(np.arange(2)[:, None, None] == 0, pixels, np.nan)
-    moved, rms = rig, []
-    for observed in (left_alone, *[pixels] * ITERATIONS):
-        fits = fit_poses(
-            observed, covariance, moved, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
-        )
-        R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
-        t = np.where(fits.converged[:, None], fits.t_world_body, t)
-        if not fits.used.any():
-            return ""
-        if observed is left_alone:
-            continue
-        rms.append(float(np.sqrt(np.mean(fits.residuals_px[fits.used] ** 2))))
-        normal, gradient = shared_normal_equations(observed, covariance, fits.used, moved, disc, R, t, free)
-        step = np.zeros(N_RIG)
-        step[_POSE] = np.linalg.solve(normal + prior, gradient - prior @ _motion(rig, moved))
-        moved = moved.perturbed(step)
-    motion = _motion(rig, moved)
-    turn, shift = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
+    began = fit_poses(
+        left_alone, covariance, rig, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
+    )
+    free = np.zeros((N_RIG, N_RIG))
+    free[_POSE, _POSE] = np.repeat([TURN**2, SHIFT**2], 3)
+    found = refine_as_built(
+        pixels,
+        covariance,
+        replace(rig, covariance=free),
+        disc,
+        began.R_world_body,
+        began.t_world_body,
+        refine_markers=False,
+        refine_rig=True,
+    )
+    rms = BLOB_PX * np.sqrt([found.reduced_chi_square_before, found.reduced_chi_square_after])
+    turn = np.linalg.norm(vector_from_rotation(found.rig.R_right_left @ rig.R_right_left.T))
+    shift = np.linalg.norm(found.rig.t_right_left - rig.t_right_left)
     if not (rms[-1] < FITS_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS):
         return ""
     return (
@@ -69,9 +67,3 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
         f"the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
         f"{rms[0]:.1f} as calibrated); calibrate again"
     )
-
-
-def _motion(before: StereoRig, after: StereoRig) -> Array:
-    """(6,) turn [rad] and shift [m] of the right camera, as RIG_PARAMETERS have them."""
-    turn = vector_from_rotation(after.R_right_left @ before.R_right_left.T)
-    return np.concatenate([turn, after.t_right_left - before.t_right_left])

@@ -47,7 +47,7 @@ from disctrack.trajectory import FrameStatus
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
 MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
-PAIRS_TRIED = 5  # where no disc is found, for what else is wrong
+PAIRS_TRIED = 12  # where no disc is found, for what else is wrong: some more than the refinement of a rig takes
 STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 

@@ -196,13 +196,13 @@ def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion)
 
 
 def test_no_camera_is_said_to_have_moved_where_none_did(clip):
-    assert moved_camera(clip.images[[0, 20, 40]], clip.rig, clip.disc) == ""
+    assert moved_camera(clip.images[::4], clip.rig, clip.disc) == ""
 
 
 def test_blobs_at_random_are_no_disc_of_any_kind(clip, rng):
     """Neither a camera that moved nor other dots are read into pictures of something else."""
     for _ in range(15):
-        pairs = np.full((3, 2, 272, 272), 190, np.uint8)
+        pairs = np.full((12, 2, 272, 272), 190, np.uint8)
         for image in pairs.reshape(-1, 272, 272):
             for _ in range(rng.integers(0, 12)):
                 place, size = ([int(v) for v in rng.integers(low, high, 2)] for low, high in ((0, 272), (2, 30)))
