@@ -121,10 +121,12 @@ def assemble(
     )
     fits.covariance[...] *= verdicts.factor[:, None, None]
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
-    placed = _by_pattern(as_built, fits.R_world_body)
-    systematic += placed
+    if pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)[0] > 0:
+        for first_row in range(0, len(systematic), FITTED_AT_ONCE):
+            rows = slice(first_row, first_row + FITTED_AT_ONCE)
+            systematic[rows] += _by_pattern(as_built, fits.R_world_body[rows])
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
-    shared = _shared_sigma(fits, systematic, placed, rig)
+    shared = _shared_sigma(fits, systematic, as_built, rig)
     as_built = replace(as_built, rig=rig)
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
     warnings = warnings_of(first, factor, faults, scatter, table, trajectory)
@@ -216,13 +218,16 @@ def _by_pattern(as_built: AsBuilt, R: Array) -> Array:
     return np.asarray(J * [place, place, turn] @ J.swapaxes(1, 2))
 
 
-def _shared_sigma(fits: PoseFits, systematic: Array, placed: Array, rig: StereoRig) -> tuple[tuple[float, str], ...]:
+def _shared_sigma(
+    fits: PoseFits, systematic: Array, as_built: AsBuilt, rig: StereoRig
+) -> tuple[tuple[float, str], ...]:
     """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what."""
     rows = np.flatnonzero(fits.converged & np.isfinite(systematic).all(axis=(1, 2)))
     if not rows.size:
         return ()
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(SHARED_FRAMES, len(rows))).astype(int))]
-    whole, by_pattern = (np.mean(np.diagonal(part[rows], axis1=1, axis2=2), axis=0) for part in (systematic, placed))
+    parts = systematic[rows], _by_pattern(as_built, fits.R_world_body[rows])
+    whole, by_pattern = (np.mean(np.diagonal(part, axis1=1, axis2=2), axis=0) for part in parts)
     further = {"what repeats in the dots": whole - by_pattern, "where the dots are on the disc": by_pattern}
     sigma, most = causes(rig, fits.sensitivity[rows], further)
     return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
