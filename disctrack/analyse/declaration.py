@@ -56,7 +56,7 @@ MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not
 SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
 ALIKE = 0.2  # radii by the rates and by the rim: the balance of moments is not quite in proportion to the radius
-DENSITIES = 50.0, 23e3  # [kg/m^3] half of cork's, and osmium's
+DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _radius_suspected(trajectory: Trajectory, ratio: float) -> Suspect:
 
 
 def density(disc: Disc) -> tuple[Finding, ...]:
-    """A disc lighter than cork or heavier than osmium: mass, radius or thickness is in another unit."""
+    """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in another unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
     if DENSITIES[0] < found < DENSITIES[1]:
         return ()

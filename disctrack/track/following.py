@@ -180,10 +180,7 @@ class Follower:
     measured: bool = False  # blur and noise known
     acquisitions: int = 0
     first_reason: str = ""
-    saturated: tuple[int | None, int | None] = (
-        None,
-        None,
-    )  # grey value at which the brighter side of the dots' edges is clipped
+    saturated: tuple[int | None, int | None] = (None, None)  # grey value at which the dots' brighter side is clipped
     given: Callable[[], Law | None] = lambda: None  # noise and blur that an earlier stretch has measured
     told: Future[Law | None] = field(default_factory=Future)  # what this stretch measured; None if it did not
     first_row: int | None = None  # of the tables

@@ -231,9 +231,7 @@ def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
     good = fits.converged[near].all(axis=1)
     for some in np.array_split(rows[good], len(rows) // _AT_ONCE + 1):
         near = some[:, None] + offsets
-        turn = vector_from_rotation(
-            R[near] @ np.swapaxes(R[near[:, :1]], 2, 3)
-        )  # from the first: they differ by little
+        turn = vector_from_rotation(R[near] @ np.swapaxes(R[near[:, :1]], 2, 3))  # by little, from the first
         away = np.einsum("k,nki->ni", weight, np.concatenate([t[near], turn], axis=2))
         spread = np.einsum("k,nkij->nij", weight**2, C[near])
         square[some] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])

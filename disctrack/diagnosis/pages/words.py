@@ -34,9 +34,8 @@ def quantity_text(value: float, sigma: float, unit: str) -> str:
         return f"{value:.4g}{unit}"
     digits = int(max(0, 1 - np.floor(np.log10(sigma))))
     if digits > 7 or abs(value) >= 1e6:
-        places = (
-            int(np.floor(np.log10(max(abs(value), sigma))) - np.floor(np.log10(sigma))) + 2
-        )  # down to sigma's second
+        powers = [np.floor(np.log10(number)) for number in (max(abs(value), sigma), sigma)]
+        places = int(powers[0] - powers[1]) + 2  # down to sigma's second
         return f"({value:.{places}g} +- {sigma:.2g}){unit}"
     return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
 
