@@ -1,6 +1,7 @@
 """Write the intermediate code that ships with the packages (`calibration.compiled`): python tests/ship_compiled.py
 
 To be run whenever one of these functions, numba or Python changes; until then they are compiled on the user's machine.
+Files that were made from the present sources, by the present programs, are left alone.
 What ships is what numba hands to LLVM: all that a function calls is in it, and nothing is optimised, as that is done
 for one machine.
 """
@@ -21,7 +22,7 @@ from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, no
 from disctrack.readers import _png
 from disctrack.rolling import equations, integrate
 from disctrack.rolling._compiled import system_types
-from disctrack.track import _kernels, dots, following
+from disctrack.track import _kernels, _pose_kernel, dots, following, pose
 
 PREPARED = (
     (_corner_kernel.fit_corners, corner_fit.prepare),
@@ -31,6 +32,7 @@ PREPARED = (
     (_kernels.track_frames, lambda: following.prepare(np.uint16)),
     (_kernels.look, lambda: dots.prepare(np.uint8)),
     (_kernels.look, lambda: dots.prepare(np.uint16)),
+    (_pose_kernel.fit, pose.prepare),
     (integrate._dop853, lambda: integrate.prepare(float)),
     (integrate._dop853, lambda: integrate.prepare(complex)),
 )
@@ -92,6 +94,19 @@ def unoptimised(found):
         library._optimize_final_module, library._finalize_final_module, jit.set_env = optimise, finalise, set_env
 
 
+def is_present(function, n):
+    """True where the n files of the function, or more, were made from the present sources, by this Python and numba."""
+    stamp = compiled._ShippedOrKept(function)._impl.locator.get_source_stamp()
+    made = [pickle.loads(gzip.decompress(file.read_bytes())) for file in files_of(function)]
+    *_, platform, python, version = compiled.made_for("", "")
+    return len(made) >= n and all((m[0], *m[2:]) == (stamp, platform, python, version) for m in made)
+
+
+def files_of(function):
+    """Those that ship of it, for whatever types."""
+    return list(compiled.AHEAD.glob(f"{function.__module__}.{function.__qualname__}-*.gz"))
+
+
 def ship(dispatcher, prepare):
     """Compile a function for the types that `prepare` calls it with, and write the files."""
     dispatcher._cache.disable()
@@ -127,9 +142,13 @@ def write(cache, function, sig, result, found):
 
 if __name__ == "__main__":
     compiled.AHEAD.mkdir(exist_ok=True)
-    for old in compiled.AHEAD.iterdir():
+    asked = [dispatcher.py_func for dispatcher, _ in PREPARED] + [function for function, _ in CALLBACKS]
+    kept = {function for function in asked if is_present(function, asked.count(function))}
+    for old in set(compiled.AHEAD.iterdir()).difference(*map(files_of, kept)):
         old.unlink()
     for dispatcher, prepare in PREPARED:
-        ship(dispatcher, prepare)
+        if dispatcher.py_func not in kept:
+            ship(dispatcher, prepare)
     for function, scalar in CALLBACKS:
-        ship_callback(function, system_types(scalar))
+        if function not in kept:
+            ship_callback(function, system_types(scalar))

@@ -13,7 +13,7 @@ from disctrack.readers import _png as png
 from disctrack.rolling import integrate
 from disctrack.track import _kernels as kernels
 from disctrack.track import dots
-from disctrack.track.following import prepare
+from disctrack.track.tracking import prepare
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -210,6 +210,18 @@ def _edge_profile(z):
 
 
 @_part
+def _conic(G, gentlest, steepest, longest, shortest):
+    """The form (xx, xy, yy), 1 on the ellipse of these semi-axes along those of G^T G; singular values of G given."""
+    xx, yy = G[0, 0] * G[0, 0] + G[1, 0] * G[1, 0], G[0, 1] * G[0, 1] + G[1, 1] * G[1, 1]
+    xy = G[0, 0] * G[0, 1] + G[1, 0] * G[1, 1]
+    apart = steepest * steepest - gentlest * gentlest
+    along, across = 1.0 / (longest * longest), 1.0 / (shortest * shortest)
+    slope = (across - along) / apart if apart > 1e-9 * steepest * steepest else 0.0
+    level = across - slope * steepest * steepest
+    return slope * xx + level, slope * xy, slope * yy + level
+
+
+@_part
 def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, unit, steepest, p, u0, v0, pixels):
     """Fill the first rows of pixels with those in a band round the edge; returns number, mean grey in and outside.
 
@@ -219,17 +231,18 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     band = 3.0 * p[SIGMA] + 1.0
     shift_x, shift_y, radius = _f(p[A]), _f(p[B]), _f(p[RADIUS])
     outer = p[RADIUS] + band * steepest
-    inner = max(p[RADIUS] - 1.4 * (band + 1.0) * steepest, 0.0)
-    # Of each row the pixels between two ellipses, those of the linear map: its scale changes over the window, and a
-    # pixel is one more in doubt. In the ring of both nothing is decided by branches, so that it is vector code.
-    far = math.hypot(x_hi - x_lo, y_hi - y_lo)
-    doubt = 0.05 * far * math.hypot(G[2, 0], G[2, 1])
-    outer_row = outer * (1.0 + doubt) + steepest
-    inner_row = max(inner * (1.0 - doubt) - steepest, 0.0)
-    xx, xy, yy = (
-        G[0, 0] * G[0, 0] + G[1, 0] * G[1, 0],
-        G[0, 0] * G[0, 1] + G[1, 0] * G[1, 1],
-        G[0, 1] * G[0, 1] + G[1, 1] * G[1, 1],
+    # Of each row the pixels between two ellipses, longer and shorter by the band than the dot's own, by the linear map:
+    # its scale changes over the window, and a pixel is one more in doubt. In the ring of both nothing is decided by
+    # branches, so that it is vector code.
+    doubt = 0.05 * math.hypot(x_hi - x_lo, y_hi - y_lo) * math.hypot(G[2, 0], G[2, 1])
+    gentlest = abs(G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]) / steepest
+    longest, shortest = p[RADIUS] / gentlest, p[RADIUS] / steepest
+    more, less = band + 1.0, band + 2.0
+    rim_xx, rim_xy, rim_yy = _conic(
+        G, gentlest, steepest, longest * (1.0 + doubt) + more, shortest * (1.0 + doubt) + more
+    )
+    hole_xx, hole_xy, hole_yy = _conic(
+        G, gentlest, steepest, max(longest * (1.0 - doubt) - less, 0.1), max(shortest * (1.0 - doubt) - less, 0.1)
     )
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
@@ -237,20 +250,20 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     n = 0
     for y in range(y_lo, y_hi + 1):
         dy = y - v0
-        middle = u0 - xy / xx * dy
-        across = (xy * xy - xx * yy) * dy * dy
-        reach2, hole2 = across + xx * outer_row * outer_row, across + xx * inner_row * inner_row
+        reach2 = (rim_xy * rim_xy - rim_xx * rim_yy) * dy * dy + rim_xx
+        hole2 = (hole_xy * hole_xy - hole_xx * hole_yy) * dy * dy + hole_xx
         if reach2 < 0.0:
             continue
-        reach, hole = math.sqrt(reach2) / xx, math.sqrt(max(hole2, 0.0)) / xx
+        middle, hole_middle = u0 - rim_xy / rim_xx * dy, u0 - hole_xy / hole_xx * dy
+        reach, hole = math.sqrt(reach2) / rim_xx, math.sqrt(max(hole2, 0.0)) / hole_xx
         first, end = max(int(math.ceil(middle - reach)), x_lo), min(int(middle + reach) + 1, x_hi + 1)
         for part in range(2):
             if hole2 <= 0.0:
                 lo, hi = (first, end) if part == 0 else (end, end)
             elif part == 0:
-                lo, hi = first, min(int(math.ceil(middle - hole)), end)
+                lo, hi = first, min(int(math.ceil(hole_middle - hole)), end)
             else:
-                lo, hi = max(int(middle + hole) + 1, first), end
+                lo, hi = max(int(hole_middle + hole) + 1, first), end
             if lo >= hi:
                 continue
             # views, for an index that is a sum might be negative, and is looked at one by one
@@ -488,12 +501,22 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
         if not rejected:
             damping = max(0.03 * damping, 1e-9)
         last, rejected = chi2, False
-        for j in range(9):  # the last row is the right-hand side, J^T W r
-            for k in range(min(j + 1, 8)):
-                total = _0
+        for j in range(0, 8, 2):  # two by two: what is loaded serves twice
+            row, next_row = pixels[_JACOBIAN + j], pixels[_JACOBIAN + j + 1]
+            for k in range(0, j + 1, 2):
+                column, next_column = pixels[_JACOBIAN + k], pixels[_JACOBIAN + k + 1]
+                a, b, c, d = _0, _0, _0, _0
                 for i in range(n):
-                    total += pixels[_JACOBIAN + j, i] * pixels[_JACOBIAN + k, i]
-                work[j, k] = total
+                    a += row[i] * column[i]
+                    b += row[i] * next_column[i]
+                    c += next_row[i] * column[i]
+                    d += next_row[i] * next_column[i]
+                M[j, k], M[j, k + 1], M[j + 1, k], M[j + 1, k + 1] = a, b, c, d
+            a, b = _0, _0
+            for i in range(n):
+                a += row[i] * pixels[_RESIDUAL, i]
+                b += next_row[i] * pixels[_RESIDUAL, i]
+            rhs[j], rhs[j + 1] = a, b
         if blurred:
             M[RADIUS, RADIUS] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
             rhs[RADIUS] += (radius - p[RADIUS]) / (_RADIUS_PRIOR * radius) ** 2

@@ -21,7 +21,7 @@ from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.least_squares import step_to_minimum
 from disctrack.track.own_scatter import SharedFaults, split_scatter, without_shared_faults
-from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
+from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.slips import slips_in_words
 from disctrack.track.table_contact import TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -168,13 +168,14 @@ def _outlying(tables: Tables, rig: StereoRig, disc: Disc) -> Mask:
     residuals = np.full(tables.pixels.shape, np.nan)
     for first in range(0, n, FITTED_AT_ONCE):
         rows = slice(first, first + FITTED_AT_ONCE)
-        pixels, J = marker_pixels(tables.R[rows], tables.t[rows], rig, disc.marker_centres_body)
-        W = whitening(tables.covariance_px2[rows])
-        residual = (W @ (tables.pixels[rows] - pixels)[..., None])[..., 0]
-        known: Mask = np.asarray(np.isfinite(residual).all(-1))
-        known &= np.isfinite(tables.covariance_px2[rows]).all((-1, -2))
-        r = np.where(known[..., None], residual, 0.0)
-        J = np.where(known[..., None, None], W @ J, 0.0)
+        r, J, known = misses(
+            tables.pixels[rows],
+            tables.covariance_px2[rows],
+            rig,
+            disc.marker_centres_body,
+            tables.R[rows],
+            tables.t[rows],
+        )
         step = step_to_minimum(r.reshape(len(r), -1), J.reshape(len(J), -1, 6))
         residuals[rows] = np.where(known[..., None], r - (J @ step[:, None, None, :, None])[..., 0], np.nan)
     return outlying_frames(residuals)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calibration.arrays import Array, Image
-from calibration.camera import Camera, normalise, project
+from calibration.camera import Camera, normalised_maps, project
 from calibration.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
 from disctrack.track import _kernels as kernels
@@ -82,15 +82,6 @@ class DotCentres:
     radius: Array  # (m,) fitted radius, plane units
     level: Array  # (m,) grey value beside the dot
     contrast: Array  # (m,) 1 - dark / light
-
-
-def normalised_maps(camera: Camera) -> tuple[Array, Array]:
-    """Undistorted normalised coordinates x, y of every pixel, each (height, width); made once per camera."""
-    width, height = camera.image_size
-    grid = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
-    ab = normalise(grid, camera)
-    # pixels beyond the fold of a distortion polynomial have no ray; the kernels skip windows that touch them
-    return np.ascontiguousarray(ab[..., 0]), np.ascontiguousarray(ab[..., 1])
 
 
 def face_edge(disc: Disc) -> float:

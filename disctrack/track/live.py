@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Image, Mask
-from calibration.camera import StereoRig
+from calibration.camera import StereoRig, normalised_maps
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.track.assembly import MIN_GOOD_DOT_IMAGES, TrackingSettings
-from disctrack.track.dots import dot_centres, normalised_maps
+from disctrack.track.dots import dot_centres
 from disctrack.track.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
 from disctrack.track.tracking import check_images

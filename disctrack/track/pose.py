@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig, project_with_slopes
-from disctrack import frames
-from disctrack.track.least_squares import BatchFit, State, levenberg_marquardt
+from calibration.camera import StereoRig
+from disctrack.track import _pose_kernel as kernel
 
 MIN_DOTS = 3  # six unknowns, two numbers per dot
 # A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
 # chance alone does it once in 3e5 dots.
 OUTLIER_CHI_SQUARE = 25.0
 MAX_REJECTED = 4
+TOLERANCE = 1e-3  # standard deviations: the Gauss-Newton step at which a pose has converged
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,68 @@ class PoseFits:
 def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tuple[Array, Array]:
     """Images of the dots' centres (n, 2, m, 2) and their derivative (n, 2, m, 2, 6) by POSE_COMPONENTS.
 
-    R (n, 3, 3), t (n, 3): body -> world; centres_body (m, 3).
+    R (n, 3, 3), t (n, 3): body -> world; centres_body (m, 3). NaN behind a camera.
     """
-    arm = centres_body @ np.swapaxes(R, 1, 2)  # (n, m, 3)
-    pixels, jacobians = [], []
-    for camera, (R_cw, t_cw) in zip(rig.cameras, rig.camera_poses(), strict=True):
-        view, d_camera = project_with_slopes((arm + t[:, None]) @ R_cw.T + t_cw, camera)
-        d_world = d_camera @ R_cw
-        jacobians.append(np.concatenate([d_world, np.cross(arm[..., None, :], d_world)], axis=-1))
-        pixels.append(view)
-    return np.stack(pixels, axis=1), np.stack(jacobians, axis=1)
+    n, shape = len(R), (len(R), 2, len(centres_body))
+    pixels, J = np.empty((*shape, 2)), np.empty((*shape, 2, 6))
+    identity, used = np.tile(np.eye(2), (*shape, 1, 1)), np.ones(shape, bool)
+    _fit(np.arange(n), np.zeros((*shape, 2)), identity, used, rig, centres_body, -1.0, np.array(R, float),
+         np.array(t, float), np.empty(n, bool), pixels, np.empty_like(pixels), J)  # fmt: skip
+    return pixels, J
+
+
+def misses(
+    markers_px: Array, markers_covariance_px2: Array, rig: StereoRig, centres_body: Array, R: Array, t: Array
+) -> tuple[Array, Array, Mask]:
+    """By what n poses miss their dots, in sigmas (n, 2, m, 2), its slopes (n, 2, m, 2, 6), and which dots tell so.
+
+    Shapes as in `fit_poses`; (n, 2, m) of the last. Zeros where a dot was not seen, or where there is no pose.
+    """
+    known: Mask = np.asarray(np.isfinite(markers_px).all(-1))
+    known &= np.isfinite(markers_covariance_px2).all((-1, -2))
+    posed = np.asarray(np.isfinite(R).all((1, 2)))
+    known &= (posed & np.isfinite(t).all(1))[:, None, None]
+    observed, covariance = np.ascontiguousarray(markers_px), np.ascontiguousarray(markers_covariance_px2)
+    pixels, residuals, J = np.empty(observed.shape), np.empty(observed.shape), np.empty((*observed.shape, 6))
+    _fit(np.arange(len(R)), observed, covariance, known, rig, centres_body, -1.0, np.array(R, float),
+         np.array(t, float), np.empty(len(R), bool), pixels, residuals, J)  # fmt: skip
+    return residuals, J, known
+
+
+def _fit(
+    rows: NDArray[np.intp],
+    observed: Array,
+    covariance: Array,
+    used: Mask,
+    rig: StereoRig,
+    centres_body: Array,
+    tolerance: float,
+    *filled: NDArray,
+) -> None:
+    """`_pose_kernel.fit` with the rig's numbers."""
+    poses = rig.camera_poses()
+    kernel.fit(
+        rows,
+        observed,
+        covariance,
+        used,
+        np.stack([camera.parameters for camera in rig.cameras]),
+        np.stack([R for R, _ in poses]),
+        np.stack([t for _, t in poses]),
+        np.ascontiguousarray(centres_body, float),
+        tolerance,
+        *filled,
+    )
+
+
+def prepare() -> None:
+    """Compile the loop over poses, or load it."""
+    zeros = np.zeros
+    kernel.fit(
+        zeros(0, int), zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2, 2)), zeros((0, 2, 1), bool), zeros((2, 9)),
+        zeros((2, 3, 3)), zeros((2, 3)), zeros((1, 3)), TOLERANCE, zeros((0, 3, 3)), zeros((0, 3)), zeros(0, bool),
+        zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2, 6)),
+    )  # fmt: skip
 
 
 def whitening(covariance: Array) -> Array:
@@ -95,40 +147,34 @@ def fit_poses(
     possible = np.asarray(np.isfinite(R_start).all((1, 2)))
     possible &= np.isfinite(t_start).all(1)
     used = seen & possible[:, None, None]
-    W = whitening(np.where(seen[..., None, None], markers_covariance_px2, np.eye(2)))
     observed = np.where(seen[..., None], markers_px, 0.0)
-    R = np.where(possible[:, None, None], R_start, _safe_rotation(R_start, possible))
-    t = np.where(possible[:, None], t_start, _safe_translation(t_start, possible))
-    if not possible.any():
-        return _empty(n, markers_px.shape[2], seen)
-
-    rows = np.arange(n)
+    weighted = np.ascontiguousarray(markers_covariance_px2, float)
+    R, t = np.array(R_start, float, order="C"), np.array(t_start, float, order="C")
     converged = np.zeros(n, bool)
+    pixels, whitened, JW = np.full(observed.shape, np.nan), np.zeros(observed.shape), np.zeros((*observed.shape, 6))
+    rows = np.flatnonzero(possible)
     for _ in range(MAX_REJECTED + 1):
-        fit = _minimise(observed[rows], W[rows], used[rows], rig, centres_body, R[rows], t[rows])
-        R[rows], t[rows] = fit.state
-        converged[rows] = fit.converged
+        _fit(rows, observed, weighted, used, rig, centres_body, TOLERANCE, R, t, converged, pixels, whitened, JW)
         if not reject_outliers:
             break
-        worst = _worst_dot(observed, W, used, rig, centres_body, R, t, rows)
-        rows = worst
+        rows = _strike_worst_dot(whitened, JW, used, rows)
         if rows.size == 0:
             break
 
-    pixels, J = marker_pixels(R, t, rig, centres_body)
-    enough = used.sum((1, 2)) >= MIN_DOTS
-    JW = np.where(used[..., None, None], W @ J, 0.0).reshape(n, -1, 6)
-    normal = np.swapaxes(JW, 1, 2) @ JW
-    good = enough & converged & (np.linalg.cond(np.where(enough[:, None, None], normal, np.eye(6))) < 1e16)
+    JW = JW.reshape(n, -1, 6)
+    good = (used.sum((1, 2)) >= MIN_DOTS) & converged
+    normal = np.swapaxes(JW[good], 1, 2) @ JW[good]
+    regular = np.linalg.cond(normal, 1) < 1e16
+    good[good] = regular
     covariance = np.full((n, 6, 6), np.nan)
-    covariance[good] = np.linalg.inv(normal[good])
+    covariance[good] = np.linalg.inv(normal[regular])
     residuals = np.where(seen[..., None], observed - pixels, np.nan)
-    whitened = np.where(used[..., None], (W @ (observed - pixels)[..., None])[..., 0], 0.0)
     sensitivity = np.full((n, 6, 30), np.nan)
     if with_sensitivity and good.any():
         for block in np.array_split(np.flatnonzero(good), max(1, good.sum() // 512)):
             _, _, d_rig = rig.project_with_jacobians(centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None])
-            DW = np.where(used[block][..., None, None], W[block] @ d_rig, 0.0).reshape(len(block), -1, 30)
+            W = whitening(np.where(used[block][..., None, None], markers_covariance_px2[block], 0.0))
+            DW = (W @ d_rig).reshape(len(block), -1, 30)
             sensitivity[block] = -covariance[block] @ (np.swapaxes(JW[block], 1, 2) @ DW)
     return PoseFits(
         R_world_body=np.where(good[:, None, None], R, np.nan),
@@ -143,43 +189,19 @@ def fit_poses(
     )
 
 
-def _minimise(observed: Array, W: Array, used: Mask, rig: StereoRig, centres: Array, R: Array, t: Array) -> BatchFit:
-    n = len(observed)
+def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Strike the worst outlier of each of the rows from `used`; returns the rows that must be fitted again.
 
-    def evaluate(state: State) -> tuple[Array, Array]:
-        pixels, J = marker_pixels(state[0], state[1], rig, centres)
-        residual = np.where(used[..., None], (W @ (observed - pixels)[..., None])[..., 0], 0.0)
-        jacobian = np.where(used[..., None, None], W @ J, 0.0)
-        return residual.reshape(n, -1), jacobian.reshape(n, -1, 6)
-
-    def retract(state: State, step: Array) -> State:
-        return frames.rotation_from_vector(step[:, 3:]) @ state[0], state[1] + step[:, :3]
-
-    return levenberg_marquardt(evaluate, retract, (R, t))
-
-
-def _worst_dot(
-    observed: Array,
-    W: Array,
-    used: Mask,
-    rig: StereoRig,
-    centres: Array,
-    R: Array,
-    t: Array,
-    rows: NDArray[np.intp],
-) -> NDArray[np.intp]:
-    """Strike the worst outlier of each of the rows from `used`; returns the rows that must be fitted again."""
-    pixels, J = marker_pixels(R[rows], t[rows], rig, centres)
+    residual (n, 2, m, 2), JW (n, 2, m, 2, 6): whitened, zeros for dots that are not used
+    """
     count = used[rows].sum((1, 2))
-    residual = np.where(used[rows][..., None], (W[rows] @ (observed[rows] - pixels)[..., None])[..., 0], 0.0)
-    chi_square = np.sum(residual**2, axis=(1, 2, 3))
+    chi_square = np.sum(residual[rows] ** 2, axis=(1, 2, 3))
     # a dot's part is at most the whole: of other frames none can be an outlier
     far = np.flatnonzero((chi_square > 2 * OUTLIER_CHI_SQUARE) & (count > MIN_DOTS + 1))
     if not len(far):
         return rows[far]
     rows, chi_square, count = rows[far], chi_square[far], count[far]
-    residual = residual[far].reshape(len(far), -1, 2)
-    JW = np.where(used[rows][..., None, None], W[rows] @ J[far], 0.0).reshape(len(rows), -1, 2, 6)
+    residual, JW = residual[rows].reshape(len(rows), -1, 2), JW[rows].reshape(len(rows), -1, 2, 6)
     normal = np.einsum("ndij,ndik->njk", JW, JW)
     possible = np.linalg.cond(normal) < 1e16
     inverse = np.linalg.inv(np.where(possible[:, None, None], normal, np.eye(6)))
@@ -196,26 +218,3 @@ def _worst_dot(
     struck = possible & (largest > 2 * OUTLIER_CHI_SQUARE * usual)
     used.reshape(len(used), -1)[rows[struck], worst[struck]] = False
     return rows[struck]
-
-
-def _safe_rotation(R: Array, possible: Mask) -> Array:
-    return R[np.argmax(possible)] if possible.any() else np.eye(3)
-
-
-def _safe_translation(t: Array, possible: Mask) -> Array:
-    return t[np.argmax(possible)] if possible.any() else np.zeros(3)
-
-
-def _empty(n: int, m: int, seen: Mask) -> PoseFits:
-    nan = np.nan
-    return PoseFits(
-        np.full((n, 3, 3), nan),
-        np.full((n, 3), nan),
-        np.full((n, 6, 6), nan),
-        np.full((n, 6, 30), nan),
-        np.full((n, 2, m, 2), nan),
-        np.zeros_like(seen),
-        np.full(n, nan),
-        np.zeros(n, np.int64),
-        np.zeros(n, bool),
-    )

@@ -14,18 +14,18 @@ from threading import Event, Lock
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
+from calibration.camera import StereoRig, normalised_maps
 from calibration.grey_levels import mosaic_gains
 from calibration.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
+from disctrack.track import following, pose
 from disctrack.track.arrangement import arrangement_found
 from disctrack.track.assembly import Tracking, TrackingSettings, assemble
-from disctrack.track.dots import normalised_maps
 from disctrack.track.doubts import MOVED, ONE_SIDED
 from disctrack.track.following import (
     Follower,
@@ -38,7 +38,6 @@ from disctrack.track.following import (
     empty_tables,
     follow_block,
 )
-from disctrack.track.following import prepare as prepare
 from disctrack.track.moved_camera import moved_camera
 from disctrack.track.slips import LEFT_OUT
 from disctrack.track.unlike_declared import unlike_declared
@@ -75,6 +74,12 @@ class _Repaired:
     readable: Mask
 
 
+def prepare(dtype: DTypeLike = np.uint8) -> None:
+    """Compile the inner loops for images of this type, or load them: some seconds once per installation."""
+    following.prepare(dtype)
+    pose.prepare()
+
+
 def track(
     read_blocks: Callable[[int, int], Iterable[BlockOfPairs]],
     pairs: range,
@@ -108,7 +113,7 @@ def track(
         )
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
     tables = empty_tables(n, disc.n_markers)
-    with ThreadPoolExecutor(2) as pool:  # 0.1 s each
+    with ThreadPoolExecutor(2) as pool:
         maps = list(pool.map(normalised_maps, rig.cameras))
     maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
     edges = stretch_edges(pairs, disc)

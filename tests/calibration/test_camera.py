@@ -1,15 +1,18 @@
 """The camera model against OpenCV's, its derivatives against differences, its inverse against itself."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.camera import (
     N_RIG,
     Camera,
     StereoRig,
     normalise,
+    normalised_maps,
     project,
     project_with_jacobians,
     rotation_from_vector,
@@ -65,6 +68,24 @@ def test_a_point_behind_the_camera_has_no_image():
 
 def test_normalising_undoes_the_projection(points):
     assert_allclose(normalise(project(points, CAMERA), CAMERA), points[:, :2] / points[:, 2:], atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [(512, 512), (640, 48)])
+def test_maps_of_whole_images_are_the_pixels_own_coordinates(size):
+    wide = Camera(0.5 * size[0], 0.5 * size[0], 250.0, 20.0, (-0.2, 0.03, 1e-3, 1e-3, 0.0), size)
+    grid = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1)
+    for camera in (replace(CAMERA, image_size=size), wide):
+        maps = np.stack(normalised_maps(camera), axis=-1)
+        assert_allclose(maps, normalise(grid, camera), atol=1e-12)
+        assert_allclose(project(np.dstack([maps, np.ones(size[::-1])]), camera), grid, atol=1e-9)
+
+
+def test_maps_of_a_lens_that_folds_have_no_rays_beyond():
+    folding = Camera(300.0, 300.0, 256.0, 256.0, (-0.5, 0.0, 0.0, 0.0, 0.0), (512, 512))
+    x, _ = normalised_maps(folding)
+    y_px, x_px = np.mgrid[:512, :512]
+    r = np.hypot(x_px - 256, y_px - 256) / 300
+    assert_array_equal(np.isfinite(x)[abs(r - 0.5443) > 1e-4], (r < 0.5443)[abs(r - 0.5443) > 1e-4])
 
 
 def test_one_pixel_without_a_ray_does_not_spoil_the_others():

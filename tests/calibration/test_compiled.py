@@ -12,6 +12,7 @@ from calibration._normal_kernel import accumulate
 from disctrack.readers import _png
 from disctrack.rolling import equations, integrate
 from disctrack.track._kernels import look, track_frames
+from disctrack.track._pose_kernel import fit
 
 SHIPPED = {
     "fit_corners": (fit_corners.py_func, 1),
@@ -19,6 +20,7 @@ SHIPPED = {
     "_undo_filters": (_png._undo_filters.py_func, 2),
     "track_frames": (track_frames.py_func, 2),
     "look": (look.py_func, 2),
+    "fit": (fit.py_func, 1),
     "_dop853": (integrate._dop853.py_func, 2),
     "rates": (equations.rates, 2),
     "event_margins": (equations.event_margins, 2),

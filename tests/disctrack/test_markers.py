@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from calibration.camera import normalised_maps
 from disctrack import frames
 from disctrack.render import expected_disc, render_disc, rig_of
 from disctrack.scene.description import Scene
@@ -15,7 +16,6 @@ from disctrack.track.dots import (
     locate_on_disc,
     locate_on_plane,
     measure_noise,
-    normalised_maps,
 )
 from disctrack.trajectory import MarkerStatus
 from tests.disctrack.conftest import RenderedPairs, disc_on_table

@@ -1,0 +1,126 @@
+"""Compiled fit of many poses to their dots (numba): Levenberg-Marquardt, one frame after the other; see `pose`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from disctrack.track._kernels import _copy, _entry, _part, _project_point_jacobian, _rotate_from_left, _solve_in_place
+
+MAX_DAMPING = 1e10
+_MAX_ITERATIONS = 60
+# Rows of six: J^T J, J^T r, step; and those of a trial
+_MATRIX, _GRADIENT, _STEP, _WORK_ROWS = 6, 6, 7, 8
+
+
+@_part
+def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pixels, residual, jacobian, sums):
+    """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns their cost.
+
+    sums (7, 6): J^T J and J^T r.
+    """
+    J, row, arm, point = np.empty((2, 3)), np.empty((2, 6)), np.empty(3), np.empty(3)
+    for i in range(_GRADIENT + 1):
+        for j in range(6):
+            sums[i, j] = 0.0
+    cost = 0.0
+    for c in range(2):
+        for m in range(centres.shape[0]):
+            for i in range(3):
+                arm[i] = R[i, 0] * centres[m, 0] + R[i, 1] * centres[m, 1] + R[i, 2] * centres[m, 2]
+            for i in range(3):
+                point[i] = t_cw[c, i]
+                for j in range(3):
+                    point[i] += R_cw[c, i, j] * (arm[j] + t[j])
+            depth = point[2] if point[2] > 0.0 else np.nan
+            u, v = _project_point_jacobian(cameras[c], point[0], point[1], depth, J)
+            pixels[c, m, 0], pixels[c, m, 1] = u, v
+            for axis in range(2):
+                for i in range(3):
+                    row[axis, i] = J[axis, 0] * R_cw[c, 0, i] + J[axis, 1] * R_cw[c, 1, i] + J[axis, 2] * R_cw[c, 2, i]
+                row[axis, 3] = arm[1] * row[axis, 2] - arm[2] * row[axis, 1]
+                row[axis, 4] = arm[2] * row[axis, 0] - arm[0] * row[axis, 2]
+                row[axis, 5] = arm[0] * row[axis, 1] - arm[1] * row[axis, 0]
+            # W with W C W^T = 1, as `pose.whitening` has it; no weight where C is not a covariance
+            a, b = covariance[c, m, 0, 0], covariance[c, m, 0, 1]
+            remaining = covariance[c, m, 1, 1] - b * b / a
+            good = used[c, m] and a > 0.0 and 0.0 < remaining < np.inf
+            if not good:
+                for axis in range(2):
+                    residual[c, m, axis] = 0.0
+                    for i in range(6):
+                        jacobian[c, m, axis, i] = 0.0
+                continue
+            w00, w11 = 1.0 / math.sqrt(a), 1.0 / math.sqrt(remaining)
+            w10 = -b / a * w11
+            du, dv = observed[c, m, 0] - u, observed[c, m, 1] - v
+            residual[c, m, 0], residual[c, m, 1] = w00 * du, w10 * du + w11 * dv
+            for i in range(6):
+                jacobian[c, m, 0, i], jacobian[c, m, 1, i] = w00 * row[0, i], w10 * row[0, i] + w11 * row[1, i]
+            for axis in range(2):
+                r = residual[c, m, axis]
+                cost += r * r
+                for i in range(6):
+                    slope = jacobian[c, m, axis, i]
+                    sums[_GRADIENT, i] += slope * r
+                    for j in range(i + 1):
+                        sums[i, j] += slope * jacobian[c, m, axis, j]
+    return cost
+
+
+@_entry
+def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, tolerance, R, t, converged, pixels, residuals,
+        jacobian):  # fmt: skip
+    """Fit the poses of some rows (k,) of n frames, from R (n, 3, 3), t (n, 3) on, which are moved to the minimum.
+
+    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras (2, 9). Marquardt 1963, with Nielsen-like
+    damping; a pose has converged when its Gauss-Newton step is shorter than `tolerance` standard deviations of its own
+    parameters, sqrt(step^T J^T J step); a negative tolerance leaves it where it is. Filled: converged (n,), pixels
+    (n, 2, m, 2) of all dots, NaN behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian
+    (n, 2, m, 2, 6), both whitened, with zeros for dots that are not used.
+    """
+    shape = residuals.shape[1:]
+    trial_pixels, trial_residuals, trial_jacobian = np.empty(shape), np.empty(shape), np.empty((*shape, 6))
+    sums, trial_sums, damped = np.empty((_WORK_ROWS, 6)), np.empty((_WORK_ROWS, 6)), np.empty((6, 6))
+    R_trial, t_trial = np.empty((3, 3)), np.empty(3)
+    step = sums[_STEP]
+    for f in rows:
+        cost = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R[f], t[f], pixels[f],
+                         residuals[f], jacobian[f], sums)  # fmt: skip
+        damping, converged[f] = 1e-8, False
+        for _ in range(_MAX_ITERATIONS if tolerance >= 0.0 else 0):
+            _copy(damped, sums[:_MATRIX])
+            for i in range(6):
+                step[i] = sums[_GRADIENT, i]
+                damped[i, i] += damping * damped[i, i]
+                if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
+                    damped[i, i] = 1.0
+            solved = _solve_in_place(damped, step)
+            length2 = 0.0
+            for i in range(6):
+                length2 += sums[i, i] * step[i] * step[i]
+                for j in range(i):
+                    length2 += 2.0 * sums[i, j] * step[i] * step[j]
+            _rotate_from_left(step[3:6], R[f], R_trial)
+            for i in range(3):
+                t_trial[i] = t[f, i] + step[i]
+            new = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R_trial, t_trial,
+                            trial_pixels, trial_residuals, trial_jacobian, trial_sums)  # fmt: skip
+            small = solved and length2 < tolerance * tolerance and damping < 1e-2
+            if solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12)):
+                cost, damping = new, max(0.1 * damping, 1e-10)
+                _copy(R[f], R_trial)
+                _copy(sums, trial_sums)
+                for i in range(3):
+                    t[f, i] = t_trial[i]
+                for c in range(2):
+                    _copy(pixels[f, c], trial_pixels[c])
+                    _copy(residuals[f, c], trial_residuals[c])
+                    for m in range(shape[1]):
+                        _copy(jacobian[f, c, m], trial_jacobian[c, m])
+            else:
+                damping = max(30.0 * damping, 1e-4)
+            if small or damping > MAX_DAMPING:
+                converged[f] = small
+                break
