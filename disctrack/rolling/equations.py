@@ -23,7 +23,7 @@ angle of e in the body, is touched at p e + p' e3 x e (both at once: to first or
 
 A table that moves by u(t) is at rest in its own axes, where gravity is g - u''. If it gives way by c F_z, then to first
 order in the compliance c the load is that of the rigid table, whose course F_z', F_z'' along the motion is had by
-differences over LOAD_STEP.
+differences over LOAD_STEP; slip that friction would turn within that time keeps its direction beside n0 in it.
 
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
@@ -323,9 +323,14 @@ def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> A
 
 
 @_part
-def _flow(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
-    """Rates of the first ten components on a rigid table; fills kinematics and wrench on the way."""
+def _flow(t: Any, y: Any, held: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    """Rates of the first ten components on a rigid table; fills kinematics and wrench on the way.
+
+    held : slip along n0 and m0 that takes the place of the state's own, and the share to which it does
+    """
     _kinematics(table[0], t, y, body, kin)
+    slip_n, slip_m, share = held
+    kin.slip_n, kin.slip_m = kin.slip_n + share * (slip_n - kin.slip_n), kin.slip_m + share * (slip_m - kin.slip_m)
     _apply_laws(table, wrench)
     return _rates_of(y, kin, _accelerations(table[0], y, body, kin, wrench))
 
@@ -363,13 +368,20 @@ def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any
     slips = table[0] == SLIPPING
     v_x, v_y = (y[8], y[9]) if slips else (nothing, nothing)
     here = (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], v_x, v_y, nothing, nothing)
-    first = _flow((t[0],), here, table, body, kin, wrench)
+    held = (nothing, nothing, nothing)
+    if slips:
+        # slip that creeps follows its force at once, and turns any way within LOAD_STEP: its direction is held then
+        _kinematics(table[0], t, here, body, kin)
+        slow = 3.0 * LOAD_STEP * kin.gravity / body.inverse_friction
+        speed2, slow2 = kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m, slow * slow
+        held = (kin.slip_n, kin.slip_m, slow2 * slow2 / (slow2 * slow2 + speed2 * speed2))
+    first = _flow((t[0],), here, held, table, body, kin, wrench)
     now, h = wrench.F_z, LOAD_STEP
-    middle = _flow((t[0] + 0.5 * h,), _moved(here, 0.5 * h, first), table, body, kin, wrench)
-    _flow((t[0] + h,), _moved(here, h, middle), table, body, kin, wrench)
+    middle = _flow((t[0] + 0.5 * h,), _moved(here, 0.5 * h, first), held, table, body, kin, wrench)
+    _flow((t[0] + h,), _moved(here, h, middle), held, table, body, kin, wrench)
     after = wrench.F_z
-    middle = _flow((t[0] - 0.5 * h,), _moved(here, -0.5 * h, first), table, body, kin, wrench)
-    _flow((t[0] - h,), _moved(here, -h, middle), table, body, kin, wrench)
+    middle = _flow((t[0] - 0.5 * h,), _moved(here, -0.5 * h, first), held, table, body, kin, wrench)
+    _flow((t[0] - h,), _moved(here, -h, middle), held, table, body, kin, wrench)
     before = wrench.F_z
     return now, (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
 

@@ -295,12 +295,12 @@ def swing(cosine, sine, frequency, start=0.0):
     return course
 
 
-def yielding(disc, start, times, **integration):
+def yielding(disc, start, times, regime="rolling", **integration):
     """The course of a table that has given way to the load of the motion on the rigid one, by a spline."""
     rigid = copy(disc)
     rigid.table = None
-    solution = follow(rigid, start, times, **integration)
-    load = [accelerations(rigid.at(t), s, "rolling")[2][2] for t, s in zip(times, solution.y.T, strict=True)]
+    solution = follow(rigid, start, times, regime, **integration)
+    load = [accelerations(rigid.at(t), s, regime)[2][2] for t, s in zip(times, solution.y.T, strict=True)]
     sunk = make_interp_spline(times, -disc.gives_way * np.array(load), k=7)
     return lambda t: tuple(sunk(t, order) * K for order in range(3))
 

@@ -1,5 +1,7 @@
 """Derivatives of the motion against central differences of separate simulations."""
 
+import sys
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -7,6 +9,8 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Model, ModelError, Regime, State, steady_precession
+from disctrack.rolling._assembly import Assembly
+from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
 
 STATE = steady_precession(np.radians(15), MA_2014, omega3=2.5, nutation_amplitude=0.03, psi=0.4, phi=-1.0, x=0.02)
@@ -74,6 +78,46 @@ def test_all_columns_at_once_equal_those_one_by_one():
     alone = rolling.sensitivities(MODEL, STATE, TIMES, ["km.k_m"], components=["theta"])
     assert_allclose(together.dq[:, :, [3, 8]], alone.dq, rtol=1e-13)
     assert_allclose(together.q, rolling.simulate(MODEL, STATE, times=TIMES).q, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({}, {"x", "y", "psi", "phi"}),
+        ({"slip.mu": 0.2, "table_yielding.c": 1e-7}, {"x", "y", "psi", "phi"}),
+        ({"table_tilt.tilt_x": 1e-3}, {"x", "y", "phi"}),
+        ({"table_shaken.u_cos_x": 1e-5}, {"x", "y", "phi"}),
+        ({"centre_of_mass.c_1": 1e-4}, {"x", "y", "psi"}),
+        ({"inertia_product.J_13": 1e-9}, {"x", "y", "psi"}),
+        ({"spring.k": 0.1}, {"phi"}),
+        ({"table_curved.kappa": 0.1}, set()),
+        ({"rim.oval_c": 1e-5}, set()),
+    ],
+)
+@pytest.mark.parametrize("slides", [False, True])
+def test_columns_by_symmetry_equal_those_of_the_complex_step(values, expected, slides, monkeypatch):
+    model = sliding(0.2).with_values(values)
+    state = STATE
+    if slides:
+        velocity = rolling.simulate(MODEL, STATE, times=[0.0]).qdot[0]
+        state = STATE.moved(v_x=velocity[0] + 0.05, v_y=velocity[1] - 0.02)
+    module = sys.modules["disctrack.rolling.sensitivities"]
+    assert module.symmetries(model, Assembly(model, 0.01)) == expected
+    written = rolling.sensitivities(model, state, TIMES)
+    monkeypatch.setattr(module, "symmetries", lambda *_: set())
+    followed = rolling.sensitivities(model, state, TIMES)
+    assert np.isfinite(followed.dq).all()
+    for found, true in ((written.dq, followed.dq), (written.dqdot, followed.dqdot)):
+        size = np.abs(true).max(axis=(0, 2), keepdims=True)
+        # the instant of sticking is known to the slip that is dropped there, 1e-7 m/s
+        assert_allclose(found / size, true / size, atol=1e-5 if slides else 1e-12)
+
+
+def test_a_law_by_formula_breaks_the_symmetries_that_it_reads():
+    law = effect_from_formulas("patch", {"M_m": "-c * exp(-(x * x + y * y) / 1e-4) * cos(phi)"})
+    model = MODEL.with_effects(law(c=0.0))
+    module = sys.modules["disctrack.rolling.sensitivities"]
+    assert module.symmetries(model, Assembly(model, 0.01)) == set()
 
 
 def sliding(mu):

@@ -82,7 +82,7 @@ def diagnose_motion(
         assumed = find_clock(rolling, faults)
         if assumed is not None:
             return _with_large(assumed, settings)
-    rolling.patience = Patience(MOST_SLIP_STEPS)
+    rolling.patience = Patience(MOST_SLIP_STEPS * len(rolling.time))
     try:
         answer = _rolling_or_slipping(trajectory, model, faults, settings, rolling, base)
         answer.system.patience.without_end()
