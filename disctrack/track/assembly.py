@@ -22,6 +22,7 @@ from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unex
 from disctrack.track.least_squares import step_to_minimum
 from disctrack.track.own_scatter import SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses, misses
+from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.slips import slips_in_words
 from disctrack.track.table_contact import TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -58,6 +59,7 @@ class Tracking:
     variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared
     noise_factor: float  # the part of it that changes from frame to frame (`own_scatter`), by which the covariances of
     # dots and poses are multiplied; what is left of the other makes `Trajectory.systematic_covariance`
+    pose_scatter: PoseScatter  # of the poses about a smooth motion, beyond what the dots tell
     systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
     shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
     table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
@@ -126,10 +128,13 @@ def assemble(
             rows = slice(first_row, first_row + FITTED_AT_ONCE)
             systematic[rows] += _by_pattern(as_built, fits.R_world_body[rows])
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
+    # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
+    poses = scatter_of_poses(fits)
+    fits.covariance[...] *= np.sqrt(np.outer(poses.factor, poses.factor))
     shared = _shared_sigma(fits, systematic, as_built, rig)
     as_built = replace(as_built, rig=rig)
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
-    warnings = warnings_of(first, factor, faults, scatter, table, trajectory)
+    warnings = warnings_of(first, factor, faults, scatter, poses, table, trajectory)
     return Tracking(
         trajectory=trajectory,
         noise=first.law.noise,
@@ -137,6 +142,7 @@ def assemble(
         as_built=as_built,
         variance_factor=factor,
         noise_factor=noise_factor,
+        pose_scatter=poses,
         shared_sigma=shared,
         systematic_px=scatter.systematic_px,
         table=table,

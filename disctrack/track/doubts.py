@@ -9,6 +9,7 @@ from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.track.following import Follower
 from disctrack.track.own_scatter import Scatter, SharedFaults
+from disctrack.track.pose_scatter import GROUPS, PoseScatter
 from disctrack.track.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -18,6 +19,7 @@ FAULTY = 2.0  # times the noise that residuals must reach before cameras or cloc
 DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
+SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is worth a word
 ONE_SIDED = "the dots of only one camera make sense"
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 MISFIT = "the dots miss their fitted places"
@@ -61,11 +63,31 @@ def misplaced_in_words(declared: Disc, found: Array) -> str:
     )
 
 
+def _shaken_in_words(poses: PoseScatter, trajectory: Trajectory) -> str:
+    """Poses that scatter far more than their dots tell, with how far; "" without any."""
+    names = ("horizontal position", "height", "tilt", "turn about the vertical")
+    variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
+    told = [
+        f"{name} by {length} ({np.sqrt(poses.factor[group[0]]):.1f} times)"
+        for name, group in zip(names, GROUPS, strict=True)
+        if poses.factor[group[0]] > SHAKEN**2
+        for sigma in [np.sqrt(np.mean(variance[list(group)]))]
+        for length in [f"{1e6 * sigma:.1f} um" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"]
+    ]
+    if not told:
+        return ""
+    return (
+        f"from frame to frame poses scatter more than their dots tell: {', '.join(told)}. Dots that err alike leave no "
+        "residual: a camera or the table trembles, or the frames were compressed as video. The sigmas follow"
+    )
+
+
 def warnings_of(
     follower: Follower,
     variance_factor: float,
     faults: SharedFaults | None,
     scatter: Scatter,
+    poses: PoseScatter,
     table: TableFromDisc | None,
     trajectory: Trajectory,
 ) -> tuple[str, ...]:
@@ -104,6 +126,8 @@ def warnings_of(
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
             "round, or their edges are not sharp, or the images were processed"
         )
+    if shaken := _shaken_in_words(poses, trajectory):
+        warnings.append(shaken)
     if table is not None and table.probability < DISAGREE:
         warnings.append(
             f"{LOWEST_POINT} does not roll on the board's table: {table.sentence}. They differ by more than "

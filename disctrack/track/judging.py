@@ -7,7 +7,7 @@ taken from the frames around, so that a frame is judged by its neighbours and by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -223,9 +223,19 @@ def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
     two neighbours on either side, which follows a motion that changes quickly from frame to frame far better. ACROSS
     tells how far the disc went. NaN where one of the poses is missing.
     """
+    square = np.full(len(fits.converged), np.nan)
+    for rows, away, spread in sums_over_time(fits, weights):
+        square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
+    return square
+
+
+def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
+    """Weighted sums of neighbours as in `departure`, some thousands at a time.
+
+    yields : frames (k,); sums (k, 6) in POSE_COMPONENTS; the covariance (k, 6, 6) that noise gives them
+    """
     n, R, t, C = len(fits.converged), fits.R_world_body, fits.t_world_body, fits.covariance
     offsets, weight = np.array([*weights]), np.array([*weights.values()])
-    square = np.full(n, np.nan)
     rows = np.arange(max(-offsets.min(), 0), n - max(offsets.max(), 0))
     near = rows[:, None] + offsets
     good = fits.converged[near].all(axis=1)
@@ -233,9 +243,7 @@ def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
         near = some[:, None] + offsets
         turn = vector_from_rotation(R[near] @ np.swapaxes(R[near[:, :1]], 2, 3))  # by little, from the first
         away = np.einsum("k,nki->ni", weight, np.concatenate([t[near], turn], axis=2))
-        spread = np.einsum("k,nkij->nij", weight**2, C[near])
-        square[some] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
-    return square
+        yield some, away, np.einsum("k,nkij->nij", weight**2, C[near])
 
 
 FROM_BEFORE = {-1: -3.0, 0: 1.0, -2: 3.0, -3: -1.0}

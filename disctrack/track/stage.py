@@ -200,6 +200,7 @@ def findings_of(tracking: Tracking) -> dict[str, Any]:
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,
         "noise_factor": tracking.noise_factor,
+        "pose_variance_factor": tracking.pose_scatter.factor.round(3).tolist(),
         "systematic_px": list(tracking.systematic_px),
         "shared_sigma": [[sigma, cause] for sigma, cause in tracking.shared_sigma],
         "size": {

@@ -1,5 +1,6 @@
 """Faults planted into recordings: none ends with a pose that is wrong by more than its sigma says and not flagged."""
 
+import io
 import json
 import re
 import time
@@ -320,3 +321,35 @@ def imperfect(tmp_path):
     images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(N)])
     with np.load(folder / "truth.npz") as truth:
         return Laboratory(images, read_rig(tmp_path / "rig.h5"), recording.disc, truth["q"])
+
+
+def as_video(images, quality):
+    """Grey images (n, height, width) through H.264 of that constant rate factor, its luma."""
+    av = pytest.importorskip("av")
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=100)
+        stream.height, stream.width, stream.pix_fmt = *images.shape[1:], "gray"
+        stream.options = {"crf": str(quality)}
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
+        container.mux(stream.encode())
+    file.seek(0)
+    with av.open(file) as container:
+        return np.array([frame.to_ndarray(format="gray") for frame in container.decode(video=0)])
+
+
+def test_frames_that_an_encoder_predicts_from_one_another_scatter_as_stated(clip):
+    """H.264 moves blocks of an image together: dots err alike, poses farther than the dots' misfit tells."""
+    lossy = np.stack([as_video(clip.images[:, side], 23) for side in (0, 1)], axis=1)
+    found = measure(lossy, clip.rig, clip.disc)
+    truth = clip.untouched.trajectory
+    R, R_true = (frames.rotation_from_euler(*t.q[:, 3:].T) for t in (found.trajectory, truth))
+    turn = frames.vector_from_rotation(R @ np.swapaxes(R_true, 1, 2))
+    error = np.column_stack([found.trajectory.q[:, :3] - truth.q[:, :3], turn])
+    stated = found.trajectory.pose_covariance + found.trajectory.calibration_covariance
+    ratio = np.nanmean(error**2 / np.einsum("nii->ni", stated), axis=0)
+    assert (ratio < 2.5).all()  # errors of neighbouring frames are alike: 48 are some 16
+    assert any("the frames were compressed as video" in warning for warning in found.warnings)
+    assert clip.untouched.pose_scatter.factor.max() < 1.5
+    assert not any("compressed as video" in warning for warning in clip.untouched.warnings)

@@ -1,0 +1,72 @@
+"""How far poses scatter from frame to frame, beside what their dots tell.
+
+Dots that err alike leave no residual: a camera or table that trembles, an encoder that moves blocks of the image
+together. The motion tells: it is smooth, and what it is not is noise, whatever the dots say. In sixth differences of
+the poses white noise is 30 times itself, and what precesses by an angle a per frame is a^6 of itself: at SLOW, 0.3 um
+of 5 mm. So only frames are counted between which the disc precesses by less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Array
+from disctrack.track.judging import sums_over_time
+from disctrack.track.pose import PoseFits
+
+# The frame itself first: turns are taken from there.
+SIXTH = {k: float((-1) ** k * comb(6, k + 3)) for k in (0, -3, -2, -1, 1, 2, 3)}
+SLOW = 0.2  # [rad] of precession from frame to frame
+# Horizontal place, height, tilt, turn about the vertical: light and view make each of them scatter in a way of its own.
+GROUPS = ((0, 1), (2,), (3, 4), (5,))
+MIN_FRAMES = 40  # fewer tell as much as eight independent ones, whose variance chance alone doubles now and then
+# Blows and smears are cut off with the largest fifth of the squares; what is left of chi-square with one degree of
+# freedom has this mean.
+KEPT, MEAN_KEPT = 0.8, 0.43772
+# Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n tell as much as n / 3.2 independent ones
+# (the sum of the squared correlations); without those that are cut off, n / 4.5 (4000 samples of white noise).
+WORTH = 4.5
+
+
+@dataclass(frozen=True)
+class PoseScatter:
+    """Variance of the poses from frame to frame over what the dots tell."""
+
+    found: Array  # (4,) by GROUPS; NaN where no frames are slow enough
+    sigma: Array  # (4,) by chance alone, for 1
+    factor: Array  # (6,) at least 1, for the variances of POSE_COMPONENTS: the part of the excess that is no chance
+
+
+def scatter_of_poses(fits: PoseFits) -> PoseScatter:
+    """From sixth differences of the fitted poses; the covariances are those that their dots tell."""
+    found, sigma, factor = np.full(4, np.nan), np.full(4, np.nan), np.ones(6)
+    parts = [
+        away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
+        for rows, away, spread in sums_over_time(fits, SIXTH)
+        for slow in [_precession(fits.R_world_body, rows) < SLOW]
+    ]
+    square = np.concatenate(parts) if parts else np.empty((0, 6))
+    if len(square) < MIN_FRAMES:
+        return PoseScatter(found, sigma, factor)
+    kept = np.sort(square, axis=0)[: int(KEPT * len(square))].mean(axis=0) / MEAN_KEPT
+    for i, group in enumerate(GROUPS):
+        part = list(group)
+        found[i], sigma[i] = kept[part].mean(), np.sqrt(2 * WORTH / (len(square) * len(part)))
+        excess = found[i] - 1.0
+        # nothing below three sigmas, all of what is far above
+        factor[part] = 1.0 + max(excess - (3.0 * sigma[i]) ** 2 / excess, 0.0) if excess > 0 else 1.0
+    return PoseScatter(found, sigma, factor)
+
+
+def _precession(R: Array, rows: NDArray[np.intp]) -> Array:
+    """Largest angle [rad] per frame by which the disc's axis turns about the vertical, in the seven frames around."""
+    axis = R[rows[:, None] + np.arange(-3, 4), :2, 2]
+    tilt = np.linalg.norm(axis, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # a disc that lies flat has no direction to precess in, and none is measured: it is not slow
+        turn = 2.0 * np.linalg.norm(np.diff(axis, axis=1), axis=2) / (tilt[:, 1:] + tilt[:, :-1])
+    return np.asarray(turn.max(axis=1))
