@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
+from disctrack.readers.base import CINE_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, VIDEO_SUFFIXES
 from disctrack.readers.files import natural_key
 from disctrack.recording.declaration import FILE_NAME
 
 RESULTS = "results"  # beside a recording's images
+_FILMS = VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class FoundRecordings:
     base: Path  # the deepest folder that holds all folders searched
     recordings: tuple[Path, ...]  # folders with a recording.toml, each once, in natural order of their names
     problems: tuple[str, ...]  # folders that could not be looked into
+    undeclared: tuple[Path, ...] = ()  # that hold two folders of images or two films, and no recording.toml
 
     def name(self, recording: Path) -> str:
         """The recording's place below `base`, with slashes: unique, and the same on every machine."""
@@ -39,33 +42,43 @@ def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> 
         if not root.is_dir():
             raise RecordingError(f"{folder}: no such folder. Give folders that hold recordings, at any depth.")
     problems: list[str] = []
+    undeclared: list[Path] = []
     seen = {folder.resolve() for folder in leave_out} - set(roots)
-    found = [place for root in roots for place in _search(root, seen, problems)]
+    found = [place for root in roots for place in _search(root, seen, problems, undeclared)]
+    undeclared = [place for place in undeclared if not set(place.parents) & set(undeclared)]
     if not found:
         shown = ", ".join(str(folder) for folder in folders)
         raise RecordingError(
             f"{shown}: no recording found. A recording is a folder with a {FILE_NAME} beside its images."
+            + (f" {undeclared[0]} has images: `disctrack init {undeclared[0]}` writes one." if undeclared else "")
             + (f" Not searched: {'; '.join(problems)}." if problems else "")
         )
     base = Path(os.path.commonpath(roots))
     order = sorted(found, key=lambda place: [natural_key(part) for part in place.parts])
-    return FoundRecordings(base, tuple(order), tuple(problems))
+    return FoundRecordings(base, tuple(order), tuple(problems), tuple(undeclared))
 
 
-def _search(folder: Path, seen: set[Path], problems: list[str]) -> Iterator[Path]:
+def _search(folder: Path, seen: set[Path], problems: list[str], undeclared: list[Path]) -> Generator[Path, None, bool]:
+    """The recordings at and below the folder; whether images lie in it. Notes in the lists what a user must be told."""
     place = folder.resolve()
     if place in seen:
-        return
+        return False
     seen.add(place)
     try:
         with os.scandir(folder) as entries:
-            below = sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
+            visible = [(entry.name, entry.is_dir()) for entry in entries if not entry.name.startswith(".")]
             is_recording = (folder / FILE_NAME).exists()
     except OSError as error:
         problems.append(f"{folder} ({error.strerror})")
-        return
+        return False
+    below = sorted(name for name, is_folder in visible if is_folder)
+    suffixes = [Path(name).suffix.lower() for name, is_folder in visible if not is_folder]
     if is_recording:
         yield folder
+    of_images = 0
     for name in below:
         if not (is_recording and name == RESULTS):
-            yield from _search(folder / name, seen, problems)
+            of_images += yield from _search(folder / name, seen, problems, [] if is_recording else undeclared)
+    if not is_recording and max(of_images, sum(suffix in _FILMS for suffix in suffixes)) > 1:
+        undeclared.append(folder)
+    return not is_recording and not IMAGE_SUFFIXES.isdisjoint(suffixes)

@@ -93,6 +93,7 @@ class BatchPlan:
     rigs: tuple[Job, ...]
     recordings: tuple[Job, ...]
     failures: dict[str, str]  # name of the recording -> reason
+    undeclared: tuple[Path, ...]  # folders of images that no recording.toml speaks of
 
 
 @dataclass(frozen=True)
@@ -117,18 +118,26 @@ def make_plan(places: Places, recordings: Sequence[Path], options: BatchOptions)
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
     failures: dict[str, str] = {}
+    undeclared = places.found.undeclared
     for folder in recordings:
         name = places.found.name(folder)
         try:
-            jobs.append(_job(places, folder, name, options, rigs))
+            recording = read_recording(folder)
+            undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
+            jobs.append(_job(places, recording, name, options, rigs))
         except Exception as error:  # whatever is wrong with one recording, the others are measured
             failures[name] = reason_of(error)
     needed = {job.rig for job in jobs}
-    return BatchPlan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures)
+    return BatchPlan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures, undeclared)
 
 
-def _job(places: Places, folder: Path, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
-    recording = read_recording(folder)
+def _has_views_of(place: Path, recording: Recording) -> bool:
+    """Do the views that many recordings may share lie in this folder?"""
+    return recording.views is not None and (recording.folder / recording.views.left).resolve().is_relative_to(place)
+
+
+def _job(places: Places, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
+    folder = recording.folder
     n = len(open_pairs(recording))
     results = places.results(folder)
     if recording.rig_file is not None:

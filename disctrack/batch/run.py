@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -20,6 +21,7 @@ from disctrack.batch.together import diagnose_all
 from disctrack.errors import ClusterError, OutputError
 from disctrack.files.whole import check_writable
 from disctrack.readers.blocks import default_threads
+from disctrack.recording.declaration import FILE_NAME
 
 INTERRUPTED = "interrupted before it was done"
 
@@ -34,6 +36,7 @@ class BatchOutcome:
     problems: tuple[str, ...]  # besides those of single recordings
     interrupted: bool = False
     together: tuple[str, ...] = ()  # what the diagnosis of all recordings together says
+    undeclared: tuple[str, ...] = ()  # folders of images that no recording.toml speaks of
 
     @property
     def failed(self) -> bool:
@@ -49,7 +52,8 @@ class BatchOutcome:
         """One line per recording, then the totals."""
         width = max(len(row["recording"]) for row in self.rows)
         total = ", ".join(f"{n} {status}" for status, n in counts(self.rows).items() if n)
-        return [*(line_of(row, width) for row in self.rows), f"{'total':<13} {total}", *self.together]
+        left = [f"{'left out':<13} {name:<{width}}  images, and no {FILE_NAME}" for name in self.undeclared]
+        return [*(line_of(row, width) for row in self.rows), *left, f"{'total':<13} {total}", *self.together]
 
 
 def run_batch(
@@ -86,7 +90,8 @@ def run_batch(
     for job in plan.recordings:
         results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, stopped)))
     whole = shard is None  # or else whoever sums up the shards
-    return _summed_up(places, mine, results, options, stopped == INTERRUPTED, n if whole else 0)
+    outcome = _summed_up(places, mine, results, options, stopped == INTERRUPTED, n if whole else 0)
+    return replace(outcome, undeclared=tuple(os.path.relpath(place, places.found.base) for place in plan.undeclared))
 
 
 def summarise_batch(

@@ -54,6 +54,27 @@ def test_recordings_are_found_at_any_depth_in_natural_order_and_results_are_not_
     assert names_of(find_recordings([root / "r3"])) == [".", "r3"]
 
 
+def test_images_without_a_declaration_are_told(tmp_path):
+    """The uppermost folder of a recording that was forgotten; not its views, results, or a single film of something."""
+    root = recordings_at(tmp_path, "day 1/r1", "day 1/r2")
+    for name in ("day 1/r1/left", "day 1/r1/right", "day 1/r2/calibration/left", "day 1/r2/calibration/right"):
+        (root / name).mkdir(parents=True)
+        (root / name / "0.png").write_bytes(b"")
+    assert find_recordings([root]).undeclared == ()
+    for name in ("left", "right", "calibration/left", "calibration/right"):
+        (root / "day 1" / "r3" / name).mkdir(parents=True)
+        (root / "day 1" / "r3" / name / "0.TIF").write_bytes(b"")
+    (root / "films").mkdir()
+    (root / "films" / "left.cine").write_bytes(b"")
+    (root / "pictures" / "some").mkdir(parents=True)
+    (root / "pictures" / "some" / "a.png").write_bytes(b"")
+    assert find_recordings([root]).undeclared == (root / "day 1" / "r3",)
+    (root / "films" / "right.cine").write_bytes(b"")
+    assert set(find_recordings([root]).undeclared) == {root / "day 1" / "r3", root / "films"}
+    with pytest.raises(RecordingError, match=r"r3 has images: `disctrack init .*r3` writes one"):
+        find_recordings([root / "day 1" / "r3"])
+
+
 def test_no_folder_and_no_recording_are_told_apart(tmp_path):
     with pytest.raises(RecordingError, match="no such folder"):
         find_recordings([tmp_path / "nothing"])
