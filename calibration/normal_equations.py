@@ -37,6 +37,7 @@ class Normal:
     pose_gradient: Array  # (n_views, k)
     costs: Array  # (n_views,) chi-square, or Huber's sum when robust
     n_views: int  # without the prior
+    board: Array  # (s2, s2) what is known of the target's shape beforehand: the prior's part
 
     @property
     def cost(self) -> float:
@@ -79,7 +80,12 @@ class Normal:
     @property
     def shared(self) -> Array:
         """(s, s) of the shared parameters, all views together, before the poses are eliminated."""
-        return self._assembled(self.stereo.sum(0), self.stereo_point.sum(0), self.point.sum(0))
+        return self._with_board(self._assembled(self.stereo.sum(0), self.stereo_point.sum(0), self.point.sum(0)))
+
+    def _with_board(self, total: Array) -> Array:
+        s1 = self.stereo.shape[1]
+        total[s1:, s1:] += self.board
+        return total
 
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Damped step of the shared parameters (s,) and of the poses (n_views, k)."""
@@ -106,6 +112,8 @@ class Normal:
         carried, own = self._eliminated(self.pose)
         parts = zip(self.stereo, self.stereo_point, self.point, strict=True)
         shared = np.stack([self._assembled(*part) for part in parts])
+        if len(shared) > self.n_views:
+            self._with_board(shared[-1])
         return shared - self.cross @ carried, self.gradient - np.einsum("vsi,vi->vs", self.cross, own)
 
     def shifts_by_views(self, s1: int) -> tuple[Array, Array, Array]:
@@ -204,6 +212,7 @@ class Problem:
             pose_gradient=np.concatenate([*squares[..., s1:-1, -1]], axis=1),
             costs=costs.reshape(exposures, V).sum(0),
             n_views=n_views,
+            board=np.zeros((s2, s2)),
         )
         for k in range(exposures):
             normal.pose[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = squares[k, :, s1:-1, s1:-1]
@@ -221,6 +230,11 @@ class Problem:
             information, towards, normal.costs[-1] = self.prior.normal(model)
             normal.stereo[-1] = self.stereo_basis.T @ information @ self.stereo_basis
             normal.gradient[-1, :s1] = self.stereo_basis.T @ towards
+            if s2 and self.prior.board is not None:
+                weight, (pull, cost) = self.prior.weight, self.prior.board.normal(model.points)
+                normal.board[...] = weight * self.prior.board.information
+                normal.gradient[-1, s1:] = weight * pull
+                normal.costs[-1] += weight * cost
         return normal
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:

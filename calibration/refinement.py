@@ -13,7 +13,7 @@ from calibration.arrays import Array, Mask
 from calibration.board_motion import BoardMotion, learnt, split
 from calibration.errors import CalibrationError
 from calibration.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
-from calibration.priors import Prior, camera_priors
+from calibration.priors import Prior, priors_of
 from calibration.stereo_model import Observations, StereoModel, Terms, board_basis, predict_pixels, restricted
 
 FREE_ROUNDS = 6  # of rejection, in which a point may come back; then it may not, so that the rounds come to an end
@@ -65,7 +65,7 @@ def refine_stereo(
     nominal : (n, 3) [m] the target's points as declared
     reject_beyond : sigmas, after the noise that the residuals themselves show: of 10^4 good points none lies beyond
     begin : an earlier refinement of the same observations with other terms: spares the robust start
-    priors : whether what is known of cameras beforehand counts, see `priors`
+    priors : whether what is known of cameras and boards beforehand counts, see `priors`
     motion : about how far boards moved between the two exposures of a pair; None: they did not, or as `begin` has it
 
     Raises CalibrationError if the views cannot determine the parameters.
@@ -76,7 +76,7 @@ def refine_stereo(
     stereo_basis, shape_basis = terms.stereo_basis(), board_basis(nominal, terms.board)
     kept = np.ones(len(observations), bool)
     model, total = restricted(start if begin is None else begin.model, nominal, terms), 0
-    prior = camera_priors(model) if priors else None
+    prior = priors_of(model, nominal, shape_basis) if priors else None
     motion = begin.problem.motion if motion is None and begin is not None else motion
     if begin is None:
         model, extra = _robust_start(observations, model, stereo_basis, shape_basis, n_views, prior)

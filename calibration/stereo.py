@@ -23,11 +23,11 @@ from calibration.camera import StereoRig
 from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
-from calibration.model_choice import TermsTried, choose_terms
+from calibration.model_choice import TermsTried, choose_board
 from calibration.pairs import PairsJudged, judge_pairs, motion_between_exposures, own_places, pairs_that_agree
 from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
-from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, Observations
+from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
 from calibration.wide_lens import too_wide
@@ -42,10 +42,10 @@ Finder = Callable[[NDArray, bool], CornerView | BoardNotFound]  # image, whether
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """What the user may decide; "auto" is decided by held-out error."""
+    """What the user may decide."""
 
-    distortion: str = "auto"  # or a key of stereo_model.DISTORTION_MODELS
-    board: str = "auto"  # or one of stereo_model.BOARD_MODELS
+    distortion: str = "auto"  # all terms, with priors; or a key of stereo_model.DISTORTION_MODELS
+    board: str = "auto"  # decided by held-out error; or one of stereo_model.BOARD_MODELS
     equal_aspect: bool = False  # fx = fy
     threads: int = 2
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)
@@ -242,12 +242,10 @@ def calibrate_from_corners(
     report("refining")
     seen = np.bincount(observations.point, minlength=len(board.points))
     boards = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
-    choice = (
-        None if settings.distortion == "auto" else (settings.distortion,),
-        boards if settings.board == "auto" else (settings.board,),
-    )
+    boards = boards if settings.board == "auto" else (settings.board,)
+    lens = (RICHEST if settings.distortion == "auto" else settings.distortion, settings.equal_aspect)
     places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
-    refinement, candidates = choose_terms(*places, board.points, *choice, settings.equal_aspect, report)
+    refinement, candidates = choose_board(*places, board.points, boards, *lens, report)
     for _ in range(REJUDGED):
         before = sorted(pairs.apart)
         pairs = judge_pairs(observations, refinement, before)
@@ -256,16 +254,13 @@ def calibrate_from_corners(
         observations, pairs, lost, notes = _without_images(observations, pairs, names)
         rejected, warnings = rejected | lost, [*warnings, *notes]
         places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
-        terms = refinement.terms
-        refinement, again = choose_terms(
-            *places, board.points, (terms.distortion,), (terms.board,), settings.equal_aspect, report
-        )
+        refinement, again = choose_board(*places, board.points, (refinement.terms.board,), *lens, report)
         candidates = (*candidates, *again)
     motion = motion_between_exposures(refinement)
     if motion is not None and motion.is_seen:
         report("pairs that were not synchronised: with a motion of the board between the exposures")
         begin = motion.as_random(board.points)
-        refinement, again = choose_terms(*places, board.points, *choice, settings.equal_aspect, report, begin)
+        refinement, again = choose_board(*places, board.points, boards, *lens, report, begin)
         candidates = (*candidates, *again)
     told = _told_apart(pairs.apart, names, bool(wide))
     warnings += told
@@ -280,9 +275,9 @@ def calibrate_from_corners(
             f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
         )
     report("trying a field of the lenses")
-    lens = fit_lens_field(refinement, board.points)
-    if lens is not None:
-        refinement = lens.refinement
+    lens_fit = fit_lens_field(refinement, board.points)
+    if lens_fit is not None:
+        refinement = lens_fit.refinement
     report("judging")
     inflation = max(consistency_factor(refinement), 1.0)
     shape = board_shape(refinement, board.points, inflation)
@@ -290,7 +285,7 @@ def calibrate_from_corners(
     origin = on_the_table(board.points, shape)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, stereo_covariance(refinement), origin)
     with_board = with_tolerances(
-        replace(rig, lens_field=lens.field if lens else None),
+        replace(rig, lens_field=lens_fit.field if lens_fit else None),
         board.points,
         table_view,
         board_thickness,
@@ -314,7 +309,7 @@ def calibrate_from_corners(
         candidates=candidates,
         assessment=assessment,
         warnings=(*warnings, *assessment.warnings),
-        lens=lens,
+        lens=lens_fit,
         shape=shape,
     )
 

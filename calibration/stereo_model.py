@@ -19,6 +19,7 @@ DISTORTION_MODELS: dict[str, tuple[str, ...]] = {
     "k1 k2 k3": ("k1", "k2", "k3"),
     "k1 k2 p1 p2 k3": ("k1", "k2", "p1", "p2", "k3"),
 }
+RICHEST = "k1 k2 p1 p2 k3"
 BOARD_MODELS = ("flat", "warped", "free")
 N_WARP = 5  # shape parameters of a warped board
 N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
@@ -68,7 +69,7 @@ class StereoModel:
 class Terms:
     """What the refinement may change."""
 
-    distortion: str = "k1 k2 p1 p2 k3"  # key of DISTORTION_MODELS, the same for both cameras
+    distortion: str = RICHEST  # key of DISTORTION_MODELS, the same for both cameras
     board: str = "flat"  # one of BOARD_MODELS
     equal_aspect: bool = False  # fx = fy in each camera
     fixed_intrinsics: bool = False

@@ -16,6 +16,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.camera import N_RIG, Allowance, StereoRig
+from calibration.priors import board_prior
 from calibration.refinement import Refinement
 from calibration.stereo_model import board_basis
 
@@ -60,7 +61,8 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
         to_smooth = np.linalg.pinv(B) @ problem.shape_basis.reshape(3 * n, -1)
         C = to_smooth @ refinement.normal.covariances()[0][s1:, s1:] @ to_smooth.T
     else:  # one step beyond the flat board, everything else free
-        normal = replace(problem, shape_basis=basis).linearise(refinement.model)
+        prior = problem.prior and replace(problem.prior, board=board_prior(nominal, basis))
+        normal = replace(problem, shape_basis=basis, prior=prior).linearise(refinement.model)
         s1 = problem.stereo_basis.shape[1]
         found = found + normal.solve(0.0)[0][s1:]
         C = normal.covariances()[0][s1:, s1:]

@@ -323,9 +323,9 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
 
 def _calibration_options(parser: argparse.ArgumentParser) -> None:
     """Options that `run` and `calibrate` have in common."""
-    group = parser.add_argument_group("calibration", "what is not given is chosen by held-out error")
-    group.add_argument("--distortion", default="auto", metavar="TERMS", help="Brown's terms, e.g. 'k1 k2'")
-    group.add_argument("--board", default="auto", metavar="SHAPE", help="flat, warped or free")
+    group = parser.add_argument_group("calibration")
+    group.add_argument("--distortion", default="auto", metavar="TERMS", help="Brown's terms, e.g. 'k1 k2'; auto: all")
+    group.add_argument("--board", default="auto", metavar="SHAPE", help="flat, warped or free; auto: by held-out error")
 
 
 def _frame_range(text: str) -> tuple[int | None, int | None]:

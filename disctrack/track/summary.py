@@ -71,16 +71,17 @@ def _mostly(sigma: Sequence[tuple[float, str]], what: str) -> str:
 
 
 def _model_text(found: StereoCalibration) -> str:
-    """Which distortion and which board, and what the others give on views left out."""
+    """Which distortion and which board, and what other boards give on views left out."""
     chosen = found.refinement.terms
     text = f"distortion {chosen.distortion}, {chosen.board} board"
-    rows = {(c.terms.distortion, c.terms.board): c.held_out_rms_px for c in found.candidates}
-    own = rows.pop((chosen.distortion, chosen.board), float("nan"))
-    others = sorted(rows.items(), key=lambda item: item[1])[:3]
-    if not others:
-        return text + " (as told)"
-    listed = ", ".join(f"{distortion} {board} {rms:.4f}" for (distortion, board), rms in others)
-    return f"{text}: views left out fit at {own:.4f} px ({listed}); the simplest that is not clearly worse is taken"
+    rows = {c.terms.board: c.held_out_rms_px for c in found.candidates}
+    own = rows.pop(chosen.board, float("nan"))
+    if not rows:
+        return text + (" (as told)" if found.settings.board != "auto" else " (no other comes near)")
+    listed = ", ".join(f"{board} {rms:.4f}" for board, rms in sorted(rows.items(), key=lambda item: item[1]))
+    return (
+        f"{text}: views left out fit at {own:.4f} px ({listed}); the simplest board that is not clearly worse is taken"
+    )
 
 
 def left_out(rejected: Mapping[int, str]) -> list[str]:
