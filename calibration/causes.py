@@ -24,6 +24,8 @@ def causes(rig: StereoRig, shift: Array, further: Mapping[str, Array] | None = N
     parts: dict[str, Array] = {}
     for a in rig.allowances:
         parts[a.cause] = parts.get(a.cause, 0.0) + variance(np.outer(a.shift, a.shift))
-    parts = {"the views": np.maximum(variance(rig.covariance) - sum(parts.values()), 0.0), **parts, **(further or {})}
+    parts = {"the views": np.maximum(variance(rig.covariance) - sum(parts.values()), 0.0), **parts}
+    for cause, own in (further or {}).items():
+        parts[cause] = parts.get(cause, 0.0) + own
     table = np.array(list(parts.values()))
     return np.sqrt(table.sum(axis=0)), [list(parts)[i] for i in table.argmax(axis=0)]

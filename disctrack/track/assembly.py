@@ -24,7 +24,7 @@ from disctrack.track.own_scatter import SharedFaults, split_scatter, without_sha
 from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.slips import slips_in_words
-from disctrack.track.table_contact import TableFromDisc, table_from_disc
+from disctrack.track.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 MIN_GOOD_DOT_IMAGES = 6
@@ -123,11 +123,15 @@ def assemble(
     )
     fits.covariance[...] *= verdicts.factor[:, None, None]
     fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
-    if pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)[0] > 0:
+    misplaced = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)[0] > 0
+    by_pattern = _by_pattern(as_built, fits.R_world_body) if misplaced else None
+    fits, systematic, rig, table = table_from_disc(
+        fits, systematic, as_built.rig, as_built.disc, settings.table, by_pattern
+    )
+    if by_pattern is not None:
         for first_row in range(0, len(systematic), FITTED_AT_ONCE):
-            rows = slice(first_row, first_row + FITTED_AT_ONCE)
-            systematic[rows] += _by_pattern(as_built, fits.R_world_body[rows])
-    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, settings.table)
+            part = by_pattern[first_row : first_row + FITTED_AT_ONCE]
+            systematic[first_row : first_row + FITTED_AT_ONCE] += part @ part.swapaxes(1, 2)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
     poses = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(poses.factor, poses.factor))
@@ -219,10 +223,9 @@ def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFi
 
 
 def _by_pattern(as_built: AsBuilt, R: Array) -> Array:
-    """(n, 6, 6) covariance of poses whose dots are misplaced, as far as seen, as a whole, too."""
+    """(n, 6, 3) change of poses whose dots are misplaced, as far as seen, as a whole, too: by one sigma of each way."""
     place, turn = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)
-    J = motions_of_pattern(R, as_built.disc)
-    return np.asarray(J * [place, place, turn] @ J.swapaxes(1, 2))
+    return np.asarray(motions_of_pattern(R, as_built.disc) * np.sqrt([place, place, turn]))
 
 
 def _shared_sigma(
@@ -233,9 +236,9 @@ def _shared_sigma(
     if not rows.size:
         return ()
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(SHARED_FRAMES, len(rows))).astype(int))]
-    parts = systematic[rows], _by_pattern(as_built, fits.R_world_body[rows])
-    whole, by_pattern = (np.mean(np.diagonal(part, axis1=1, axis2=2), axis=0) for part in parts)
-    further = {"what repeats in the dots": whole - by_pattern, "where the dots are on the disc": by_pattern}
+    whole = np.mean(np.diagonal(systematic[rows], axis1=1, axis2=2), axis=0)
+    by_pattern = np.mean(np.sum(_by_pattern(as_built, fits.R_world_body[rows]) ** 2, axis=2), axis=0)
+    further = {"what repeats in the dots": whole - by_pattern, OF_PATTERN: by_pattern}
     sigma, most = causes(rig, fits.sensitivity[rows], further)
     return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
 

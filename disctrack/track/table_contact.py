@@ -30,6 +30,7 @@ from disctrack.track.least_squares import chance_beyond
 from disctrack.track.pose import PoseFits
 
 SOURCES = ("both", "board", "disc")
+OF_PATTERN = "where the dots are on the disc"
 MIN_FRAMES = 30
 # Below, the direction of the contact is noise; above, a disc stands on its rim and may well slide or fall.
 THETA_RANGE = np.radians(0.7), np.radians(85.0)
@@ -71,18 +72,22 @@ class TableFromDisc:
 
 
 def table_from_disc(
-    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc, source: str = "both"
+    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc, source: str = "both", by_pattern: Array | None = None
 ) -> tuple[PoseFits, Array, StereoRig, TableFromDisc | None]:
     """Poses, their systematic covariance and rig with the world's table where board and disc have it.
 
     fits : with the covariances of the frames' noise; systematic (n, 6, 6). What is returned holds their arrays, altered
     source : one of SOURCES; with "board" nothing is moved, and the difference is told
+    by_pattern : (n, 6, k) how poses change by one sigma of the pattern's own place on the disc, which is not in
+        `systematic`: a pattern off the centre by d lifts and lowers the rim by d sin(theta) as the disc turns, which
+        looks like a table that leans while phi follows -psi
     None, and nothing changed, where the rig has no table or the disc did not touch one.
     """
-    found = _contacts(fits, systematic, rig, disc) if rig.world_is_table else None
+    found = _contacts(fits, systematic, rig, disc, by_pattern) if rig.world_is_table else None
     if found is None:
         return fits, systematic, rig, None
-    plane, middle, H, noise, by_radius, by_thickness, scatter, n = found
+    plane, middle, H, noise, by_radius, by_thickness, by_place, scatter, n = found
+    noise = noise + by_place @ by_place.T
     turn = rig.R_left_world
     M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
     M[24:27] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -127,6 +132,7 @@ def table_from_disc(
     allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
     for cause, column in (("the disc's radius", by_disc[:, 0]), ("the disc's thickness", 0.5 * by_disc[:, 1])):
         allowances.append(Allowance(cause, M @ gain @ column))
+    allowances += [Allowance(OF_PATTERN, M @ gain @ column) for column in by_place.T]
     covariance = 0.5 * (covariance + covariance.T)
     return moved, systematic, replace(rig, covariance=covariance, allowances=tuple(allowances)), told
 
@@ -177,10 +183,10 @@ def _narrowed(
 
 
 def _contacts(
-    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc
-) -> tuple[Array, Array, Array, Array, Array, Array, float, int] | None:
+    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc, by_pattern: Array | None = None
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, float, int] | None:
     """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane, its departure
-    for one tolerance of radius and of thickness, scatter, number of frames.
+    for one tolerance of radius and of thickness, by the pattern's place (3, k), scatter, number of frames.
     """
     with np.errstate(invalid="ignore"):
         theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
@@ -208,7 +214,11 @@ def _contacts(
         float(np.median(np.concatenate([np.einsum("ni,nij,nj->n", by_pose[p], C[rows[p]], by_pose[p]) for p in parts])))
         for C in (fits.covariance, systematic)
     )
-    if spread > max(MAX_SCATTER, NOISY * np.sqrt(noise + repeats)) or kept.sum() < max(MIN_FRAMES, 0.5 * len(rows)):
+    gap_by_place = (
+        np.zeros((len(rows), 0)) if by_pattern is None else np.einsum("ni,nik->nk", by_pose, by_pattern[rows])
+    )
+    told = noise + repeats + float(np.median(np.sum(gap_by_place**2, axis=1)))
+    if spread > max(MAX_SCATTER, NOISY * np.sqrt(told)) or kept.sum() < max(MIN_FRAMES, 0.5 * len(rows)):
         return None
     repeats = max(repeats, spread**2 - noise, 0.0)
     inverse = np.linalg.inv(information)
@@ -221,7 +231,7 @@ def _contacts(
     sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
     by_radius = gain @ sine * radius_tolerance(disc)
     by_thickness = gain @ R[:, 2, 2] * 0.5 * thickness_tolerance(disc)
-    return plane, middle, by_rig, covariance, by_radius, by_thickness, spread, int(kept.sum())
+    return plane, middle, by_rig, covariance, by_radius, by_thickness, gain @ gap_by_place, spread, int(kept.sum())
 
 
 def _contact(R: Array, t: Array, disc: Disc, normal: Array) -> tuple[Array, Array]:

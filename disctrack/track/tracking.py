@@ -46,6 +46,9 @@ from disctrack.trajectory import FrameStatus
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
 MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
+# [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
+# wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
+LOOK_AGAIN = 60e-6
 PAIRS_TRIED = 12  # where no disc is found, for what else is wrong: some more than the refinement of a rig takes
 STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
@@ -103,7 +106,6 @@ def track(
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
     settings = settings or TrackingSettings()
-    n = len(pairs)
     spread = disc.marker_centres_body - disc.marker_centres_body.mean(axis=0)
     if disc.n_markers < 3 or np.linalg.matrix_rank(spread, tol=0.1 * disc.marker_diameter) < 2:
         raise TrackingError(
@@ -112,12 +114,53 @@ def track(
             + ": a pose needs at least three dots that are not on one line"
         )
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-    tables = empty_tables(n, disc.n_markers)
     with ThreadPoolExecutor(2) as pool:
         maps = list(pool.map(normalised_maps, rig.cameras))
     maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
-    edges = stretch_edges(pairs, disc)
     setup = TrackingSetup(rig, disc, settings.limits, maps_x, maps_y)
+    edges = stretch_edges(pairs, disc)
+    followers, tables = _followed(read_blocks, edges, setup, settings, workers, progress)
+    if not np.isfinite(tables.t).any():
+        reason = next((f.first_reason for f in followers if f.first_reason), "")
+        stop = "" if reason.endswith("?") else "."
+        told = f"First search: {reason.rstrip('.')}{stop} {MOVED}" if reason else "No image could be read"
+        if arranged := _arrangement(read_blocks, rig, disc, pairs):
+            told = f"It is there if {arranged}"
+        raise TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}")
+    if timestamps is None:
+        timestamps = np.array(pairs) / frame_rate
+    when = np.asarray(timestamps, float)
+    tracking = assemble(followers, tables, settings, frame_rate, gravity, when, pairs)
+    found = tracking.trajectory.disc
+    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not tracking.doubts:
+        again = replace(setup, disc=found)
+        followers, tables = _followed(read_blocks, edges, again, settings, workers, lambda n: None)
+        for follower in followers:
+            follower.setup = setup
+        tracking = assemble(followers, tables, settings, frame_rate, gravity, when, pairs)
+    tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
+    status = tracking.trajectory.frame_status
+    one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)
+    left_out = any(LEFT_OUT in doubt for doubt in tracking.doubts)  # which makes cameras contradict each other
+    if one_sided or (np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY and not left_out):
+        first = np.flatnonzero((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))[0]
+        if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
+            told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
+            tracking = replace(tracking, doubts=(told, *tracking.doubts))
+    return tracking
+
+
+def _followed(
+    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]],
+    edges: list[int],
+    setup: TrackingSetup,
+    settings: TrackingSettings,
+    workers: int,
+    progress: Callable[[int], object],
+) -> tuple[list[Follower], Tables]:
+    """The disc followed through the stretches between edges; arguments as of `track`."""
+    pairs = range(edges[0], edges[-1])
+    tables = empty_tables(len(pairs), setup.disc.n_markers)
     followers = [Follower(setup, search=Search(always=settings.search_always)) for _ in edges[1:]]
     for number, follower in enumerate(followers):
         follower.given = partial(_first_law, followers[:number])
@@ -129,7 +172,7 @@ def track(
         number = share.start
         try:
             for block in read_blocks(edges[share.start], edges[share.stop]):
-                check_images(block.images, rig)
+                check_images(block.images, setup.rig)
                 for part in _cut(block, edges):
                     while part.start >= edges[number + 1]:
                         followers[number].finish()
@@ -169,26 +212,7 @@ def track(
     for k in range(1, len(followers)):
         if _torn(tables, edges[k] - pairs.start):  # another branch of phi was found: go on from the stretch before
             carry_on(followers[k - 1], followers[k], edges[k], edges[k + 1])
-    if not np.isfinite(tables.t).any():
-        reason = next((f.first_reason for f in followers if f.first_reason), "")
-        stop = "" if reason.endswith("?") else "."
-        told = f"First search: {reason.rstrip('.')}{stop} {MOVED}" if reason else "No image could be read"
-        if arranged := _arrangement(read_blocks, rig, disc, pairs):
-            told = f"It is there if {arranged}"
-        raise TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}")
-    if timestamps is None:
-        timestamps = np.array(pairs) / frame_rate
-    tracking = assemble(followers, tables, settings, frame_rate, gravity, np.asarray(timestamps, float), pairs)
-    tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
-    status = tracking.trajectory.frame_status
-    one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)
-    left_out = any(LEFT_OUT in doubt for doubt in tracking.doubts)  # which makes cameras contradict each other
-    if one_sided or (np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY and not left_out):
-        first = np.flatnonzero((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))[0]
-        if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
-            told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
-            tracking = replace(tracking, doubts=(told, *tracking.doubts))
-    return tracking
+    return followers, tables
 
 
 def _arrangement(

@@ -10,6 +10,7 @@ from calibration.camera import N_RIG
 from disctrack.diagnosis.trials.recordings import Unseen
 from disctrack.frames import rotation_from_quaternion
 from disctrack.track import table_contact
+from disctrack.track.as_printed import motions_of_pattern
 from disctrack.track.pose import fit_poses
 from disctrack.track.table_contact import table_from_disc
 from tests.oracles.measured_disc import measured
@@ -79,6 +80,24 @@ def test_true_table_is_left_where_it_is():
     table = table_from_disc(*poses_of(trajectory), trajectory.rig, trajectory.disc)[3]
     assert table.probability > 1e-3
     assert np.all(np.abs(table.plane) < 4 * np.hypot(table.sigma, table.board_sigma))
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)])
+def test_a_pattern_off_the_centre_leans_the_rims_table_within_its_sigma(way):
+    """Dots placed by a ruler: the centre is 40 um off, and as phi follows -psi the rim seems to roll on a slope."""
+    off = 40e-6
+    trajectory = measured(n=200)
+    fits, none = poses_of(trajectory)
+    shifted = replace(fits, t_world_body=fits.t_world_body + off * fits.R_world_body[:, :, :2] @ np.array(way))
+    ways = off * motions_of_pattern(fits.R_world_body, trajectory.disc)[:, :, :2]
+
+    def pull(by_pattern):
+        fresh = replace(shifted, covariance=fits.covariance.copy(), sensitivity=fits.sensitivity.copy())
+        table = table_from_disc(fresh, none.copy(), trajectory.rig, trajectory.disc, "disc", by_pattern=by_pattern)[3]
+        return np.abs(table.plane[1:]) / np.hypot(table.sigma, table.board_sigma)[1:]
+
+    assert pull(None).max() > 6.0  # negative control: as if the dots' middle were the disc's
+    assert pull(ways).max() < 2.0
 
 
 def test_derivative_by_the_rig_agrees_with_differences(leaning):
