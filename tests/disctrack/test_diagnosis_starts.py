@@ -1,5 +1,6 @@
 """Recordings that do not hold rolling alone: slip at first, a hand, a disc at rest or flat, lost frames, few frames."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 from disctrack.diagnosis import diagnose_trajectory
 from disctrack.diagnosis.disc import slip_start
 from disctrack.diagnosis.disc.stretch import free_stretch
+from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.engine.search import Settings
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.errors import AnalysisError
 from disctrack.rolling import Model, Regime, simulate, steady_precession
@@ -93,6 +97,28 @@ def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
     end = next(s.time for s in true.switches if s.after is Regime.ROLLING) - 0.002  # the film begins 2 ms later
     (note,) = [text for text in result.notes if "slips at first" in text]
     assert f"until {end:.3f}"[:-1] in note
+
+
+@pytest.mark.parametrize("n", [300, pytest.param(900, marks=pytest.mark.slow)])
+def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
+    """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within 1e6 steps."""
+    trajectory = measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0)
+    began = time.process_time()
+    result = diagnose_trajectory(trajectory, separate=False)
+    assert time.process_time() - began < 60.0  # 3 and 13 s were measured
+    assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
+    assert result.after.reduced_chi_square < 1.03 < 1000 < result.before.reduced_chi_square
+    inverse, sigma = result.after_fit.values["slip.inverse_mu"], result.after_fit.sigma("slip.inverse_mu")
+    assert abs(inverse - 1 / 0.06) < 4 * sigma
+    assert sigma < 0.002 / 0.06
+
+
+@pytest.mark.parametrize("effects", [{"table_tilt.tilt_x": 5e-3}, {"kz.k_z": 3e-4}, {"slip.mu": 0.1}])
+def test_what_rolls_at_first_does_not_begin_in_slip(effects):
+    trajectory = measured(effects, seed=100, n=150, theta_deg=20.0)
+    system = DiscSystem(trajectory, PAPER)
+    assert fit(system, system.base, system.start({})).reduced_chi_square > slip_start.EXCESS
+    assert not slip_start._slips_slowly(trajectory, PAPER, {}, Settings(), system)
 
 
 def test_slip_to_the_end_of_the_recording_is_found_too():

@@ -1,8 +1,8 @@
 """Recordings that begin in slip: the disc was hit, and rolls only after friction has stopped its sliding.
 
-Rolling from the first frame on is tried first. Where that fails, the contact's velocity decides, which needs no model
-of the motion; slip is then fitted by its coefficient and the velocity at the first instant, and where no coefficient
-describes it, the diagnosis begins where rolling does.
+Rolling from the first frame on is tried first. Where that fails, slip of mm/s is fitted, which no velocity shows; then
+the contact's velocity decides, which needs no model of the motion. Slip is fitted by its coefficient and the velocity
+at the first instant, and where no coefficient describes it, the diagnosis begins where rolling does.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
+from disctrack.diagnosis.disc.errors import simulated
 from disctrack.diagnosis.disc.large_faults import Assumed, find_clock, find_large, in_words, with_large
 from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, slip_candidate
 from disctrack.diagnosis.disc.start import first_slip
@@ -25,7 +26,7 @@ from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
 from disctrack.diagnosis.engine.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
-from disctrack.rolling import CATALOGUE, Model
+from disctrack.rolling import CATALOGUE, Model, Regime
 from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
@@ -38,6 +39,8 @@ CREEPS_BESIDE = (
     "slip with Coulomb's friction is all that was fitted: with so little of it the disc creeps, and other effects "
     "beside it would take too long to try"
 )
+EXCESS = 10.0  # variances of the noise; above it slip at mm/s is looked for over ...
+LASTS = 5  # ... so many frames at least: contact velocities that are errors of a fit stop within one
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
@@ -105,6 +108,9 @@ def _rolling_or_slipping(
 ) -> SlipDiagnosis:
     """The diagnosis of a motion without large faults. Raises GivenUp where slip would take too long to follow."""
     stretch, systematic = rolling.stretch, rolling.systematic
+    large = not base.reduced_chi_square <= EXCESS * noise_variance(rolling, base)
+    if large and _slips_slowly(trajectory, model, faults, settings, rolling):
+        return _slipping(trajectory, model, faults, settings, rolling, base, None)
     may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
@@ -116,6 +122,29 @@ def _rolling_or_slipping(
         if _at_noise(slipping, alone, settings):
             return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
+
+
+def _slips_slowly(
+    trajectory: Trajectory,
+    model: Model,
+    faults: Mapping[str, float],
+    settings: Settings,
+    rolling: DiscSystem,
+) -> bool:
+    """Does slip over the first frames bring a residual far above the noise down to it?
+
+    Friction below what rolling needs holds the contact's velocity at mm/s, which no first poses show; a fit does. Three
+    numbers that do away with all of an EXCESS are not those of another effect.
+    """
+    slipping = DiscSystem(
+        trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=rolling.systematic
+    )
+    slipping.patience = rolling.patience
+    alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
+    if not _at_noise(slipping, alone, settings):
+        return False
+    motion = simulated(slipping, alone.values)
+    return bool((motion.regime[:LASTS] == Regime.SLIPPING).all())
 
 
 def _without_slip(system: DiscSystem) -> tuple[Candidate, ...]:
@@ -146,7 +175,7 @@ def _slipping(
     settings: Settings,
     rolling: DiscSystem,
     base: Fit,
-    onset: RollingOnset,
+    onset: RollingOnset | None,
 ) -> SlipDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     systematic = rolling.systematic
@@ -158,7 +187,7 @@ def _slipping(
     except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
         system = DiscSystem(trajectory, model, (), stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
         diagnosis, crept = diagnose(system, system.start(faults), settings), (CREEPS_BESIDE,)
-    if not crept and diagnosis.verdict == "unexplained" and np.isfinite(onset.high):
+    if not crept and diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
         later = _after_slip(rolling, faults, settings, onset, diagnosis)
         if later is not None:
             return later
@@ -216,9 +245,6 @@ def _candidate(system: DiscSystem) -> Candidate:
 
 
 def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:
-    from disctrack.diagnosis.disc.errors import simulated
-    from disctrack.rolling import Regime
-
     if not diagnosis.after.converged:
         return ()
     motion = simulated(system, diagnosis.after.values)

@@ -393,6 +393,8 @@ class DiscSystem:
         fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
         if not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest:
             return _nowhere(len(times))
+        if self.starts_in_slip and model.effect("slip") is None:  # 1/mu = 0: nothing slips, and no velocity is free
+            return _nowhere(len(times))
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
         left = self.patience.left
         found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit, left)
