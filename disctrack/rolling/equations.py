@@ -235,6 +235,7 @@ def _apply_laws(table: Any, w: Any) -> None:
     w.table_x = w.table_y = w.table_z = 0.0
     w.table_vx = w.table_vy = w.table_vz = 0.0
     w.table_ax = w.table_ay = w.table_az = 0.0
+    w.field_x = w.field_y = w.field_z = 0.0
     for i in range(table[1]):
         call_law(table[HEADER + 2 * i], table[HEADER + 1 + 2 * i], table[2], table[3])
 
@@ -264,8 +265,8 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     com = (body.com_1 * cf - body.com_2 * sf, body.com_1 * sf + body.com_2 * cf, body.com_3)
     D = _add(arm, _scale(-1.0, com))
     sp, cp = np.sin(kin.psi), np.cos(kin.psi)
-    g_x, g_y, g_z = body.g_x - w.table_ax, body.g_y - w.table_ay, body.g_z - w.table_az
-    g = _nodal(g_x * cp + g_y * sp, g_y * cp - g_x * sp, g_z, s, c)
+    g_x, g_y = body.g_x + w.field_x - w.table_ax, body.g_y + w.field_y - w.table_ay
+    g = _nodal(g_x * cp + g_y * sp, g_y * cp - g_x * sp, body.g_z + w.field_z - w.table_az, s, c)
     X = _nodal(w.X_n, w.X_m, w.X_z, s, c)
     M0 = _nodal(w.M_n, w.M_m, w.M_z, s, c)
     L = _nodal(w.load_n, w.load_m, w.load_z, s, c)

@@ -53,7 +53,7 @@ def kinematics(
 
 
 def effect_wrench(effect: Effect, motion: Any, load: ArrayLike) -> tuple[Array, Array]:
-    """Contact moment and force on O of one effect, each (..., 3) in (n0, m0, k) [N m, N].
+    """Contact moment and force of one effect, each (..., 3) in (n0, m0, k) [N m, N].
 
     motion : records.KINEMATICS by attribute, as `kinematics` gives them.   load : (...) normal force F_z [N]
     """
@@ -63,11 +63,14 @@ def effect_wrench(effect: Effect, motion: Any, load: ArrayLike) -> tuple[Array, 
     if effect.law is not None:
         effect.law(SimpleNamespace(**effect.values), motion, w)
     moment = [getattr(w, f"M_{a}") + load * getattr(w, f"load_{a}") for a in "nmz"]
-    return np.stack(moment, axis=-1), np.stack([w.X_n, w.X_m, w.X_z], axis=-1)
+    c, s, m = np.cos(motion.psi), np.sin(motion.psi), motion.mass
+    field_n, field_m = w.field_x * c + w.field_y * s, w.field_y * c - w.field_x * s
+    force = [w.X_n + m * field_n, w.X_m + m * field_m, w.X_z + m * w.field_z]
+    return np.stack(moment, axis=-1), np.stack(force, axis=-1)
 
 
 def effect_power(effect: Effect, motion: Any, load: ArrayLike) -> Array:
-    """Power of an effect's moment and force (...) [W]: never positive for a passive one."""
+    """Power of an effect's moment, and of its force at O (...) [W]: never positive for a passive one."""
     moment, force = effect_wrench(effect, motion, load)
     rates = np.stack([motion.thetadot, -motion.phidot * motion.sin_theta, motion.omega_z], axis=-1)
     velocity = np.stack([motion.v_n, motion.v_m, motion.v_z], axis=-1)

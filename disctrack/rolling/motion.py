@@ -61,7 +61,7 @@ class Motion:
     energy_potential: Array  # (n,) [J] zero where the disc lies flat at the origin
     contact_force: Array  # (n, 3) F_n, F_m, F_z [N]
     contact_moment: Array  # (n, 3) M_n, M_m, M_z [N m]
-    external_force: Array  # (n, 3) X_n, X_m, X_z at O [N], gravity not included
+    external_force: Array  # (n, 3) X_n, X_m, X_z at O, and a field's at the centre of mass [N]; no gravity
     slip_velocity: Array  # (n, 2) of the disc's material point at the contact, along n0, m0 [m/s]; zero when rolling
     power: Array  # (n,) [W] of contact force, moments and external force: dE/dt
     regime: NDArray[np.uint8]  # (n,) Regime
@@ -148,12 +148,15 @@ def motion_from_samples(
     contact_axes = np.stack(
         [axes[:, :, 0], np.cross([0, 0, 1], axes[:, :, 0]), np.tile([0.0, 0, 1], (len(k), 1))], axis=-1
     )
+    pull = b["mass"] * np.stack([w[f"field_{a}"] for a in "xyz"], axis=-1)
+    external += np.einsum("nij,ni->nj", contact_axes, pull)
     a_G = np.einsum("nij,nj->ni", contact_axes, force + external) / b["mass"] + gravity
     slip = np.stack([k["slip_n"], k["slip_m"]], axis=-1)
     slip[samples.regime == Regime.ROLLING] = 0.0
     slip_power = np.where(samples.regime == Regime.SLIPPING, w["F_n"] * k["slip_n"] + w["F_m"] * k["slip_m"], 0.0)
     to_contact = np.swapaxes(contact_axes, 1, 2)
     external_power = np.sum(external * np.einsum("nij,nj->ni", to_contact, qdot[:, :3]), axis=-1)
+    external_power += np.sum(pull * np.cross(omega, com), axis=-1)  # at the centre of mass, and not at O
     table_velocity = np.stack([w[f"table_v{a}"] for a in "xyz"], axis=-1)
     table_power = np.sum(force * np.einsum("nij,nj->ni", to_contact, table_velocity), axis=-1)
     return Motion(

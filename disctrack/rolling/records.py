@@ -68,6 +68,7 @@ WRENCH = (
     *(f"table_{a}" for a in "xyz"),  # where the table is, in the axes of cameras at rest [m]; q is relative to it
     *(f"table_v{a}" for a in "xyz"),  # its velocity [m/s]
     *(f"table_a{a}" for a in "xyz"),  # and acceleration [m/s^2]
+    *(f"field_{a}" for a in "xyz"),  # uniform field beside gravity, world axes [m/s^2]: it pulls at the centre of mass
 )
 
 # Constants of one body on one table. Inertia about the centre of mass in body axes.

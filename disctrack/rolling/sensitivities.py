@@ -28,7 +28,7 @@ _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
 _UNEVEN = ("curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth")
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
 _OF_PLACE = {"x": {"x"}, "y": {"y"}, "phi": {"phi"}}  # kinematics by which a law breaks the symmetry
-_OF_DIRECTION = {"x", "y", "psi", *(f"table_{v}{a}" for v in ("", "v", "a") for a in "xy")}
+_OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}
 
 
 @dataclass(frozen=True)

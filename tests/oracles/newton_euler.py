@@ -279,9 +279,14 @@ def spring(k, point=(0.0, 0.0)):
 
 
 def vibration(cosine, sine, frequency):
-    """Of a table, in its own axes; accelerations."""
+    """Of a table, in its own axes; accelerations, so that the force is on the centre of mass."""
     course = lambda t: np.cos(2 * np.pi * frequency * t) * cosine + np.sin(2 * np.pi * frequency * t) * sine  # noqa: E731
-    return lambda disc, now: (ZERO, ZERO, -disc.m * course(disc.t))
+
+    def law(disc, now):
+        force = -disc.m * course(disc.t)
+        return np.cross(now.R @ disc.com, force), ZERO, force
+
+    return law
 
 
 def swing(cosine, sine, frequency, start=0.0):

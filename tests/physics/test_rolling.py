@@ -105,6 +105,15 @@ def test_energy_lost_is_the_work_of_the_contact_moment():
     assert_allclose(motion.energy[-1] - motion.energy[0], work, atol=3e-10)
 
 
+def test_a_vibration_that_the_cameras_share_works_on_the_centre_of_mass():
+    shaken = CATALOGUE["table_vibration"](a_cos_x=0.5, a_sin_z=0.8, frequency=40.0)
+    model = IDEAL.with_effects(shaken, CATALOGUE["centre_of_mass"](c_1=2e-3, c_2=-1e-3, c_3=4e-4))
+    motion = rolling.simulate(model, steady_precession(np.radians(20), MA_2014, omega3=1.0), 0.1, rate=20000.0)
+    assert np.ptp(motion.energy) > 1e-5
+    # Simpson's rule at 50 us on rates of 250 1/s: (0.0125)^4 / 180 = 1e-10 of the energy exchanged
+    assert_allclose(motion.energy[-1] - motion.energy[0], simpson(motion.power, x=motion.time), atol=1e-13)
+
+
 @pytest.mark.parametrize(("k_m", "theta_deg"), [(0.381e-7, 7.93), (0.28e-7, 6.46)])
 def test_published_friction_stops_the_disc_in_about_one_and_a_half_seconds(k_m, theta_deg):
     r, g = MA_2014.radius, 9.81

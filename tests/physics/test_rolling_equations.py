@@ -215,6 +215,19 @@ EFFECTS = {
             "gravity": 9.81 * np.array([0.03, -0.02, -np.sqrt(1 - 0.03**2 - 0.02**2)]),
         },
     ),
+    "vibrating with its cameras": (
+        {
+            "table_vibration": {
+                **{"a_cos_x": 0.3, "a_cos_y": -0.2, "a_cos_z": 0.5, "a_sin_x": 0.7, "a_sin_y": 0.4, "a_sin_z": -0.1},
+                "frequency": 60.0,
+            },
+            "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4},
+        },
+        {
+            "laws": STANDING_FORCES[1:],
+            "com_body": (1e-3, -5e-4, 3e-4),
+        },
+    ),
     "hollow": (
         {
             "table_curved": {"kappa": 0.8, "slope_x": 0.03, "slope_y": -0.02},
@@ -291,7 +304,11 @@ def test_accelerations_and_forces_agree_with_the_world_vector_system(name, regim
     model = model.with_effects(CATALOGUE["slip"](mu=0.3))
     oracle.mu = 0.3
     if regime == "flying":  # contact laws do nothing in the air; drag, spring and vibration act there too
-        in_air = {"forces": [newton_euler.linear_drag(0.02), *STANDING_FORCES], "thin air": oracle.laws[1:]}
+        in_air = {
+            "forces": [newton_euler.linear_drag(0.02), *STANDING_FORCES],
+            "thin air": oracle.laws[1:],
+            "vibrating with its cameras": oracle.laws,
+        }
         oracle.laws = in_air.get(name, [])
     for _ in range(20):
         state = random_state(rng)

@@ -87,6 +87,7 @@ def test_all_columns_at_once_equal_those_one_by_one():
         ({"slip.mu": 0.2, "table_yielding.c": 1e-7}, {"x", "y", "psi", "phi"}),
         ({"table_tilt.tilt_x": 1e-3}, {"x", "y", "phi"}),
         ({"table_shaken.u_cos_x": 1e-5}, {"x", "y", "phi"}),
+        ({"table_vibration.a_cos_x": 0.1}, {"x", "y", "phi"}),
         ({"centre_of_mass.c_1": 1e-4}, {"x", "y", "psi"}),
         ({"inertia_product.J_13": 1e-9}, {"x", "y", "psi"}),
         ({"spring.k": 0.1}, {"phi"}),

@@ -25,7 +25,7 @@ def spring(p: Any, s: Any, w: Any) -> None:
 
 
 @effect(
-    "table and cameras vibrate: X = -m (a_cos cos 2 pi f t + a_sin sin 2 pi f t)",
+    "table and cameras vibrate: gravity g - a_cos cos 2 pi f t - a_sin sin 2 pi f t",
     "inertial force in an accelerated frame",
     *(EffectParameter(f"a_cos_{a}", "m/s^2", 0.1, f"acceleration of the table along {a} at t = 0") for a in "xyz"),
     *(EffectParameter(f"a_sin_{a}", "m/s^2", 0.1, f"along {a}, a quarter of a period later") for a in "xyz"),
@@ -36,16 +36,14 @@ def spring(p: Any, s: Any, w: Any) -> None:
     candidate=False,
 )
 def table_vibration(p: Any, s: Any, w: Any) -> None:
-    """The table swings with one frequency, and the cameras with it: in their axes an inertial force on the disc.
+    """The table swings with one frequency, and the cameras with it: in their axes gravity swings.
 
     In a diagnosis it is found without being named beforehand, with its frequency, as a force that swings.
     """
     c, d = np.cos(2 * np.pi * p.frequency * s.time), np.sin(2 * np.pi * p.frequency * s.time)
-    X_x = -s.mass * (p.a_cos_x * c + p.a_sin_x * d)
-    X_y = -s.mass * (p.a_cos_y * c + p.a_sin_y * d)
-    w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
-    w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
-    w.X_z -= s.mass * (p.a_cos_z * c + p.a_sin_z * d)
+    w.field_x -= p.a_cos_x * c + p.a_sin_x * d
+    w.field_y -= p.a_cos_y * c + p.a_sin_y * d
+    w.field_z -= p.a_cos_z * c + p.a_sin_z * d
 
 
 @effect(
