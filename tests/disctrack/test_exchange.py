@@ -65,6 +65,7 @@ def trajectory(rig, rng) -> Trajectory:
         rig=rig,
         frame_rate=1000.0,
         gravity=9.81,
+        air_density=0.7,
     )
 
 
@@ -153,6 +154,7 @@ def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):
     assert np.array_equal(found["q_sigma_calibration"], trajectory.calibration_sigma, equal_nan=True)
     assert list(found["q_names"]) == list(COORDINATES)
     assert found["units"]["pose_covariance"].startswith("m and rad")
+    assert found["air_density_kg_m3"] == trajectory.air_density == 0.7
     assert np.array_equal(found["marker_centre_px"], trajectory.markers_px, equal_nan=True)
     with pytest.raises(OutputError, match="exists"):
         write_mat(path, trajectory)

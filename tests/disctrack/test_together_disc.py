@@ -85,7 +85,10 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
     assert abs(value - K_M) < 3 * sigma
     alone = [r["alone"]["parameters"]["km.k_m"]["sigma"] for r in document["recordings"]]
     assert sigma < 0.8 * min(alone)
-    assert "What many recordings bring" in (tmp_path / "out" / "diagnosis.html").read_text()
+    page = (tmp_path / "out" / "diagnosis.html").read_text()
+    assert "What many recordings bring" in page
+    for bound in document["bounds"]:  # of a vector every number
+        assert all(f"<td>{p['name']}" in page for p in bound["parameters"])
     assert main(words) == 0  # the complete result is used again
     assert main(["diagnose", str(paths[0]), str(paths[0])]) == 1
     assert "more than once" in capsys.readouterr().err

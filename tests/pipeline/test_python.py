@@ -106,6 +106,7 @@ def test_xarray_holds_time_units_and_both_sigmas(taken):
     assert np.array_equal(dataset.time, by_files.trajectory.time)
     assert np.array_equal(dataset.theta.sel(time=dataset.time[3]), by_files.trajectory.q[3, 4])
     assert dataset.x.attrs["units"] == "m"
+    assert dataset.attrs["air_density_kg_m3"] == by_files.trajectory.air_density
     assert np.array_equal(dataset.x_sigma_calibration, by_files.trajectory.calibration_sigma[:, 0])
     assert dataset.marker_centre_px.sel(camera="right").shape == (len(dataset.time), 6, 2)
 

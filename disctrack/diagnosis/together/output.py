@@ -260,10 +260,10 @@ def _by_number(answer: TogetherDiagnosis) -> str:
     numbers = sorted({k for b in shown for k in b.by_number})
     rows = []
     for b in shown:
-        q = b.candidate.quantities[0]
-        sigma = [f"{x:.2g}" if np.isfinite(x := float(b.by_number[k][0])) else "unseen" for k in numbers]
-        name = q.name + (f" [{q.unit}]" if q.unit != "1" else "")
-        rows.append([_short(b.candidate.title), name, *sigma, *_in_all(b, "1")])
+        for i, q in enumerate(b.candidate.quantities):
+            sigma = [f"{x:.2g}" if np.isfinite(x := float(b.by_number[k][i])) else "unseen" for k in numbers]
+            name = q.name + (f" [{q.unit}]" if q.unit != "1" else "")
+            rows.append(["" if i else _short(b.candidate.title), name, *sigma, *_in_all(b, i, "1")])
     of = [f"{k}" if k > 1 else "sigma from 1 recording" for k in numbers]
     header = ["effect", "number", *of, "all together", "at most (95 %)"]
     said = (
@@ -273,7 +273,9 @@ def _by_number(answer: TogetherDiagnosis) -> str:
     )
     rest = [b for b in answer.bounds if b not in shown]
     others = [
-        [b.candidate.title, b.candidate.quantities[0].name, *_in_all(b, b.candidate.quantities[0].unit)] for b in rest
+        ["" if i else b.candidate.title, q.name, *_in_all(b, i, q.unit)]
+        for b in rest
+        for i, q in enumerate(b.candidate.quantities)
     ]
     more = table("", ("effect", "number", "all together", "at most (95 %)"), others)
     return paragraph(said) + table("", header, rows) + details("All other effects", [more])
@@ -284,9 +286,9 @@ def _short(title: str) -> str:
     return re.split(r", (?=\S+ (?:=|<=) )", title)[0]
 
 
-def _in_all(b: Bound, unit: str) -> list[str]:
-    """Its size from all recordings, and its upper limit."""
-    value = quantity_text(float(b.values[0]), float(b.sigma[0]), unit) if np.isfinite(b.sigma[0]) else "unseen"
+def _in_all(b: Bound, i: int, unit: str) -> list[str]:
+    """Size of its i-th number from all recordings, and the upper limit of a single one."""
+    value = quantity_text(float(b.values[i]), float(b.sigma[i]), unit) if np.isfinite(b.sigma[i]) else "unseen"
     return [value, "" if b.upper is None else quantity_text(float(f"{b.upper:.2g}"), 0.0, unit)]
 
 

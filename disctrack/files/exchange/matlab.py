@@ -37,6 +37,7 @@ def write_mat(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Pa
         "status_names": np.array([status.name.lower() for status in FrameStatus], dtype=object),
         "frame_rate_hz": trajectory.frame_rate,
         "gravity_m_s2": trajectory.gravity,
+        "air_density_kg_m3": trajectory.air_density,
         "disc": {
             "radius_m": disc.radius,
             "half_thickness_m": disc.half_thickness,

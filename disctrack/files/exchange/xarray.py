@@ -36,6 +36,7 @@ def to_xarray(trajectory: Trajectory) -> Any:
     attributes = {
         "frame_rate_hz": trajectory.frame_rate,
         "gravity_m_s2": trajectory.gravity,
+        "air_density_kg_m3": trajectory.air_density,
         "disc_radius_m": disc.radius,
         "disc_half_thickness_m": disc.half_thickness,
         "disc_mass_kg": disc.mass,
