@@ -13,6 +13,7 @@ from scipy.signal import periodogram
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import frequencies, simulated
+from disctrack.diagnosis.disc.form_misfit import LawCourse
 from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
 from disctrack.diagnosis.engine.held_out import HeldOut
@@ -33,6 +34,8 @@ def all_figures(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> tupl
         found.append(moment(result, beside.moment, beside.moment_of_law))
     if beside.measured is not None:
         found.append(force(result, beside.measured))
+    if result.learned is not None and result.learned.course is not None:
+        found.append(course(result.learned.course))
     found.append(candidates(result))
     return tuple(replace(d, name=f"{i:02d}_{d.name}") for i, d in enumerate(found, start=1))
 
@@ -186,6 +189,25 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
         )
     )
     return Drawn("missing_moment", "The missing moment", caption, figure)
+
+
+def course(known: LawCourse) -> Drawn:
+    """Moment about the contact of all laws, with the band of the learned law's coefficients and form."""
+    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
+    for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
+        value, sigma = 1e6 * known.moment[:, i], 1e6 * known.sigma[:, i]
+        axes.fill_between(known.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
+        axes.plot(known.time, value, lw=0.8, marker=".", ms=5, color=BLUE)
+        axes.axhline(0.0, color=MUTED, lw=0.7)
+        axes.set_ylabel(f"along {name} (µN m)")
+    grid[-1].set_xlabel("time [s]")
+    caption = (
+        "Moment about the contact of all laws of the model and of the law outside the catalogue, a force at the centre "
+        "included as the moment that it has about the contact, at the points shown. The band is two standard "
+        f"deviations, with what the law's form may be off by ({100 * known.misfit:.2g} % of the law) and the other "
+        "laws that fit as well."
+    )
+    return Drawn("course_of_the_laws", "How well the laws are known along the recording", caption, figure)
 
 
 def force(result: DiscDiagnosis, measured: ModelFreeForces) -> Drawn:
