@@ -104,6 +104,9 @@ class Trajectory(Brief):
     frame_rate: float  # [Hz]
     gravity: float  # [m/s^2]
     air_density: float = AIR_DENSITY  # [kg/m^3]
+    # Sizes by which the table's plane was moved from the board's to where the disc rolls, as far as their sigmas do not
+    # allow it: height at the origin [m], slopes along x and y. The board is bent, or the table is not flat
+    table_moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.time)

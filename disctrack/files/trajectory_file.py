@@ -244,6 +244,7 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "frame_rate_hz": trajectory.frame_rate,
         "gravity_m_s2": trajectory.gravity,
         "air_density_kg_m3": trajectory.air_density,
+        "table_moved_m_rad": trajectory.table_moved,
         **_CONVENTIONS,
     }
 
@@ -470,6 +471,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         expected = tuple(lengths[axis] for axis in dims)
         if found[attribute].shape != expected:
             raise TrajectoryFileError(f"{attribute} has shape {found[attribute].shape}; expected {expected}")
+    height, slope_x, slope_y = map(float, file.attrs.get("table_moved_m_rad", np.zeros(3)))  # files of earlier versions
     trajectory = Trajectory(
         time=root["time"],
         q=np.column_stack([root[name] for name in COORDINATES]),
@@ -478,6 +480,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
         air_density=float(file.attrs.get("air_density_kg_m3", AIR_DENSITY)),  # files of earlier versions
+        table_moved=(height, slope_x, slope_y),
         **found,
     )
     _check_values(trajectory)

@@ -138,6 +138,8 @@ def assemble(
     shared = _shared_sigma(fits, systematic, as_built, rig)
     as_built = replace(as_built, rig=rig)
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
+    if table is not None:
+        trajectory = replace(trajectory, table_moved=table.beyond)
     warnings = warnings_of(first, factor, faults, scatter, poses, table, trajectory)
     return Tracking(
         trajectory=trajectory,

@@ -13,6 +13,10 @@ to each other.
 How far board and disc differ also tells how well both were made: two errors hardly cancel. So what was assumed of the
 board, and apart from it of the disc, without being declared, is narrowed to the difference that is seen.
 
+Where they differ by more than both sigmas allow, the one that bends is as a rule the board. It may be the table itself:
+a hollow that is rolled along is a slope there. So what is moved beyond the sigmas is kept (`TableFromDisc.beyond`), and
+whoever fits the motion lets the table's plane free by so much.
+
 This is geometry alone. A table that is not level leans in the world and against gravity; here the world leans with it.
 """
 
@@ -54,6 +58,7 @@ class TableFromDisc:
     sigma: Array  # (3,) of the plane by the disc: noise, what repeats, tolerances of the disc
     board_sigma: Array  # (3,) of the table by the board, the rig's covariance
     applied: Array  # (3,) by which the world was moved
+    beyond: tuple[float, float, float]  # sizes of what of this both sigmas do not allow: at the origin [m], slopes
     probability: float  # that board and disc differ by as much if both sigmas are right
     scatter: float  # [m] of the gaps about the plane
     n_frames: int
@@ -104,11 +109,15 @@ def table_from_disc(
     stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
     # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
     allowed = np.diag(board + V)
-    more = board + np.diag(np.where(plane**2 > 9.0 * allowed, plane**2 - allowed, 0.0))
+    excess = np.where(plane**2 > 9.0 * allowed, plane**2 - allowed, 0.0)
+    more = board + np.diag(excess)
     gains = {"board": np.zeros((3, 3)), "disc": np.eye(3)}
     # of what the plane is as these cameras see the disc: errors that both share do not count
     gain = gains[source] if source in gains else more @ np.linalg.inv(more + V)
     applied = gain @ plane
+    beyond = np.minimum(excess, applied**2)
+    beyond[0] += middle**2 @ beyond[1:]  # at the origin
+    height, slope_x, slope_y = np.sqrt(beyond).tolist()
     kept = np.eye(N_RIG) - M @ gain @ H
     covariance = kept @ rig.covariance @ kept.T + M @ gain @ stated @ gain.T @ M.T
     told = TableFromDisc(
@@ -118,6 +127,7 @@ def table_from_disc(
         told_sigma,
         told_board,
         applied,
+        (height, slope_x, slope_y),
         float(chance_beyond(difference, 3)),
         scatter,
         n,

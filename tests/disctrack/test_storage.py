@@ -87,6 +87,7 @@ def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
         frame_rate=1000.0,
         gravity=9.81,
         air_density=0.3,
+        table_moved=(1e-4, 0.0, 2e-3),
     )
 
 

@@ -7,8 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.camera import N_RIG
+from disctrack.diagnosis.stage import diagnose_trajectory
 from disctrack.diagnosis.trials.recordings import Unseen
-from disctrack.frames import rotation_from_quaternion
+from disctrack.frames import (
+    euler_from_rotation,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    unwrap_euler,
+)
 from disctrack.track import table_contact
 from disctrack.track.as_printed import motions_of_pattern
 from disctrack.track.pose import fit_poses
@@ -71,6 +77,10 @@ def test_board_and_disc_count_as_their_sigmas_say(leaning):
     assert_allclose(told["board"].applied, 0.0, atol=0)
     assert_allclose(told["both"].applied, told["both"].plane, rtol=0.1)  # it differs by more than a board may
     assert told["both"].probability < 1e-2
+    assert told["board"].beyond == (0.0, 0.0, 0.0)
+    height, *slopes = told["both"].beyond
+    assert 0.9 * HEIGHT < height < 1.5 * HEIGHT  # with what the slopes are worth at the origin
+    assert_allclose(slopes, np.abs(told["both"].applied[1:]), rtol=0.1)
     sure = replace(leaning.disc, thickness_tolerance=1e-3)  # a disc that nobody measured: the board tells
     assert abs(table_from_disc(*poses_of(leaning), leaning.rig, sure)[3].applied[0]) < 0.1 * HEIGHT
 
@@ -79,6 +89,7 @@ def test_true_table_is_left_where_it_is():
     trajectory = measured(n=200)
     table = table_from_disc(*poses_of(trajectory), trajectory.rig, trajectory.disc)[3]
     assert table.probability > 1e-3
+    assert table.beyond == (0.0, 0.0, 0.0)
     assert np.all(np.abs(table.plane) < 4 * np.hypot(table.sigma, table.board_sigma))
 
 
@@ -98,6 +109,22 @@ def test_a_pattern_off_the_centre_leans_the_rims_table_within_its_sigma(way):
 
     assert pull(None).max() > 6.0  # negative control: as if the dots' middle were the disc's
     assert pull(ways).max() < 2.0
+
+
+@pytest.mark.slow
+def test_hollow_that_was_taken_for_a_slope_is_found_alone():
+    """Where the disc rolls, a radius of 4 m is a slope: tracking turns the world by it, and the diagnosis back."""
+    trajectory = measured({"table_curved.kappa": 0.25}, n=220)
+    fits, _, rig, table = table_from_disc(*poses_of(trajectory), trajectory.rig, trajectory.disc)
+    assert np.hypot(*table.applied[1:]) > 2e-3
+    q = np.column_stack([fits.t_world_body, unwrap_euler(euler_from_rotation(fits.R_world_body))])
+    levelled = replace(trajectory, q=q, quaternion=quaternion_from_rotation(fits.R_world_body), rig=rig)
+    result = diagnose_trajectory(replace(levelled, table_moved=table.beyond), separate=False)
+    assert [found.candidate.name for found in result.diagnosis.found] == ["table_curved"]
+    values, fit = result.after_fit.values, result.after_fit
+    assert abs(values["table_curved.kappa"] - 0.25) < 3 * fit.sigma("table_curved.kappa")
+    # as if the sigmas of board and disc held for the hollow, too
+    assert [f.candidate.name for f in diagnose_trajectory(levelled, separate=False).diagnosis.found] != ["table_curved"]
 
 
 def test_derivative_by_the_rig_agrees_with_differences(leaning):

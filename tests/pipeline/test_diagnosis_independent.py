@@ -12,7 +12,7 @@ import pytest
 from disctrack.cli import main
 from disctrack.scene.description import Faults
 from tests.oracles import newton_euler
-from tests.oracles.hidden_recording import body_of, full_scene, hide, small_scene
+from tests.oracles.hidden_recording import LEAD, body_of, full_scene, hide, small_scene
 
 G = 9.81
 CALIBRATION = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
@@ -105,9 +105,25 @@ def test_what_is_hidden_in_images_of_an_independent_motion_is_found(name, tmp_pa
     assert_found(diagnosis_of(recording), truth)
 
 
+SHAKEN = np.array([8e-6, -5e-6, 6e-6]), np.array([4e-6, 7e-6, -9e-6])  # [m] at the first frame, and a quarter later
+SHAKEN_NAMES = [f"u_{phase}_{axis}" for phase in ("cos", "sin") for axis in "xyz"]
 TABLES_AND_RIMS = {
     "spring": ({"laws": (newton_euler.spring(0.8),)}, {"spring": {"k": 0.8, "F_x": 0.0, "F_y": 0.0}}),
     "adhesion": ({"laws": (newton_euler.adhesive_rolling_friction(1e-4),)}, {"rolling_adhesive": {"a": 1e-4}}),
+    "hollow": (
+        {"bowl": ((0.0, 0.0, 2.0), 2.0)},
+        {"table_curved": {"kappa": 0.5, "slope_x": 0.0, "slope_y": 0.0}},
+    ),
+    "oval rim": ({"waves": ((2, 1.5e-4, -1e-4),)}, {"rim_oval": {"oval_c": 1.5e-4, "oval_s": -1e-4}}),
+    "flat of the rim": (
+        {"dips": ((4e-4, 2.3, 0.15),)},
+        {"rim_flat": {"depth": 4e-4, "angle": 2.3, "width": 0.15}},
+    ),
+    "yielding table": ({"gives_way": 5e-6}, {"table_yielding": {"c": 5e-6}}),
+    "shaken table": (
+        {"table": newton_euler.swing(*SHAKEN, 63.7, start=LEAD)},
+        {"table_shaken": dict(zip(SHAKEN_NAMES, np.ravel(SHAKEN), strict=True)) | {"frequency": 63.7}},
+    ),
 }
 
 
@@ -124,3 +140,20 @@ def test_what_a_table_or_a_rim_does_is_found_in_images(name, tmp_path):
         for parameter, (value, sigma) in sizes(document, effect).items():
             assert abs(value - numbers[parameter]) < 3 * sigma, (parameter, value, sigma)
     assert document["after"]["reduced_chi_square"] < 1.1
+
+
+@pytest.mark.slow
+def test_a_table_that_vibrates_with_its_cameras_is_found_in_images(tmp_path):
+    """30 um at 60 Hz: in the axes of both a force that swings, of which the diagnosis learns the frequency."""
+    acceleration = 3e-5 * (2 * np.pi * 60) ** 2 * np.array([0.6, 0.3, 0.7])
+    scene = small_scene(79, 250, 500.0)
+    body = body_of(scene, laws=(newton_euler.vibration(acceleration, 0 * acceleration, 60.0),))
+    document = diagnosis_of(hide(tmp_path, scene=scene, body=body, note="vibration"))
+    assert document["verdict"] == "unexplained", document["sentence"]
+    numbers = {p["name"]: (p["value"], p["sigma"]) for p in document["effects"][0]["parameters"]}
+    rate, sigma = numbers["rate_0"]
+    assert abs(rate - 2 * np.pi * 60) < 3 * sigma
+    assert document["after"]["reduced_chi_square"] < 1.1
+    for axis, true in enumerate(body.m * acceleration):
+        (c, c_sigma), (s, s_sigma) = numbers[f"c_0_{2 * axis}"], numbers[f"c_0_{2 * axis + 1}"]
+        assert abs(np.hypot(c, s) - true) < 3 * max(c_sigma, s_sigma)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,7 @@ _PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "rim": {"rim_oval": ("oval_c", "oval_s"), "rim_lobes": ("lobes_c", "lobes_s")},
 }
 SLIP = "slip.inverse_mu"
+ROUGHEST = 100.0  # coefficient of friction of a disc that is known to slip; without an end to it none does
 STATE_SCALES = {
     "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,
 }  # fmt: skip
@@ -42,7 +44,10 @@ def slipping_start_quantities(model: Model) -> tuple[Quantity, ...]:
     velocity = tuple(
         Quantity(name, "m/s", 1e-3, meaning="velocity of the centre at the first instant") for name in SLIP_VELOCITY
     )
-    return velocity if model.effect("slip") else (*velocity, *slip_candidate(CATALOGUE["slip"]).quantities)
+    if model.effect("slip"):
+        return velocity
+    (inverse,) = slip_candidate(CATALOGUE["slip"]).quantities
+    return (*velocity, replace(inverse, lower=1.0 / ROUGHEST))
 
 
 def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantity:

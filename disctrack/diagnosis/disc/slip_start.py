@@ -24,12 +24,14 @@ from disctrack.diagnosis.disc.systematic import find_systematic, with_noise_of_f
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
+from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
 from disctrack.rolling import CATALOGUE, Model, Regime
 from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
+FIRST_STEPS, MOST_LEFT = 4, 0.3  # towards another body or table, and the share of the misfit that they may leave
 MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
 CREEPS = (
     "slip with Coulomb's friction was given up: with so little of it the disc creeps, for longer than can be followed; "
@@ -114,6 +116,11 @@ def _rolling_or_slipping(
     may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
+        if _contact_lies_elsewhere(rolling, base):
+            others = DiscSystem(trajectory, model, _without_slip(rolling), stretch=stretch, systematic=systematic)
+            diagnosis, remarks = refine_shapes(others, diagnose(others, base.values, settings))
+            if diagnosis.verdict == "found":
+                return SlipDiagnosis(others, diagnosis, notes=(*stretch.notes, *remarks))
         return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
         slipping = DiscSystem(trajectory, model, stretch=stretch, starts_in_slip=True, systematic=systematic)
@@ -145,6 +152,26 @@ def _slips_slowly(
         return False
     motion = simulated(slipping, alone.values)
     return bool((motion.regime[:LASTS] == Regime.SLIPPING).all())
+
+
+def _contact_lies_elsewhere(rolling: DiscSystem, base: Fit) -> bool:
+    """Do some steps towards another body or table remove most of what slip would have to explain?
+
+    The velocity at the contact is that of a point of the rim as declared. Where the rim is not round or the table
+    moves, the disc touches elsewhere, and what rolls seems to slip.
+    """
+    if not base.converged:
+        return False
+    for c in rolling.candidates:
+        if c.effect in CATALOGUE and (CATALOGUE[c.effect].adjust or c.sought):
+            names = [q.name for q in c.shape]
+            for start in rolling.starts(c, base.values) or [()]:
+                values = base.values | dict(zip(names, start, strict=False))
+                others = (q for q in base.quantities if q.name not in c.names)
+                few = fit(rolling, (*others, *c.quantities), values, FIRST_STEPS)
+                if few.chi_square - few.n_data < MOST_LEFT * (base.chi_square - base.n_data):
+                    return True
+    return False
 
 
 def _without_slip(system: DiscSystem) -> tuple[Candidate, ...]:

@@ -137,25 +137,36 @@ class DiscSystem:
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
         of_faults = tuple(q for c in freed for q in c.quantities)
-        in_base = {q.name for q in (*of_slip, *of_faults)}
+        fitted = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults)
+        sizes = tuple(self._sizes({q.name for q in fitted}))
+        # where the rim levelled the table, each recording has a plane of its own, and that is no fault to be found
+        in_base = {q.name for q in (*of_slip, *of_faults, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
-        fitted = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults)
-        self.base = (*fitted, *self._sizes({q.name for q in fitted}), *nuisances)
+        self.base = (*fitted, *sizes, *nuisances)
 
     def _sizes(self, fitted: Set[str]) -> Iterator[Quantity]:
-        """What the disc's sizes may be off by, as priors: an effect is what goes beyond. Not those fitted anyway."""
+        """What the disc's sizes and its table may be off by, as priors: an effect is what goes beyond.
+
+        Not those fitted anyway. The table's plane is known to its sigma, which the rig's covariance holds, but for what
+        it was moved by beyond that: where the disc rolls, a hollow is a slope and a height.
+        """
         radius = MICROMETER if self.disc.radius_tolerance is None else self.disc.radius_tolerance
         half = 0.5 * thickness_tolerance(self.disc)
         sizes = {"contact_radius.r_error": radius, "contact_height.h_error": half, "pattern_height.offset": half}
+        height, slope_x, slope_y = self.trajectory.table_moved
+        sizes |= {"table_height.offset": height, "table_plane.tilt_x": slope_y, "table_plane.tilt_y": slope_x}
         of_motion = motion_candidates(self.model, ("contact_radius", "contact_height"))
-        of_paper = (fault.candidate() for fault in self.faults if fault.name == "pattern_height")
-        for candidate in (*of_motion, *of_paper):
+        of_table = ("table_height", "table_plane")
+        faults = [fault.candidate() for fault in self.faults if fault.name in ("pattern_height", *of_table)]
+        for candidate in (*of_motion, *faults):
             for q in candidate.quantities:
                 sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]
+                owner = () if candidate.name in of_table else q.belongs_to
                 if q.name not in fitted and sigma > 0:
-                    yield replace(q, prior_sigma=sigma, lower=max(q.lower, -most), upper=min(q.upper, most))
+                    lower, upper = max(q.lower, -most), min(q.upper, most)
+                    yield replace(q, prior_sigma=sigma, lower=lower, upper=upper, belongs_to=owner)
 
     def _nuisances(self) -> tuple[tuple[Quantity, ...], Array]:
         """Errors common to all frames, with priors, and their whitened columns (n, 4 m, k).
