@@ -126,7 +126,9 @@ def warnings_of(
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
             "round, or their edges are not sharp, or the images were processed"
         )
-    if shaken := _shaken_in_words(poses, trajectory):
+    # a camera that moved strikes now this, now that dot, which shakes the poses: told above
+    misfit = any(text.startswith(MISFIT) for text in warnings)
+    if (shaken := _shaken_in_words(poses, trajectory)) and not misfit:
         warnings.append(shaken)
     if table is not None and table.probability < DISAGREE:
         warnings.append(

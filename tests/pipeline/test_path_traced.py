@@ -58,14 +58,20 @@ def test_the_lenses_of_a_path_traced_rig_are_found_within_their_sigmas(recording
         assert np.all(sigma < 3)  # px
 
 
-def test_squares_declared_too_large_are_errors_beyond_the_sigmas(recording, tmp_path):
-    """Negative control: the same images with squares of 6.5325 mm for 6.5, known to 1 um."""
+def test_squares_declared_too_large_are_errors_beyond_the_sigmas_of_right_ones(recording, tmp_path):
+    """Negative control: the same images with squares of 6.5325 mm for 6.5, known to 1 um.
+
+    By the sigmas of the right run: those of the wrong one are larger, as the dots' distances contradict the squares.
+    """
+    truth = truth_of(recording)[1:]
+    _, variance = errors_and_variances(measured(recording, tmp_path / "right"), *truth)
     declared = recording / "recording.toml"
     text = declared.read_text()
     try:
         declared.write_text(text.replace("square_mm = 6.5", "square_mm = 6.5325\nsquare_tolerance_mm = 0.001"))
-        trajectory = measured(recording, tmp_path)
+        wrong = measured(recording, tmp_path / "wrong")
     finally:
         declared.write_text(text)
-    error, variance = errors_and_variances(trajectory, *truth_of(recording)[1:])
+    error, larger = errors_and_variances(wrong, *truth)
     assert np.max(np.mean(error**2 / variance, axis=0)) > 9
+    assert np.all(np.mean(larger, axis=0)[:2] > np.mean(variance, axis=0)[:2])

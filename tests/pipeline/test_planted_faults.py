@@ -204,6 +204,16 @@ def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion)
     assert abs(float(found[2]) - 1e3 * np.linalg.norm(shift)) < 4.5
 
 
+@pytest.mark.parametrize("turn_deg", [0.05, 0.1])
+def test_a_camera_turned_a_little_is_one_fault_and_not_a_trembling_table_too(clip, turn_deg):
+    """Poses do scatter there, as now this, now that dot is struck: named once, by its cause."""
+    dR = frames.rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.8, 0.0]))
+    rig = replace(clip.rig, R_right_left=dR @ clip.rig.R_right_left, t_right_left=dR @ clip.rig.t_right_left)
+    found = measure(clip.images, rig, clip.disc)
+    assert any("a camera moved, was refocused or lags" in text for text in found.warnings)
+    assert not any("trembles" in text for text in found.warnings)
+
+
 def test_no_camera_is_said_to_have_moved_where_none_did(clip):
     assert moved_camera(clip.images[::4], clip.rig, clip.disc) == ""
 
