@@ -11,7 +11,7 @@ from calibration.arrays import Array, Array32
 from calibration.compiled import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
     """Area and first moments (in x, in y) of the part of the square [-1/2, 1/2]^2 on which f0 + a x + b y > 0.
 
@@ -41,14 +41,14 @@ def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
     return area, m if a > 0.0 else -m, n if b > 0.0 else -n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cell_part(c: float, f00: float, f01: float, f10: float, f11: float) -> tuple[float, float, float]:
     """`half_plane` of the cell with f > 0 from f at its centre and corners [row][column]; curvature in second order."""
     mean = 0.25 * (f00 + f01 + f10 + f11)
     return half_plane(c + (mean - c) / 3.0, 0.5 * (f01 + f11 - f00 - f10), 0.5 * (f10 + f11 - f00 - f01))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, moment_y: float) -> None:
     """Add light to a cell, its first moments to the neighbours: else an edge would lie on the cells' lattice.
 
@@ -63,7 +63,7 @@ def deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, momen
         cells[y + 1, x] += 0.5 * moment_y
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def plane_point(eye: Array, dx: float, dy: float, dz: float, height: float) -> tuple[float, float, bool]:
     """Point (x, y) of the ray eye + t d in the plane z = height, and whether it lies ahead."""
     if dz == 0.0:
@@ -72,7 +72,7 @@ def plane_point(eye: Array, dx: float, dy: float, dz: float, height: float) -> t
     return eye[0] + t * dx, eye[1] + t * dy, t > 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def between(corners: tuple[Array, Array, Array, Array], p: float, q: float) -> tuple[float, float]:
     """Bilinear interpolation at row fraction p, column fraction q of directions at a pixel's corners 00, 01, 10, 11."""
     r00, r01, r10, r11 = corners
@@ -83,7 +83,7 @@ def between(corners: tuple[Array, Array, Array, Array], p: float, q: float) -> t
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def ray_in_body(R: Array, rx: float, ry: float) -> tuple[float, float, float]:
     """Direction R^T (rx, ry, 1) in the axes of a body, R = R_camera_body."""
     return (

@@ -9,7 +9,7 @@ from calibration.compiled import njit
 from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _board_colour(x: float, y: float, n_x: int, n_y: int, margin: float) -> int:
     """0 outside the board, 1 white, 2 black, at (x, y) in squares from the lower left inner corner."""
     if x < -1.0 - margin or x > n_x + margin or y < -1.0 - margin or y > n_y + margin:
@@ -20,7 +20,7 @@ def _board_colour(x: float, y: float, n_x: int, n_y: int, margin: float) -> int:
     return 2 if (i + j) % 2 == 0 else 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_line(x: float, n: int, margin: float) -> float:
     """The board's straight edge nearest to coordinate x: a line between squares or the paper's edge."""
     line = min(max(np.round(x), -1.0), float(n))
@@ -30,7 +30,7 @@ def _nearest_line(x: float, n: int, margin: float) -> float:
     return line
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _board_grid(
     grid: Array, p0: float, q0: float, size: float, corners: tuple[Array, Array, Array, Array], R: Array, eye: Array,
     bent: Array,
@@ -57,7 +57,7 @@ def _board_grid(
     return ahead
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) -> tuple[float, float, float]:
     """Mean grey of one cell that lines may cross, and its first moments."""
     x, y = grid[1, 1]
@@ -89,7 +89,7 @@ def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) 
     return low + step * part[0], step * part[1], step * part[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def draw_board(
     cells: Array32, background: Array32, rays: Array, s: int, R: Array, t: Array, square: float, n_x: int, n_y: int,
     margin: float, white: float, black: float, bent: Array,
