@@ -29,7 +29,15 @@ from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
 from calibration.table_frame import rig_with_covariance
-from calibration.tolerances import BoardShape, BoardTolerances, as_made, board_shape, on_the_table, with_tolerances
+from calibration.tolerances import (
+    BoardShape,
+    BoardTolerances,
+    as_made,
+    board_shape,
+    on_the_table,
+    shape_left_out,
+    with_tolerances,
+)
 from calibration.wide_lens import too_wide
 
 CAMERA_NAMES = ("left", "right")
@@ -241,8 +249,8 @@ def calibrate_from_corners(
 
     report("refining")
     seen = np.bincount(observations.point, minlength=len(board.points))
-    boards = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
-    boards = boards if settings.board == "auto" else (settings.board,)
+    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
+    boards = shapes if settings.board == "auto" else (settings.board,)
     lens = (RICHEST if settings.distortion == "auto" else settings.distortion, settings.equal_aspect)
     places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
     refinement, candidates = choose_board(*places, board.points, boards, *lens, report)
@@ -262,10 +270,10 @@ def calibrate_from_corners(
         begin = motion.as_random(board.points)
         refinement, again = choose_board(*places, board.points, boards, *lens, report, begin)
         candidates = (*candidates, *again)
-    told = _told_apart(pairs.apart, names, bool(wide))
-    warnings += told
+    apart = _told_apart(pairs.apart, names, bool(wide))
+    warnings += apart
     if table_view is not None and table_view in rejected | pairs.apart:
-        reason = rejected.get(table_view) or told[0]
+        reason = rejected.get(table_view) or apart[0]
         raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
@@ -283,7 +291,13 @@ def calibrate_from_corners(
     shape = board_shape(refinement, board.points, inflation)
     refinement = as_made(refinement, board.points, shape)
     origin = on_the_table(board.points, shape)
-    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, stereo_covariance(refinement), origin)
+    covariance = stereo_covariance(refinement)
+    if refinement.terms.board in shapes:
+        left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
+        covariance = covariance + left_out
+        if sigmas > 1.0:
+            warnings.append(_not_as_told(settings.board, shape, sigmas))
+    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     with_board = with_tolerances(
         replace(rig, lens_field=lens_fit.field if lens_fit else None),
         board.points,
@@ -448,6 +462,18 @@ def _told_apart(apart: dict[int, str], names: Sequence[tuple[str, str]], wide: b
         f"exposures, or they are not a pair{', or the lens is wider than the model' if wide else ''}. Each image is "
         "used for its own camera, none of them for how the cameras stand to each other"
     ]
+
+
+def _not_as_told(board: str, shape: BoardShape, sigmas: float) -> str:
+    """A warning about a board that has another shape than the refinement gave it."""
+    taken, do = (
+        (f"{board}, as told,", ": leave its shape to the views (board auto)") if board != "auto" else ("simple", "")
+    )
+    return (
+        f"the board was taken as {taken} but the views show another shape (longer by {100 * abs(shape.stretch):.2g} % "
+        f"along one side, bent by {1e6 * abs(shape.lift):.0f} um, or misprinted): cameras are pulled by up to "
+        f"{sigmas:.1f} of their sigmas. The sigmas contain that{do}"
+    )
 
 
 __all__ = [

@@ -16,6 +16,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.camera import N_RIG, Allowance, StereoRig
+from calibration.normal_equations import scaled_solve
 from calibration.priors import board_prior
 from calibration.refinement import Refinement
 from calibration.stereo_model import board_basis
@@ -78,6 +79,32 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
         misprint=float(np.sqrt(np.mean(left**2))) if model == "free" else 0.0,
         refined=model != "flat",
     )
+
+
+def shape_left_out(
+    refinement: Refinement, nominal: Array, boards: tuple[str, ...], inflation: float
+) -> tuple[Array, float]:
+    """What a board of more freedom than the refined one's would change: covariance (s1, s1) of the stereo parameters.
+
+    One step of a refinement with each further shape of `boards`, simplest first: a board that is taken for flat and is
+    not pulls the cameras by what the step takes back. As much of it counts as is no noise (of chi-square, its expected
+    part is taken off). The second item is the largest of these shifts, in the parameters' own sigmas.
+    """
+    problem, s1 = refinement.problem, refinement.problem.stereo_basis.shape[1]
+    sigma = np.sqrt(inflation * np.diag(refinement.normal.covariances()[0])[:s1])
+    left_out, largest = np.zeros((s1, s1)), 0.0
+    shift, chi_square, n = np.zeros(s1), 0.0, problem.shape_basis.shape[-1]
+    for board in boards[boards.index(refinement.terms.board) + 1 :]:
+        basis = board_basis(nominal, board)
+        prior = problem.prior and replace(problem.prior, board=board_prior(nominal, basis))
+        normal = replace(problem, shape_basis=basis, prior=prior).linearise(refinement.model)
+        step, C = normal.solve(0.0)[0], inflation * normal.covariances()[0][s1:, s1:]
+        gain = float(step[s1:] @ scaled_solve(C, step[s1:])) - chi_square
+        further = max(0.0, 1.0 - (basis.shape[-1] - n) / max(gain, 1e-300)) ** 0.5 * (step[:s1] - shift)
+        left_out += np.outer(further, further)
+        largest = max(largest, float(np.max(np.abs(further) / sigma)))
+        shift, chi_square, n = step[:s1], chi_square + gain, basis.shape[-1]
+    return left_out, largest
 
 
 def _over_the_board(nominal: Array, heights: Array) -> Array:

@@ -54,12 +54,16 @@ def pairs(
     shift: float = 0.0,
     turn: float = 0.0,
     correlation: float = 0.0,
+    points: NDArray | None = None,
 ) -> tuple[NDArray, NDArray]:
-    """Left and right corners (n, 54, 2) [px] with noise [px]; neighbours' errors correlate by `correlation`."""
+    """Left and right corners (n, 54, 2) [px] with noise [px]; neighbours' errors correlate by `correlation`.
+
+    points : (54, 3) [m] of a board that is not as declared
+    """
     rng = np.random.default_rng(1000 + seed)
-    points = board()
+    points = board() if points is None else points
     arms = points - points.mean(0)
-    apart = np.linalg.norm(points[:, None] - points[None], axis=-1) / SQUARE
+    apart = np.linalg.norm(board()[:, None] - board()[None], axis=-1) / SQUARE
     root = np.linalg.cholesky(np.eye(len(points)) if correlation == 0 else correlation**apart)
     seen: list[tuple[NDArray, NDArray]] = []
     while len(seen) < n:

@@ -23,7 +23,7 @@ def errors_of_many(imperfections, geometry):
     found = []
     for seed in SEEDS:
         tracking, R, t = point_laboratory.recorded(laboratory.Plan(seed, 120, imperfections=imperfections), geometry)
-        found.append(point_laboratory.errors_and_variances(tracking, R, t))
+        found.append(point_laboratory.errors_and_variances(tracking.trajectory, R, t))
     ratio = np.mean([np.mean(e**2 / v, axis=0) for e, v in found], axis=0)
     rms = 1e6 * np.sqrt(np.mean([np.mean(e[:, :3] ** 2, axis=0) for e, _ in found], axis=0))
     return ratio, rms
