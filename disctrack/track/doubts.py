@@ -14,6 +14,7 @@ from disctrack.track.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
 MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
+NOISE_ALLOWED = 1.5  # times the variance of the noise: the scatter of a few frames is no better known
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
 DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
@@ -46,6 +47,26 @@ def _table_gap(trajectory: Trajectory) -> Array:
         return np.empty(0)
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
     return z - trajectory.disc.resting_height(theta)
+
+
+def off_the_table_in_words(trajectory: Trajectory) -> str:
+    """Where the disc's lowest point lies if not on the table, or scatters about it by more than its noise; else ""."""
+    gap = _table_gap(trajectory)
+    if not gap.size:
+        return ""
+    psi, theta = trajectory.q[trajectory.measured][:, [3, 4]].T
+    disc, C = trajectory.disc, trajectory.pose_covariance[trajectory.measured]
+    by_tilt = disc.half_thickness * np.sin(theta) - disc.radius * np.cos(theta)
+    J = np.stack([np.ones_like(psi), by_tilt * np.cos(psi), by_tilt * np.sin(psi)], axis=1)  # z, turns about x and y
+    noise = np.median(np.einsum("ni,nij,nj->n", J, C[:, 2:5, 2:5], J))
+    spread = 1.4826 * np.median(np.abs(gap - np.median(gap)))
+    if max(abs(np.median(gap)), np.sqrt(max(spread**2 - NOISE_ALLOWED * noise, 0.0))) <= MAX_TABLE_GAP:
+        return ""
+    return (
+        f"{LOWEST_POINT} lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
+        f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
+        "this recording, the cameras moved together, or the disc is in the air"
+    )
 
 
 def misplaced_in_words(declared: Disc, found: Array) -> str:
@@ -136,11 +157,6 @@ def warnings_of(
             "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
             "is, the cameras moved together since the table view, or a long exposure is not declared (exposure_us)"
         )
-    gap = _table_gap(trajectory)
-    if gap.size and max(abs(np.median(gap)), 1.4826 * np.median(np.abs(gap - np.median(gap)))) > MAX_TABLE_GAP:
-        warnings.append(
-            f"{LOWEST_POINT} lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
-            f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
-            "this recording, the cameras moved together, or the disc is in the air"
-        )
+    if off := off_the_table_in_words(trajectory):
+        warnings.append(off)
     return tuple(warnings)

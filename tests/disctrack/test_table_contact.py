@@ -17,6 +17,7 @@ from disctrack.frames import (
 )
 from disctrack.track import table_contact
 from disctrack.track.as_printed import motions_of_pattern
+from disctrack.track.doubts import off_the_table_in_words
 from disctrack.track.pose import fit_poses
 from disctrack.track.table_contact import table_from_disc
 from tests.oracles.measured_disc import measured
@@ -150,3 +151,14 @@ def test_few_frames_or_a_flat_disc_tell_of_no_table(leaning):
     lost = replace(fits, converged=np.arange(len(leaning)) < 20)
     assert table_from_disc(lost, none, leaning.rig, leaning.disc)[3] is None
     assert table_from_disc(fits, none, replace(leaning.rig, world_is_table=False), leaning.disc)[3] is None
+
+
+def test_scatter_about_the_table_is_told_where_noise_does_not_explain_it():
+    """A noisy recording's lowest point scatters by 40 um as stated: no thickness is to be suspected for that."""
+    trajectory, sigma = measured(n=200), 40e-6
+    trajectory.q[:, 2] += sigma * np.random.default_rng(1).normal(size=len(trajectory))
+    assert "lowest point" in off_the_table_in_words(trajectory)  # poses are stated as sure as before
+    trajectory.pose_covariance[:, 2, 2] += sigma**2
+    assert off_the_table_in_words(trajectory) == ""
+    trajectory.q[:, 2] += 3e-5
+    assert "+" in off_the_table_in_words(trajectory)  # a height that all frames share is none of the noise
