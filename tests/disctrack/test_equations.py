@@ -425,3 +425,16 @@ def test_the_arm_that_swings_lacks_more_than_viscous_friction(shared_data):
     kept = time > FITTED_S
     before, after = (np.sqrt(np.mean(x[kept] ** 2)) for x in forecasts(answer, time, angle).values())
     assert after < before / 6
+
+
+def test_an_input_that_is_held_moves_what_was_at_rest():
+    """Derivatives that are zero up to the input's step have no size yet to which an error could be small."""
+    time = 0.01 * np.arange(300)
+    after = np.maximum(time - 0.05, 0.0)
+    measured = 1 - np.exp(-after / 0.3) + 1e-3 * np.random.default_rng(7).standard_normal(300)
+    run = Run(time, {"x": measured}, 1e-3, inputs={"u": np.where(time > 0.045, 1.0, 0.0)}, known={"x": 0.0})
+    lag = Equations({"x": "(u - x)/tau"}, {"tau": 0.25}, inputs=["u"])
+    answer = diagnose(lag, replace(run, hold="hold"), [terms.constant("x")])
+    assert answer.verdict == "nothing missing"
+    assert abs(answer.values["tau"] - 0.3) < 4 * answer.sigmas["tau"]
+    assert answer.sigmas["tau"] < 1e-3

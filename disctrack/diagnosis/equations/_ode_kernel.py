@@ -102,28 +102,30 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
         step = remaining if last else h
         # inputs are smooth between their knots only: a step across one would be rejected more often than not
         i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
-        if i < len(knots) and t + step > knots[i]:
-            step, last = knots[i] - t, False
+        arrival = t + step
+        if i < len(knots) and arrival > knots[i]:
+            arrival = knots[i]  # to the bit: on the other side of it the inputs are others
+            step, last = arrival - t, False
         attempts += 1
         if attempts > max_steps or step < 1e-15 * max(abs(t), 1e-3):
             if last and remaining <= 0:
                 break
             return TOO_MANY_STEPS, steps
+        # at the end of a step that stops at a knot the inputs of the piece before it hold
+        end_of_piece = t + step * (1.0 - 1e-13) if len(knots) else t + step
         for s in range(1, 12):
             for i in range(N):
                 total = 0.0
                 for j in range(s):
                     total += _A[s, j] * K[j, i]
                 work[i] = z[i] + step * total
-            _slope(rhs, t + _C[s] * step, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
+            _slope(rhs, min(t + _C[s] * step, end_of_piece), work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
         for i in range(N):
             total = 0.0
             for j in range(12):
                 total += _B[j] * K[j, i]
             new[i] = z[i] + step * total
-        # at the end of a step that stops at a knot the inputs of the piece before it hold
-        at = t + step * (1.0 - 1e-13) if len(knots) else t + step
-        _slope(rhs, at, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
+        _slope(rhs, end_of_piece, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
         worst = 0.0
         for c in range(k + 1):
             e5, e3, top = 0.0, 0.0, 0.0
@@ -197,7 +199,7 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
             for i in range(n):
                 largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
         steps += 1
-        t += step
+        t = arrival
         z[:] = new
         if len(knots):
             _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
