@@ -114,7 +114,7 @@ TABLES_AND_RIMS = {
         {"bowl": ((0.0, 0.0, 2.0), 2.0)},
         {"table_curved": {"kappa": 0.5, "slope_x": 0.0, "slope_y": 0.0}},
     ),
-    "oval rim": ({"waves": ((2, 1.5e-4, -1e-4),)}, {"rim_oval": {"oval_c": 1.5e-4, "oval_s": -1e-4}}),
+    "oval rim": ({"waves": ((2, 1.5e-4, -1e-4),)}, {"rim": {"oval_c": 1.5e-4, "oval_s": -1e-4}}),
     "flat of the rim": (
         {"dips": ((4e-4, 2.3, 0.15),)},
         {"rim_flat": {"depth": 4e-4, "angle": 2.3, "width": 0.15}},
