@@ -438,3 +438,12 @@ def test_an_input_that_is_held_moves_what_was_at_rest():
     assert answer.verdict == "nothing missing"
     assert abs(answer.values["tau"] - 0.3) < 4 * answer.sigmas["tau"]
     assert answer.sigmas["tau"] < 1e-3
+
+
+def test_a_contact_too_stiff_for_derivatives_is_said_to_be_one():
+    time = 0.002 * np.arange(500)
+    push = lambda h, v: (-4e4 * h - 15 * v) / 0.1 if h < 0 else 0.0  # noqa: E731
+    height = motion(lambda t, y: [y[1], -9.81 + push(*y)], [1.0, 0.0], time, max_step=5e-4)[0]
+    ball = Equations({"h": "v", "v": "-g + Heaviside(-h)*(-k*h - c*v)/0.1"}, {"k": 3.5e4, "c": 12.0}, {"g": 9.81})
+    with pytest.raises(AnalysisError, match="stiff contact"):
+        diagnose(ball, Run(time, {"h": height}, 5e-4))

@@ -93,6 +93,11 @@ def ask(
         raise AnalysisError(_not_followed(system, values))
     system = _sized(system, values)
     diagnosis = diagnose(system, values, settings, system.training)
+    if not np.isfinite(diagnosis.before.chi_square):
+        raise AnalysisError(
+            "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
+            "at a stiff contact. Write the contact wider, or cut the data into runs without it."
+        )
     if start is not None and not start.whole and diagnosis.found:
         system, diagnosis, more = _joined(system, samples, diagnosis, settings)
         notes += more
