@@ -34,6 +34,8 @@ from disctrack.files.trajectory_file import read_findings, read_provenance, read
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
 
+DOUBTFUL = 0.05  # probability of what a single known effect leaves, below which laws outside the catalogue compete
+
 
 @dataclass(frozen=True, repr=False)
 class DiagnoseOutcome(Brief):
@@ -66,7 +68,7 @@ def diagnose_trajectory(
     diagnosis, remarks = refine_shapes(system, diagnosis)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    learned, also = _beyond_the_catalogue(system, diagnosis)
+    learned, also = _beyond_the_catalogue(system, diagnosis, left)
     parts = None
     if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
         parts = regimes(system, _judged(diagnosis, system), diagnosis.before, diagnosis.noise)
@@ -138,12 +140,18 @@ def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:
     return diagnosis.judged.over(system) if isinstance(diagnosis.judged, Wrapped) else system
 
 
-def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Learned | None, tuple[str, ...]]:
+def _beyond_the_catalogue(
+    system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
+) -> tuple[Learned | None, tuple[str, ...]]:
     """A law outside the catalogue if that describes the data better, for its length, than the catalogue does.
 
-    Beside it remarks on what describes them as well.
+    Beside it remarks on what describes them as well. A single known effect has to compete where what it leaves is
+    less like noise than that of one recording in twenty: it may stand in for a law that is not known.
     """
-    if diagnosis.verdict == "nothing missing" or (diagnosis.verdict == "found" and len(diagnosis.found) < 2):
+    doubtful = left is not None and min(left.pose_p_value, left.other_p_value) < DOUBTFUL
+    if diagnosis.verdict == "nothing missing" or (
+        diagnosis.verdict == "found" and len(diagnosis.found) < 2 and not doubtful
+    ):
         return None, ()
     base = diagnosis.before
     law = learn(system, base, diagnosis.noise, diagnosis.after if diagnosis.verdict == "found" else None)
@@ -160,6 +168,8 @@ def _beyond_the_catalogue(system: DiscSystem, diagnosis: Diagnosis) -> tuple[Lea
     price = float(np.log(np.sum(system.weights)))
     lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
     saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])
+    if diagnosis.verdict == "found":  # both were looked for, among so many laws, and among so many effects
+        saved += 2.0 * float(np.log(len(diagnosis.tried))) * len(diagnosis.found) - law.looked * len(law.families)
     rows = training_rows(system, diagnosis.settings.train_fraction)
     held = held_out(judged, fitted.quantities, fitted.values, rows)
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise

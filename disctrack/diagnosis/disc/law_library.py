@@ -90,6 +90,7 @@ def families(q: Array, time: Array, frame_rate: float) -> Iterator[Family]:
     yield from _drifts(time)
     yield from _gates(q, time)
     yield from _bumps()
+    yield from _uneven(q)
     yield from _hums(time, frame_rate)
 
 
@@ -110,11 +111,17 @@ def _places() -> Iterator[Family]:
     stiffness = (along_x("-x"), along_y("-y"), {c: f"{along_x('-y')[c]} + {along_y('-x')[c]}" for c in ("X_n", "X_m")})
     yield Family("a force by a stiffness that differs with the direction", (*stiffness, *constant), kind="place")
     distance = "sqrt(x * x + y * y + 1e-6)"
+    square = {c: f"{f} * {distance}" for c, f in towards.items()}
+    yield Family("a force towards a point that grows as the distance squared", (square, *constant), kind="place")
     thread = {c: f"{f} / {distance}" for c, f in towards.items()}
     yield Family("a force of constant size towards the origin", (thread, *constant), kind="place")
     yield Family("a drag that grows as the speed squared", ({c: f"-v_{c[-1]} * {_SPEED}" for c in ("X_n", "X_m")},))
     yield Family("a drag of constant size", ({c: f"-v_{c[-1]} / {_SPEED}" for c in ("X_n", "X_m")},), kind="drag")
     yield Family("a drag that differs with the direction", (*_by_velocity(),), kind="drag")
+    round_it = (along_x("-y"), along_y("x"))
+    turning_air = {c: f"{round_it[0][c]} + {round_it[1][c]}" for c in ("X_n", "X_m")}
+    drag = {c: f"-v_{c[-1]}" for c in ("X_n", "X_m")}
+    yield Family("a drag in air that turns about a point", (drag, turning_air, *constant), kind="drag")
     lateral = {"X_n": "-v_m * omega_z", "X_m": "v_n * omega_z"}
     yield Family("a force across the velocity, by omega_z", (lateral,), kind="drag")
     across = {"X_n": "-v_m", "X_m": "v_n"}
@@ -205,6 +212,43 @@ def _gates(q: Array, time: Array) -> Iterator[Family]:
             for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
                 title = f"a moment M_{axis} by the load on a part of the table"
                 yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "part of the table")
+
+
+def _uneven(q: Array) -> Iterator[Family]:
+    """A table that is not flat: ridges and grooves, hills and dips, and a drag over a part of it, by where they are.
+
+    The place of touch moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin
+    theta, H' its slope along n0. The number is the area of the profile, or the volume: it hardly depends on the width.
+    """
+    path = q[:, :2] + 0.036 * np.stack([np.sin(q[:, 3]), -np.cos(q[:, 3])], axis=1)
+    along = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
+    off = f"(({along} - {{edge}}) / {{length}})"
+    ridge = (
+        f"2.0 * radius / sin_theta * cos(psi - {{direction}}) * {off} * exp(-{off} * {off}) / ({{length}} * {{length}})"
+    )
+    for direction in np.arange(0, np.pi, np.pi / 12):
+        across = path @ np.array([np.cos(direction), np.sin(direction)])
+        for edge in np.arange(across.min(), across.max(), 0.004):
+            for length in (0.003, 0.008):
+                shape = {"direction": float(direction), "edge": float(edge), "length": length}
+                yield Family("a ridge or groove of the table", ({"load_m": ridge},), shape, "ridge")
+    from_x, from_y = f"({_CONTACT_X} - {{x0}})", f"({_CONTACT_Y} - {{y0}})"
+    away2 = f"({from_x} * {from_x} + {from_y} * {from_y}) / ({{length}} * {{length}})"
+    along_n0 = f"({_X} - {{x0}} * cos(psi) - {{y0}} * sin(psi))"
+    hill = (
+        f"2.0 * radius / sin_theta * {along_n0} * exp(-{away2}) / ({{length}} * {{length}} * {{length}} * {{length}})"
+    )
+    for x0, y0 in np.unique(np.round(path / 0.006), axis=0) * 0.006:
+        for length in (0.005, 0.012):
+            shape = {"x0": float(x0), "y0": float(y0), "length": length}
+            yield Family("a hill or dip of the table", ({"load_m": hill},), shape, "hill")
+    beyond = "(0.5 + 0.5 * sign(x * cos({direction}) + y * sin({direction}) - {edge}, 3e-4))"
+    drag = {c: f"-v_{c[-1]} * {beyond}" for c in ("X_n", "X_m")}
+    for direction in np.arange(0, 2 * np.pi, np.pi / 6):
+        across = q[:, :2] @ np.array([np.cos(direction), np.sin(direction)])
+        for share in (0.2, 0.4, 0.6, 0.8):
+            shape = {"direction": float(direction), "edge": float(np.quantile(across, share))}
+            yield Family("a drag on a part of the table", (drag,), shape, "drag on a part")
 
 
 def _bumps() -> Iterator[Family]:

@@ -40,7 +40,7 @@ MAX_TERMS = 3
 REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 MAX_ITERATIONS = 15  # of a law that describes the data; others wander
-WIDTHS = ("width", "softness")  # shapes of a law that go with its amount
+WIDTHS = ("width", "softness", "length")  # shapes of a law that go with its amount
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the residual is large
 UNLIKELY = 1e-3  # odds below which a law does not count
@@ -48,6 +48,7 @@ ALIKE = 10.0  # chi-square with its price, by which two laws differ that both de
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
 CHUNK = 240  # columns of the library that are held at a time
+_OF_PLACE = ("place", "part of the table", "ridge", "hill", "drag on a part")  # angles tell where the contact is
 _LOCKED = ("psi)", "phi)", "psi +", "psi -", "phi -")
 
 
@@ -72,6 +73,7 @@ class LearnedLaw:
     share: tuple[float, ...] = ()  # of the resamples in which each family gains more than its price
     alike: tuple[str, ...] = ()  # other laws that describe the data as well
     rivals: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their likelihood
+    looked: float = 0.0  # chi-square that each family pays for having been looked for among so many
 
     @property
     def formulas(self) -> dict[str, str]:
@@ -86,7 +88,7 @@ class LearnedLaw:
     @property
     def locked(self) -> bool:
         """To an angle of the body or of the table?"""
-        parts = [f for family in self.families if family.kind != "place" for p in family.terms for f in p.items()]
+        parts = [f for family in self.families if family.kind not in _OF_PLACE for p in family.terms for f in p.items()]
         return any(c[0] in "Ml" and mark in f for c, f in parts for mark in _LOCKED)
 
 
@@ -296,6 +298,7 @@ def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None)
     current, length, alike = base, base.cost / noise, tuple[str, ...]()
     rivals = tuple[tuple[LearnedLaw, float], ...]()
     at_noise = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
+    looked = 0.0
     most_terms = MAX_TERMS if rival is None else 1
     while law is None or (len(law.families) < most_terms and current.reduced_chi_square > at_noise):
         known = system if law is None else system.knowing(law.effect)
@@ -324,7 +327,7 @@ def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None)
         (law, current), length = trials[best], lengths[best]
     if law is None:
         return None
-    law = replace(law, alike=alike, rivals=rivals, share=_stability(system, law, current, noise))
+    law = replace(law, alike=alike, rivals=rivals, looked=looked, share=_stability(system, law, current, noise))
     return without_idle_terms(law, current)
 
 
@@ -362,7 +365,8 @@ def _refitted(
     fitted = with_law(known, base, start)
     if not fitted.converged:
         fitted = min(fitted, _one_by_one(known, base, start), key=lambda f: (not f.converged, f.cost))
-    return replace(enlarged, values=fitted.values), fitted
+    reached = replace(enlarged.candidate, start=tuple(fitted.values[n] for n in enlarged.candidate.names))
+    return replace(enlarged, candidate=reached, values=fitted.values), fitted
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw) -> Fit:
@@ -431,6 +435,9 @@ _SHAPES = {  # smallest and largest value, and a sensible step
     "angle": (-np.inf, np.inf, 0.01),
     "direction": (-np.inf, np.inf, 0.01),
     "width": (0.04, 2.0, 0.01),
+    "length": (1e-3, 0.05, 1e-4),
+    "x0": (-np.inf, np.inf, 1e-4),
+    "y0": (-np.inf, np.inf, 1e-4),
 }
 
 
@@ -497,7 +504,9 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     if not kept or len(values) == len(law.candidate.quantities):
         return law
     shorter = _law(kept, np.array(values), law.candidate.name)
-    return replace(shorter, values=fitted.values, share=tuple(share), alike=law.alike, rivals=law.rivals)
+    return replace(
+        shorter, values=fitted.values, share=tuple(share), alike=law.alike, rivals=law.rivals, looked=law.looked
+    )
 
 
 def _acts(fitted: Fit, names: Sequence[str]) -> bool:

@@ -1,0 +1,54 @@
+"""Laws by the place on the table: the library's against the oracle's, and a groove that a tilt could stand in for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis.disc.law_library import families
+from disctrack.rolling import Model, State, simulate
+from disctrack.rolling.effects import effect_from_formulas
+from tests.oracles.measured_disc import K_M
+from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, motion, recording
+
+RIDGE = {"direction": 0.6, "edge": 0.05, "length": 3e-3}  # as UNKNOWN["groove"], of 20 um
+HILL = {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}  # as UNKNOWN["bump"], of 30 um
+
+
+@pytest.mark.parametrize(
+    ("name", "title", "shape", "amount"),
+    [
+        ("groove", "a ridge or groove of the table", RIDGE, -20e-6 * 3e-3),
+        ("bump", "a hill or dip of the table", HILL, 30e-6 * 8e-3**2),
+    ],
+)
+def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, title, shape, amount):
+    """The oracle lets the load pay for what the contact climbs, for every direction of the angular velocity."""
+    unknown = replace(UNKNOWN[name], duration=0.2)
+    times, q, speed, _ = motion(unknown)
+    family = next(f for f in families(q, times, 500.0) if f.title == title)
+    formulas = replace(family, shape=shape).formulas()[0]
+    law = effect_from_formulas("uneven", {k: f"c * ({f})" for k, f in formulas.items()})
+    theta, psidot, phidot = q[0, 4], speed[0, 3], speed[0, 5]
+    start = State(*q[0, :2], *q[0, 3:], speed[0, 4], psidot * np.sin(theta), psidot * np.cos(theta) + phidot)
+    flat = Model(DISC).with_values({"km.k_m": K_M})
+    found, without = (simulate(m, start, times=times).q for m in (flat.with_effects(law(c=amount)), flat))
+    moved = np.abs(q - without).max(axis=0)
+    assert moved[2] > 1e-7
+    # as much as the two integrations, of 1e-10, differ where nothing acts
+    assert_allclose(found, q, atol=1e-3 * moved.min())
+
+
+@pytest.mark.slow
+def test_a_groove_is_no_tilted_table():
+    """The tilt leaves 1.03 of the noise, with p = 0.02; a law by the place leaves noise, and is named in its stead."""
+    result = diagnose_trajectory(recording("groove").trajectory, separate=False)
+    assert result.learned.law.title == "a ridge or groove of the table"
+    assert not result.diagnosis.found
+    assert result.after.reduced_chi_square < 1.0
+    values, fit = result.learned.fit.values, result.learned.fit
+    for name, true in (("c_0", -6e-8), ("direction_0", 0.6), ("edge_0", 0.05)):
+        assert abs(values[f"learned.{name}"] - true) < 4 * fit.sigma(f"learned.{name}")
+    assert any("table_tilt" in note for note in result.notes)
