@@ -37,6 +37,8 @@ from calibration.sources import PACKAGES, sha256_with_imports
 __all__ = ["cfunc", "dumps", "njit"]
 
 AHEAD = Path(__file__).parent / "ahead"
+# Compiled code meets Python by named functions only, the same in these: code made by the first was tried on all.
+SAME_INTERFACE = ((3, 11), (3, 12), (3, 13))
 
 
 def njit(function: Any = None, *, cache: bool = False, **rules: Any) -> Any:
@@ -108,7 +110,9 @@ def shipped_file(function: Callable[..., Any], sig: Any) -> Path:
 
 def made_for(stamp: str, sig: Any) -> tuple[str, ...]:
     """What must be the same where intermediate code is made and where it is used."""
-    python = f"{sys.implementation.name} {sys.version_info.major}.{sys.version_info.minor}"
+    version = tuple(sys.version_info[:2])
+    versions = SAME_INTERFACE if version in SAME_INTERFACE else version
+    python = f"{sys.implementation.name} {versions}{sys.abiflags}"  # t: a build without its lock, with other objects
     return stamp, str(sig), llvm.get_process_triple(), python, numba.__version__
 
 
