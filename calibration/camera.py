@@ -116,6 +116,7 @@ def _distorted(a: Array, b: Array, camera: Camera) -> tuple[Array, Array, Array,
     return xd, yd, xd_a, xd_b, yd_b
 
 
+NEWTON_PX = 1e-6  # the last step of Newton's method
 _AT_ONCE = 16384  # points whose numbers stay in a core's cache: a whole image takes 2.5 times as long
 
 
@@ -143,11 +144,11 @@ def _undistorted(x: Array, y: Array, a: Array, b: Array, camera: Camera, iterati
             inverse = 1.0 / det
             step_a, step_b = (yd_b * rx - xd_b * ry) * inverse, (xd_a * ry - xd_b * rx) * inverse
             a, b = a + step_a, b + step_b
-            length2 = step_a * step_a + step_b * step_b
-            if np.fmax.reduce(length2, axis=None, initial=0.0) < 1e-18:  # NaN-blind; what is left is as long as that
+            px2 = camera.fx * camera.fy * (step_a * step_a + step_b * step_b)
+            if np.fmax.reduce(px2, axis=None, initial=0.0) < NEWTON_PX**2:  # NaN-blind; what is left is its square
                 break
         # both slopes are positive up to the fold; beyond it are roots that no ray goes to
-        good = (camera.fx * camera.fy * length2 < 1e-12) & (det > 0) & (xd_a + yd_b > 0)
+        good = (px2 < NEWTON_PX**2) & (det > 0) & (xd_a + yd_b > 0)
     return np.where(good, a, np.nan), np.where(good, b, np.nan)
 
 

@@ -80,6 +80,16 @@ def test_maps_of_whole_images_are_the_pixels_own_coordinates(size):
         assert_allclose(project(np.dstack([maps, np.ones(size[::-1])]), camera), grid, atol=1e-9)
 
 
+@pytest.mark.parametrize("focal", [300.0, 1000.0, 3000.0, 20000.0])
+def test_every_pixel_has_a_ray_whatever_the_focal_length(focal, rng):
+    """What ends the iteration keeps its result: the steps of a long lens are short in angle."""
+    bends = -0.05, -1e-3 * (focal / 300) ** 4, 2e-4, -2e-4, 0.0
+    camera = Camera(focal, 1.01 * focal, 250.0, 260.0, bends, (512, 512))
+    pixels = rng.uniform(0, 511, (20, 500, 2))
+    rays = np.array([normalise(some, camera) for some in pixels])  # the worst point ends the iteration of its company
+    assert_allclose(project(np.insert(rays, 2, 1.0, axis=-1), camera), pixels, atol=1e-9)
+
+
 def test_maps_of_a_lens_that_folds_have_no_rays_beyond():
     folding = Camera(300.0, 300.0, 256.0, 256.0, (-0.5, 0.0, 0.0, 0.0, 0.0), (512, 512))
     x, _ = normalised_maps(folding)
