@@ -82,6 +82,8 @@ def main() -> None:
     arguments = parser.parse_args()
     recording = read_recording(arguments.recording)
     rig_file = arguments.rig or recording.rig_file or recording.folder / "results" / "rig.h5"
+    if not rig_file.exists():
+        parser.error(f"{rig_file}: no such rig; `disctrack run {arguments.recording}` makes it, or give --rig FILE")
     cv2.setNumThreads(1)
     if arguments.one:
         with tempfile.TemporaryDirectory() as folder:
