@@ -109,8 +109,7 @@ def half_set_differences(refinement: Refinement, inflation: float) -> HalfSets |
         keep = np.isin(used.view, part)
         problem = replace(refinement.problem, observations=used[keep], weights=refinement.problem.weights[keep])
         # the shape of the board is one for both halves
-        prior = problem.prior and replace(problem.prior, board=None)
-        problem = replace(problem, shape_basis=problem.shape_basis[..., :0], prior=prior)
+        problem = problem.with_shape(refinement.model.points, problem.shape_basis[..., :0])
         try:
             halves.append(_half(problem, refinement))
         except (CalibrationError, np.linalg.LinAlgError):

@@ -16,7 +16,7 @@ from calibration._normal_kernel import N_COLUMNS, accumulate
 from calibration.arrays import Array
 from calibration.board_motion import BoardMotion, motions
 from calibration.errors import CalibrationError
-from calibration.priors import Prior
+from calibration.priors import Prior, board_prior
 from calibration.stereo_model import N_STEREO, Observations, StereoModel, moved
 
 
@@ -175,6 +175,11 @@ class Problem:
     huber: float = np.inf  # residuals beyond this many sigmas count linearly
     prior: Prior | None = None  # of the cameras
     motion: BoardMotion | None = None  # of the boards between the two exposures, for a model that has such places
+
+    def with_shape(self, nominal: Array, basis: Array) -> Problem:
+        """The same with points (n, 3) that may move along `basis` (n, 3, s2), and what is known of that beforehand."""
+        prior = self.prior and replace(self.prior, board=board_prior(nominal, basis))
+        return replace(self, shape_basis=basis, prior=prior)
 
     def linearise(self, model: StereoModel) -> Normal:
         """Normal equations at the model."""

@@ -17,7 +17,6 @@ import numpy as np
 from calibration.arrays import Array
 from calibration.camera import N_RIG, Allowance, StereoRig
 from calibration.normal_equations import scaled_solve
-from calibration.priors import board_prior
 from calibration.refinement import Refinement
 from calibration.stereo_model import board_basis
 
@@ -62,8 +61,7 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
         to_smooth = np.linalg.pinv(B) @ problem.shape_basis.reshape(3 * n, -1)
         C = to_smooth @ refinement.normal.covariances()[0][s1:, s1:] @ to_smooth.T
     else:  # one step beyond the flat board, everything else free
-        prior = problem.prior and replace(problem.prior, board=board_prior(nominal, basis))
-        normal = replace(problem, shape_basis=basis, prior=prior).linearise(refinement.model)
+        normal = problem.with_shape(nominal, basis).linearise(refinement.model)
         s1 = problem.stereo_basis.shape[1]
         found = found + normal.solve(0.0)[0][s1:]
         C = normal.covariances()[0][s1:, s1:]
@@ -96,8 +94,7 @@ def shape_left_out(
     shift, chi_square, n = np.zeros(s1), 0.0, problem.shape_basis.shape[-1]
     for board in boards[boards.index(refinement.terms.board) + 1 :]:
         basis = board_basis(nominal, board)
-        prior = problem.prior and replace(problem.prior, board=board_prior(nominal, basis))
-        normal = replace(problem, shape_basis=basis, prior=prior).linearise(refinement.model)
+        normal = problem.with_shape(nominal, basis).linearise(refinement.model)
         step, C = normal.solve(0.0)[0], inflation * normal.covariances()[0][s1:, s1:]
         gain = float(step[s1:] @ scaled_solve(C, step[s1:])) - chi_square
         further = max(0.0, 1.0 - (basis.shape[-1] - n) / max(gain, 1e-300)) ** 0.5 * (step[:s1] - shift)
