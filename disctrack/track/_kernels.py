@@ -783,6 +783,30 @@ def _orthonormalise(R):
 
 
 @_part
+def _dot_by_pose(camera, R_cw, t_cw, centre, R, t, J, rows):
+    """Image u, v and depth of a dot at `centre` (3,) on the disc; fills rows (2, 6), d (u, v) / d pose, and J (2, 3).
+
+    The pose is a translation and a rotation vector in world axes. The rows mean nothing behind the camera.
+    """
+    a0 = R[0, 0] * centre[0] + R[0, 1] * centre[1] + R[0, 2] * centre[2]
+    a1 = R[1, 0] * centre[0] + R[1, 1] * centre[1] + R[1, 2] * centre[2]
+    a2 = R[2, 0] * centre[0] + R[2, 1] * centre[1] + R[2, 2] * centre[2]
+    x, y, z = a0 + t[0], a1 + t[1], a2 + t[2]
+    p0 = t_cw[0] + R_cw[0, 0] * x + R_cw[0, 1] * y + R_cw[0, 2] * z
+    p1 = t_cw[1] + R_cw[1, 0] * x + R_cw[1, 1] * y + R_cw[1, 2] * z
+    depth = t_cw[2] + R_cw[2, 0] * x + R_cw[2, 1] * y + R_cw[2, 2] * z
+    u, v = _project_point_jacobian(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
+    for axis in range(2):
+        row = rows[axis]
+        for i in range(3):
+            row[i] = J[axis, 0] * R_cw[0, i] + J[axis, 1] * R_cw[1, i] + J[axis, 2] * R_cw[2, i]
+        row[3] = a1 * row[2] - a2 * row[1]
+        row[4] = a2 * row[0] - a0 * row[2]
+        row[5] = a0 * row[1] - a1 * row[0]
+    return u, v, depth
+
+
+@_part
 def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
     """One Gauss-Newton step (translation, world rotation vector) of the disc's pose from the dots of one pair.
 
@@ -790,8 +814,7 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
     or -1 where fewer than three dots or a singular system leave nothing to solve.
     """
     M, J = np.zeros((6, 6)), np.empty((2, 3))
-    row = np.empty(6)
-    arm, point = np.empty(3), np.empty(3)
+    rows = np.empty((2, 6))
     for i in range(6):
         step[i] = 0.0
     total, count = 0.0, 0
@@ -799,15 +822,9 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
         for m in range(centres.shape[0]):
             if status[c, m] != MEASURED:
                 continue
-            for i in range(3):
-                arm[i] = R[i, 0] * centres[m, 0] + R[i, 1] * centres[m, 1] + R[i, 2] * centres[m, 2]
-            for i in range(3):
-                point[i] = t_cw[c, i]
-                for j in range(3):
-                    point[i] += R_cw[c, i, j] * (arm[j] + t[j])
-            if point[2] <= 0.0:
+            u, v, depth = _dot_by_pose(cameras[c], R_cw[c], t_cw[c], centres[m], R, t, J, rows)
+            if depth <= 0.0:
                 return -1.0
-            u, v = _project_point_jacobian(cameras[c], point[0], point[1], point[2], J)
             du, dv = results[c, m, U] - u, results[c, m, V] - v
             distance = math.hypot(du, dv)
             total += distance * distance
@@ -817,14 +834,7 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
             if distance > 1.0:
                 w /= distance
             for axis in range(2):
-                r = du if axis == 0 else dv
-                for i in range(3):
-                    row[i] = 0.0
-                    for j in range(3):
-                        row[i] += J[axis, j] * R_cw[c, j, i]
-                row[3] = arm[1] * row[2] - arm[2] * row[1]
-                row[4] = arm[2] * row[0] - arm[0] * row[2]
-                row[5] = arm[0] * row[1] - arm[1] * row[0]
+                r, row = du if axis == 0 else dv, rows[axis]
                 for i in range(6):
                     step[i] += w * row[i] * r
                     for j in range(i + 1):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disctrack.track._kernels import _copy, _entry, _part, _project_point_jacobian, _rotate_from_left, _solve_in_place
+from disctrack.track._kernels import _copy, _dot_by_pose, _entry, _part, _rotate_from_left, _solve_in_place
 
 MAX_DAMPING = 1e10
 _MAX_ITERATIONS = 60
@@ -20,28 +20,15 @@ def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pi
 
     sums (7, 6): J^T J and J^T r.
     """
-    J, row, arm, point = np.empty((2, 3)), np.empty((2, 6)), np.empty(3), np.empty(3)
+    J, row = np.empty((2, 3)), np.empty((2, 6))
     for i in range(_GRADIENT + 1):
         for j in range(6):
             sums[i, j] = 0.0
     cost = 0.0
     for c in range(2):
         for m in range(centres.shape[0]):
-            for i in range(3):
-                arm[i] = R[i, 0] * centres[m, 0] + R[i, 1] * centres[m, 1] + R[i, 2] * centres[m, 2]
-            for i in range(3):
-                point[i] = t_cw[c, i]
-                for j in range(3):
-                    point[i] += R_cw[c, i, j] * (arm[j] + t[j])
-            depth = point[2] if point[2] > 0.0 else np.nan
-            u, v = _project_point_jacobian(cameras[c], point[0], point[1], depth, J)
+            u, v, _ = _dot_by_pose(cameras[c], R_cw[c], t_cw[c], centres[m], R, t, J, row)
             pixels[c, m, 0], pixels[c, m, 1] = u, v
-            for axis in range(2):
-                for i in range(3):
-                    row[axis, i] = J[axis, 0] * R_cw[c, 0, i] + J[axis, 1] * R_cw[c, 1, i] + J[axis, 2] * R_cw[c, 2, i]
-                row[axis, 3] = arm[1] * row[axis, 2] - arm[2] * row[axis, 1]
-                row[axis, 4] = arm[2] * row[axis, 0] - arm[0] * row[axis, 2]
-                row[axis, 5] = arm[0] * row[axis, 1] - arm[1] * row[axis, 0]
             # W with W C W^T = 1, as `pose.whitening` has it; no weight where C is not a covariance
             a, b = covariance[c, m, 0, 0], covariance[c, m, 0, 1]
             remaining = covariance[c, m, 1, 1] - b * b / a
