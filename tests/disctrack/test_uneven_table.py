@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose_trajectory
 from disctrack.diagnosis.disc.law_library import families
+from disctrack.frames import nodal_axes_world
 from disctrack.rolling import Model, State, simulate
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import K_M
@@ -28,7 +29,7 @@ def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, title
     """The oracle lets the load pay for what the contact climbs, for every direction of the angular velocity."""
     unknown = replace(UNKNOWN[name], duration=0.2)
     times, q, speed, _ = motion(unknown)
-    family = next(f for f in families(q, times, 500.0) if f.title == title)
+    family = next(f for f in families(q, times, 500.0, DISC) if f.title == title)
     formulas = replace(family, shape=shape).formulas()[0]
     law = effect_from_formulas("uneven", {k: f"c * ({f})" for k, f in formulas.items()})
     theta, psidot, phidot = q[0, 4], speed[0, 3], speed[0, 5]
@@ -39,6 +40,20 @@ def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, title
     assert moved[2] > 1e-7
     # as much as the two integrations, of 1e-10, differ where nothing acts
     assert_allclose(found, q, atol=1e-3 * moved.min())
+
+
+def test_uneven_tables_are_looked_for_where_the_disc_touches():
+    """A disc of half the size: hills of the library lie on the path of its lowest point, and cover it."""
+    small = replace(DISC, radius=0.5 * DISC.radius, half_thickness=0.5 * DISC.half_thickness)
+    q = np.tile([0.02, -0.01, 0.0, 0.0, 0.3, 0.0], (200, 1))
+    q[:, 3] = np.linspace(0, 6, 200)
+    lowest = q[:, :2] + small.arm_to_contact(*nodal_axes_world(q[:, 3], q[:, 4])[1:])[:, :2]
+    hills = (f.shape for f in families(q, np.arange(200) / 500.0, 500.0, small) if f.kind == "hill")
+    places = np.array(sorted({(s["x0"], s["y0"]) for s in hills}))
+    apart = np.linalg.norm(places[:, None] - lowest, axis=2)
+    half_diagonal = 0.006 / np.sqrt(2)  # of the squares of the grid
+    assert apart.min(axis=0).max() <= half_diagonal
+    assert apart.min(axis=1).max() <= half_diagonal
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibration.arrays import Array
+from disctrack.disc import Disc
 
 Parts = Mapping[str, str]  # component of the wrench -> formula
 
@@ -77,8 +78,9 @@ def along_y(formula: str = "1.0") -> Parts:
     return {"X_n": f"({formula}) * sin(psi)", "X_m": f"({formula}) * cos(psi)"}
 
 
-def families(q: Array, time: Array, frame_rate: float) -> Iterator[Family]:
-    """The library for a motion q (N, 6) at the instants (N,) [s]."""
+def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[Family]:
+    """The library for a motion q (N, 6) of a disc at the instants (N,) [s]."""
+    path = _path_of_contact(q, disc)
     for axis in MOMENTS:
         for words, formula in SCALARS:
             yield Family(f"a moment M_{axis} by {words}", ({f"M_{axis}": formula},))
@@ -88,10 +90,17 @@ def families(q: Array, time: Array, frame_rate: float) -> Iterator[Family]:
     for words, formula in SCALARS[:13]:
         yield Family(f"a force X_z by {words}", ({"X_z": formula},), kind="lift")
     yield from _drifts(time)
-    yield from _gates(q, time)
+    yield from _gates(q, time, path)
     yield from _bumps()
-    yield from _uneven(q)
+    yield from _uneven(q, path)
     yield from _hums(time, frame_rate)
+
+
+def _path_of_contact(q: Array, disc: Disc) -> Array:
+    """Places (N, 2) [m] where the disc touches the table: the numbers of _CONTACT_X and _CONTACT_Y."""
+    psi, theta = q[:, 3], q[:, 4]
+    arm = disc.radius * np.cos(theta) - disc.half_thickness * np.sin(theta)
+    return q[:, :2] + arm[:, None] * np.stack([np.sin(psi), -np.cos(psi)], axis=1)
 
 
 def _angular(axis: str) -> Iterator[Family]:
@@ -176,7 +185,7 @@ def _magnets() -> Iterator[Family]:
     yield Family("a magnet along the axis, in a vertical field", (cross(third, along_k),), kind="magnet")
 
 
-def _gates(q: Array, time: Array) -> Iterator[Family]:
+def _gates(q: Array, time: Array, path: Array) -> Iterator[Family]:
     """What begins at a nutation, at an instant or at a place."""
     s = np.sin(q[:, 4])
     for share in np.linspace(0.05, 0.95, 13):
@@ -201,9 +210,8 @@ def _gates(q: Array, time: Array) -> Iterator[Family]:
             push = (along_x(law), along_y(law), {"X_z": law})
             yield Family(f"a force {words}", push, {"instant": at}, kind)
         yield Family("a moment during 20 ms", tuple({f"M_{a}": pulse} for a in MOMENTS), {"instant": at}, "pulse")
-    contact = q[:, :2] + 0.036 * np.stack([np.sin(q[:, 3]), -np.cos(q[:, 3])], axis=1)
     for angle in np.arange(0, 2 * np.pi, np.pi / 6):
-        along = contact @ np.array([np.cos(angle), np.sin(angle)])
+        along = path @ np.array([np.cos(angle), np.sin(angle)])
         place = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
         for share in (0.2, 0.4, 0.6, 0.8):
             edge = float(np.quantile(along, share))
@@ -214,13 +222,12 @@ def _gates(q: Array, time: Array) -> Iterator[Family]:
                 yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "part of the table")
 
 
-def _uneven(q: Array) -> Iterator[Family]:
+def _uneven(q: Array, path: Array) -> Iterator[Family]:
     """A table that is not flat: ridges and grooves, hills and dips, and a drag over a part of it, by where they are.
 
     The place of touch moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin
     theta, H' its slope along n0. The number is the area of the profile, or the volume: it hardly depends on the width.
     """
-    path = q[:, :2] + 0.036 * np.stack([np.sin(q[:, 3]), -np.cos(q[:, 3])], axis=1)
     along = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
     off = f"(({along} - {{edge}}) / {{length}})"
     ridge = (

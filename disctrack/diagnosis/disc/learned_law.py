@@ -305,7 +305,7 @@ def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None)
         if responding(known, current) is None:
             break
         scan = _Scan(known, current)
-        library = list(families(scan.motion.q, scan.motion.time, rate))
+        library = list(families(scan.motion.q, scan.motion.time, rate, system.disc))
         looked = 2.0 * float(np.log(len(library)))
         worth = [p for p in scan.proposals(library) if p.gain / noise > price * p.family.n_numbers + looked]
         if rival is not None:
