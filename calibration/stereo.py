@@ -264,16 +264,12 @@ def calibrate_from_corners(
         places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
         refinement, again = choose_board(*places, board.points, (refinement.terms.board,), *lens, report)
         candidates = (*candidates, *again)
-    report("trying a field of the lenses")
-    motion, lens_fit = motion_between_exposures(refinement), fit_lens_field(refinement, board.points)
-    if motion is not None and motion.is_seen and lens_fit is not None:
-        motion = motion_between_exposures(lens_fit.refinement)  # a field puts boards elsewhere for each camera, too
+    motion = motion_between_exposures(refinement)
     if motion is not None and motion.is_seen:
         report("pairs that were not synchronised: with a motion of the board between the exposures")
         begin = motion.as_random(board.points)
         refinement, again = choose_board(*places, board.points, boards, *lens, report, begin)
         candidates = (*candidates, *again)
-        lens_fit = fit_lens_field(refinement, board.points)
     apart = _told_apart(pairs.apart, names, bool(wide))
     warnings += apart
     if table_view is not None and table_view in rejected | pairs.apart:
@@ -286,6 +282,8 @@ def calibrate_from_corners(
         raise CalibrationError(
             f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
         )
+    report("trying a field of the lenses")
+    lens_fit = fit_lens_field(refinement, board.points)
     if lens_fit is not None:
         refinement = lens_fit.refinement
     report("judging")

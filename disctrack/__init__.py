@@ -25,8 +25,6 @@ Conventions (frames, angles, units, pixels) have one home: the docstring of disc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.2.0"
-
 if TYPE_CHECKING:
     from calibration.rig_file import read_rig, write_rig
     from disctrack.analyse.analysis import Analysis
@@ -38,14 +36,7 @@ if TYPE_CHECKING:
     from disctrack.diagnosis.stage import run_diagnose
     from disctrack.disc import Disc
     from disctrack.errors import DiscTrackError
-    from disctrack.files.trajectory_file import (
-        Provenance,
-        read_group,
-        read_trajectory,
-        write_csv,
-        write_group,
-        write_trajectory,
-    )
+    from disctrack.files.software import __version__ as __version__
     from disctrack.readers import FrameReader, open_frames
     from disctrack.readers.blocks import iter_pair_blocks
     from disctrack.recording.declaration import Recording, read_recording
@@ -57,6 +48,14 @@ if TYPE_CHECKING:
     from disctrack.track.overlay import write_overlay
     from disctrack.track.stage import Measurement, measure, open_pairs, trajectory_provenance
     from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+    from disctrack.trajectory.file import (
+        Provenance,
+        read_group,
+        read_trajectory,
+        write_csv,
+        write_group,
+        write_trajectory,
+    )
 
 # module -> the names it gives; "name=other" where the module calls it otherwise
 _HOME = {
@@ -68,7 +67,7 @@ _HOME = {
     "disctrack.disc": ("Disc",),
     "disctrack.track.stage": ("open_pairs", "Measurement", "measure", "trajectory_provenance"),
     "disctrack.trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
-    "disctrack.files.trajectory_file": (
+    "disctrack.trajectory.file": (
         "Provenance",
         "write_trajectory",
         "read_trajectory",
@@ -85,6 +84,7 @@ _HOME = {
     "disctrack.track.arrays": ("measure_pairs",),
     "disctrack.track.live": ("Tracker", "LivePose"),
     "disctrack.diagnosis.stage": ("run_diagnose", "diagnose=diagnose_trajectory"),
+    "disctrack.files.software": ("__version__",),
     "disctrack.rolling": ("Model", "State", "steady_precession", "simulate"),
     "disctrack.scene.simulation": ("run_simulate",),
     "disctrack.render": ("run_render",),

@@ -13,8 +13,8 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 
-from disctrack import __version__
 from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE, options
+from disctrack.files.software import __version__
 
 # The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
 # save. It must stand before numpy is loaded; a user's own setting is kept.

@@ -15,9 +15,8 @@ from calibration.arrays import Array
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import MeasuredMotion
 from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
-from disctrack.disc import Disc
+from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError
-from disctrack.regular_precession import precession_rate
 
 ENERGY = (
     ("translation", "J", "kinetic energy of the centre"),

@@ -17,9 +17,8 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from calibration.arrays import Array
-from disctrack.disc import Disc
+from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
-from disctrack.regular_precession import nutation_frequency, precession_rate
 
 # (name, n_theta): the power lost goes with theta^a on slow steady precession, n_theta = 1 / (1 - a), n_E = n_theta,
 # n_psidot = -n_theta / 2

@@ -11,12 +11,12 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.figures import all_figures
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
-from disctrack.files.trajectory_file import Provenance
+from disctrack.analyse.published import SURFACES, agreement, published_table
 from disctrack.files.whole import write_whole
 from disctrack.pages.figures import Drawn, draw, gallery
 from disctrack.pages.html import details, page, paragraph, section, table, tiles, warning
-from disctrack.published import SURFACES, agreement, published_table
 from disctrack.trajectory import FrameStatus
+from disctrack.trajectory.file import Provenance
 
 # Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
 ASYMPTOTIC_BELOW = np.radians(1.0)

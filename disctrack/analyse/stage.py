@@ -18,9 +18,9 @@ from disctrack.analyse.propagation import DerivedSeries, shared_sigma
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
-from disctrack.files.trajectory_file import Group, read_provenance, read_setup, read_trajectory, write_groups
 from disctrack.files.whole import refuse_existing
 from disctrack.frames import euler_jacobian
+from disctrack.trajectory.file import Group, read_provenance, read_setup, read_trajectory, write_groups
 
 
 @dataclass(frozen=True, repr=False)

@@ -34,13 +34,13 @@ from disctrack.batch.records import (
 )
 from disctrack.calibrate.stage import calibrate_into, is_rig_of, source_of
 from disctrack.errors import AnalysisError, DiscTrackError, OutputError
-from disctrack.files import trajectory_file as storage
-from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import write_whole
 from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.stage import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
+from disctrack.trajectory import file as storage
+from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[float], None]  # is told the share of the job that is done
 

@@ -11,8 +11,8 @@ from typing import Any
 from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
-from disctrack.files.trajectory_file import read_provenance
 from disctrack.files.whole import write_whole
+from disctrack.trajectory.file import read_provenance
 
 RECORD = "batch.json"
 SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
@@ -85,7 +85,7 @@ def is_done(folder: Path, record: Record | None, asked: dict[str, Any]) -> bool:
     """True if the record tells of a measured recording with all stages asked for, and all its files are there.
 
     The trajectory must be the record's; whether that is the result of the present inputs is another question
-    (`trajectory_file.is_result_of`).
+    (`disctrack.trajectory.file.is_result_of`).
     """
     if record is None or record.status != MEASURED or "trajectory" not in record.files:
         return False

@@ -11,13 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import disctrack
 from disctrack.batch.columns import COLUMNS, FALSE_DISCOVERY, LACKS_SOMETHING
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places, options_as_json
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file
+from disctrack.files.software import __version__
 from disctrack.files.whole import write_whole
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
@@ -83,7 +83,7 @@ def write_summary(
         document = {
             "schema": SCHEMA,
             "schema_version": SCHEMA_VERSION,
-            "version": disctrack.__version__,
+            "version": __version__,
             "searched": [str(places.found.base), *places.found.problems],
             "options": options_as_json(options),
             "counts": counts(rows),

@@ -17,12 +17,12 @@ from calibration.rig_file import read_rig, write_rig
 from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.trajectory_file import Provenance
 from disctrack.files.whole import whole_file
 from disctrack.progress import compiling, progress_bar
 from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import Recording
 from disctrack.track import summary
+from disctrack.trajectory.file import Provenance
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from calibration import CalibrationSettings, StereoRig
 from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.errors import OutputError, RecordingError
-from disctrack.files import trajectory_file as storage
 from disctrack.files.json_text import json_file
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
@@ -31,6 +30,7 @@ from disctrack.track.overlay import shown_rows, write_overlay
 from disctrack.track.stage import ImagePairs, check_rig, measure, trajectory_provenance
 from disctrack.track.tracking import TrackingSettings
 from disctrack.trajectory import Trajectory
+from disctrack.trajectory import file as storage
 
 RESULTS = "results"
 

@@ -14,12 +14,12 @@ from disctrack.analyse.viewer import require_rerun, write_rerun
 from disctrack.commands import DONE
 from disctrack.commands._outputs import pair_of, write_times
 from disctrack.errors import RecordingError
-from disctrack.files.reuse import origin_of, remember, reusable
-from disctrack.files.trajectory_file import read_provenance
 from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
 from disctrack.track.overlay import draw_pair
 from disctrack.track.stage import open_pairs
+from disctrack.trajectory.file import read_provenance
+from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:

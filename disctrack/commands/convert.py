@@ -10,11 +10,11 @@ from calibration.opencv_yaml import export_opencv, import_opencv
 from calibration.rig_file import read_rig, write_rig
 from disctrack.commands import DONE
 from disctrack.errors import OutputError, RigFileError
-from disctrack.files.exchange.c3d import write_c3d
-from disctrack.files.exchange.matlab import write_mat
 from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.trajectory_file import read_trajectory, write_csv
 from disctrack.files.whole import refuse_existing
+from disctrack.trajectory.exchange.c3d import write_c3d
+from disctrack.trajectory.exchange.matlab import write_mat
+from disctrack.trajectory.file import read_trajectory, write_csv
 
 TRAJECTORY = (".csv", ".mat", ".c3d")
 OPENCV = (".yml", ".yaml", ".xml")

@@ -9,10 +9,10 @@ from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.together.stage import run_together
-from disctrack.files.reuse import origin_of, remember, reusable
 from disctrack.progress import stage
 from disctrack.readers.blocks import default_threads
 from disctrack.track import summary
+from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -30,9 +30,9 @@ from disctrack.diagnosis.pages.words import law_text, sentence
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
+from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
 
 DOUBTFUL = 0.05  # probability of what a single known effect leaves, below which laws outside the catalogue compete
 

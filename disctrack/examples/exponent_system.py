@@ -15,13 +15,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from calibration.arrays import Array
+from disctrack.analyse.published import SURFACES, published_table
 from disctrack.diagnosis import Candidate, Quantity
 from disctrack.diagnosis.disc.motion import SLIP, motion_candidates
 from disctrack.diagnosis.engine.system import Values
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import LastStage, Reading, Setup
-from disctrack.published import SURFACES, published_table
 from disctrack.rolling import CATALOGUE, Model, effects
 
 ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin

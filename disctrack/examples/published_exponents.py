@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from calibration.arrays import Array, Mask
+from disctrack.analyse.published import PREDICTED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
@@ -31,7 +32,6 @@ from disctrack.examples.exponent_model import LastStage, Setup
 from disctrack.examples.exponent_system import BRAKING, ExponentSystem, at, published_series
 from disctrack.pages.figures import panels
 from disctrack.pages.palette import INK, MUTED
-from disctrack.published import PREDICTED
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 ASKED = ("t_f", "air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # looked at, found or not

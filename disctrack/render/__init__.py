@@ -5,10 +5,10 @@ rays (own inverse of the lens) -> areas, disc_raster, board_raster -> optics (bl
 It shares no code with the location of markers and corners, so that those can be judged by it.
 """
 
-from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.render.images import expected_disc, render_board, render_disc
 from disctrack.render.recording import recording_toml, run_render, true_disc_of, write_recording
 from disctrack.render.truth import Truth, read_truth
+from disctrack.scene.cameras import board_poses, rig_after_faults, rig_of
 
 __all__ = [
     "Truth",

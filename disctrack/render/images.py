@@ -18,8 +18,9 @@ from disctrack.frames import rotation_from_euler
 from disctrack.render import imperfect, optics
 from disctrack.render.board_raster import draw_board
 from disctrack.render.disc_raster import draw_disc
-from disctrack.render.rays import View, corner_rays, image_of
+from disctrack.render.rays import corner_rays
 from disctrack.render.sensor import digitise, hot_pixels
+from disctrack.scene.cameras import View, image_of
 from disctrack.scene.description import (
     AppearanceSettings,
     ImperfectionSettings,

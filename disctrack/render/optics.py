@@ -9,7 +9,8 @@ from scipy.special import erf
 
 from calibration.arrays import Array, Array32
 from calibration.compiled import njit
-from disctrack.render.rays import View, table_points
+from disctrack.render.rays import table_points
+from disctrack.scene.cameras import View
 from disctrack.scene.description import Scene
 
 _TEXTURE_SIZE = 1024  # texels per side

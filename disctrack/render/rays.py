@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,14 +15,7 @@ from calibration.arrays import Array
 from calibration.camera import Camera
 from calibration.compiled import njit
 from disctrack.errors import SceneError
-
-
-class View(NamedTuple):
-    """One camera and where it stands: x_camera = R_camera_world x_world + t_camera_world."""
-
-    camera: Camera
-    R_camera_world: Array  # (3, 3)
-    t_camera_world: Array  # (3,) [m]
+from disctrack.scene.cameras import View
 
 
 @njit(cache=True, nogil=True)
@@ -78,18 +70,6 @@ def bent_rays(rays: Array, pad: int, field: Callable[[Array], Array]) -> Array:
     off = field(np.stack([columns, rows], axis=-1) - pad - 0.5)
     by_row, by_column = np.gradient(rays, axis=(0, 1))
     return np.asarray(rays - by_column * off[..., :1] - by_row * off[..., 1:])
-
-
-def image_of(points_world: Array, view: View) -> Array:
-    """Pixels (..., 2) of points (..., 3) [m]: Brown's polynomial as printed, for bounding boxes and truth only."""
-    points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
-    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-    k1, k2, p1, p2, k3 = view.camera.distortion
-    s = x**2 + y**2
-    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
-    xd = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x**2)
-    yd = y * radial + p1 * (s + 2 * y**2) + 2 * p2 * x * y
-    return np.stack([view.camera.fx * xd + view.camera.cx, view.camera.fy * yd + view.camera.cy], axis=-1)
 
 
 def table_points(view: View, pad: int) -> Array:

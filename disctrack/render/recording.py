@@ -17,10 +17,10 @@ from calibration.camera import StereoRig
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
 from disctrack.frames import CAMERAS
-from disctrack.render.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.render.images import Stage, TrueDisc, expected_board_image, expected_disc_image, stages
 from disctrack.render.sensor import digitise
 from disctrack.render.truth import Truth, write_truth
+from disctrack.scene.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.scene.description import ImperfectionSettings, Scene
 from disctrack.scene.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
 

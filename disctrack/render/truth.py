@@ -16,7 +16,7 @@ from calibration.rig_file import read_rig_group, write_rig_group
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import COORDINATES, rotation_from_euler
-from disctrack.render.rays import View, image_of
+from disctrack.scene.cameras import View, image_of
 from disctrack.scene.description import Scene, scene_toml
 
 SCHEMA = "disctrack truth"

@@ -14,7 +14,7 @@ from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
-from disctrack.files.trajectory_file import read_group, read_provenance, read_setup
+from disctrack.trajectory.file import read_group, read_provenance, read_setup
 
 NUTATION_PER_PRECESSION = 0.785  # of the frequencies, thin disc 0.775 to 0.80 at 20 deg: enough to cut into periods
 MIN_PERIODS = 4  # of nutation, to judge a slope by their scatter

@@ -5,7 +5,7 @@ Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `str
 elsewhere, `run` writes a scene's motion to a file.
 """
 
-from disctrack.regular_precession import nutation_frequency, precession_rate
+from disctrack.disc import nutation_frequency, precession_rate
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, EffectParameter, ModelError
 from disctrack.rolling.impact import struck_disc

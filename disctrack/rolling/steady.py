@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disctrack.disc import Disc
-from disctrack.regular_precession import followers, nutation_frequency, precession_rate
+from disctrack.disc import Disc, followers, nutation_frequency, precession_rate
 from disctrack.rolling.state import State
 
 

@@ -100,8 +100,8 @@ def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None =
     """Write a motion as HDF5 that xarray and netCDF readers open: root, groups motion, energy, contact, effects."""
     import h5py
 
-    import disctrack
     from disctrack.files.labelled_arrays import Variable, write_variables
+    from disctrack.files.software import __version__
 
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:
@@ -118,7 +118,7 @@ def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None =
                 "schema": SCHEMA,
                 "schema_version": SCHEMA_VERSION,
                 "software": "disctrack",
-                "software_version": disctrack.__version__,
+                "software_version": __version__,
                 "end": motion.end.name,
                 "end_reason": motion.end.value,
                 "end_time_s": motion.end_time,

@@ -16,7 +16,6 @@ from calibration.arrays import Array
 from calibration.brief import Brief
 from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
-from disctrack.files.trajectory_file import Provenance
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
 from disctrack.readers import open_frames
@@ -30,6 +29,7 @@ from disctrack.recording.declaration import Recording
 from disctrack.track.motion_span import MotionSpan, find_motion
 from disctrack.track.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[int], None]
 

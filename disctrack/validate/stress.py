@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
-from disctrack.disc import Disc
+from disctrack.disc import Disc, precession_rate
 from disctrack.errors import TrackingError
-from disctrack.regular_precession import precession_rate
 from disctrack.render import render_disc
 from disctrack.scene.description import GlareSettings, Occluder, Scene
 from disctrack.validate.comparison import compare

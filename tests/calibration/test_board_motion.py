@@ -10,13 +10,10 @@ from numpy.testing import assert_allclose
 from calibration import Board, CalibrationSettings, CornerView, Terms, calibrate_from_corners, refine_stereo
 from calibration.board_motion import BoardMotion, motions, split
 from calibration.normal_equations import Problem
-from calibration.pairs import motion_between_exposures
 from calibration.rig_file import read_rig_file, write_rig
-from calibration.stereo import _observations
 from calibration.stereo_model import board_basis, moved, predict_pixels
 from calibration.tolerances import BoardTolerances
-from tests.oracles import imperfect_laboratory as laboratory
-from tests.oracles import moved_boards, point_laboratory
+from tests.oracles import moved_boards
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
@@ -148,26 +145,6 @@ def test_pairs_that_were_synchronised_have_no_motion():
         asked = refine_stereo(r.observations, r.model, BOARD.points, r.terms, motion=BoardMotion(1e-3, 1e-3))
         assert asked.problem.motion.shift < 0.1e-3
         assert asked.problem.motion.turn < 0.5e-3
-
-
-@pytest.mark.parametrize("seed", [404, 416])
-def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
-    plan = laboratory.Plan(seed)
-    cameras, target, draws = point_laboratory.cameras_of(plan)
-    found = point_laboratory.calibration_of(plan, cameras, target, draws, settings=CalibrationSettings())
-    assert found.lens is not None
-    assert found.refinement.problem.motion is None
-    assert not any("synchronised" in text for text in found.warnings)
-    # without the field it passes for one
-    left, right = found.corner_views
-    begun, terms, points = found.refinement.model, found.refinement.terms, found.board.points
-    plain = refine_stereo(_observations((list(left), list(right))), begun, points, terms)
-    assert motion_between_exposures(plain).is_seen
-    # and boards that do move are still told: 0.1 px are 25 um here
-    moving = [replace(view, points=view.points + 0.1 * rng.normal(size=2)) for view in right]
-    both = calibrate_from_corners(left, moving, found.board, CalibrationSettings(), 0, 3e-3)
-    assert_allclose(both.refinement.problem.motion.shift, 25e-6, rtol=0.5)
-    assert any("synchronised" in text for text in both.warnings)
 
 
 def test_a_rig_file_keeps_where_the_boards_were(tmp_path):

@@ -12,8 +12,8 @@ import pytest
 from calibration import sources
 from calibration.compiled import njit
 from disctrack import cli
-from disctrack.files.trajectory_file import read_trajectory
 from disctrack.progress import compiling
+from disctrack.trajectory.file import read_trajectory
 
 
 def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch, tmp_path, capsys):

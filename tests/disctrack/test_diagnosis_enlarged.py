@@ -10,9 +10,9 @@ from disctrack.diagnosis.disc.model_file import declared_model, model_toml
 from disctrack.diagnosis.disc.start import first_state
 from disctrack.frames import rotation_from_euler
 from disctrack.render import rig_of
-from disctrack.render.cameras import rig_after_faults
 from disctrack.render.recording import true_disc_of
 from disctrack.rolling import simulate
+from disctrack.scene.cameras import rig_after_faults
 from disctrack.scene.description import Faults, load_scene
 from disctrack.scene.motion import rolling_model, rolling_start
 from tests.oracles.measured_disc import measured

@@ -8,7 +8,7 @@ from disctrack.diagnosis import diagnose_trajectory
 from disctrack.diagnosis.disc.faults import setup_of
 from disctrack.diagnosis.disc.large_faults import in_step, poses_with, rig_as_it_is
 from disctrack.render import rig_of
-from disctrack.render.cameras import rig_after_faults
+from disctrack.scene.cameras import rig_after_faults
 from disctrack.scene.description import CameraFault, Faults, Scene
 from disctrack.trajectory import Trajectory
 from tests.disctrack.test_diagnosis_imperfect import recording

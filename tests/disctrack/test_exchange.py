@@ -15,9 +15,6 @@ from calibration.foreign_rigs import export_caliscope, export_mrcal, import_cali
 from disctrack.cli import main
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, RigFileError
-from disctrack.files.exchange.c3d import write_c3d
-from disctrack.files.exchange.matlab import write_mat
-from disctrack.files.trajectory_file import write_csv
 from disctrack.frames import (
     COORDINATES,
     continuous_quaternions,
@@ -27,6 +24,9 @@ from disctrack.frames import (
 from disctrack.render import rig_of
 from disctrack.scene.description import Scene
 from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory.exchange.c3d import write_c3d
+from disctrack.trajectory.exchange.matlab import write_mat
+from disctrack.trajectory.file import write_csv
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.published import SURFACES, agreement, published_table
+from disctrack.analyse.published import SURFACES, agreement, published_table
 
 
 def test_all_printed_averages_are_those_of_their_rows_but_one():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from disctrack.analyse.published import SURFACES
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.engine.fit import fit
 from disctrack.disc import MA_2014
@@ -22,7 +23,6 @@ from disctrack.examples.exponent_system import (
     setup_of,
 )
 from disctrack.examples.published_exponents import THIN_DISC, explanation, misfit
-from disctrack.published import SURFACES
 
 QUICK = replace(published_exponents.SETTINGS, shortlist=3, max_effects=1, judged=2)
 FEW = ("t_f", "air_bildsten", "contour_viscous", "theta_zero", "kz")

@@ -23,7 +23,7 @@ def test_a_result_counts_only_for_the_sources_that_made_it(tmp_path):
         home = Path(package.__file__).parent
         shutil.copytree(home, tmp_path / home.name, ignore=shutil.ignore_patterns("__pycache__", "*.md", "pictures"))
     code = (
-        "from disctrack.files.trajectory_file import Provenance\n"
+        "from disctrack.trajectory.file import Provenance\n"
         "made = Provenance('r', {}, {})\nprint(made.version, made.fingerprint)"
     )
     version, first = run(code, tmp_path).split()

@@ -20,9 +20,11 @@ from calibration.camera import N_RIG, Allowance, Camera, StereoRig
 from calibration.splines import LensField
 from disctrack.disc import MA_2014
 from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
-from disctrack.files import trajectory_file as storage
 from disctrack.files.labelled_arrays import Variable
-from disctrack.files.trajectory_file import (
+from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
+from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory import file as storage
+from disctrack.trajectory.file import (
     Group,
     Provenance,
     is_result_of,
@@ -34,8 +36,6 @@ from disctrack.files.trajectory_file import (
     write_groups,
     write_trajectory,
 )
-from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
-from disctrack.trajectory import FrameStatus, Trajectory
 
 PROVENANCE = Provenance("clip", {"images": "ab" * 32}, {"refine": True})
 
@@ -256,7 +256,7 @@ def test_replacing_groups_again_and_again_does_not_let_the_file_grow(file, traje
 
 
 def test_groups_of_a_stage_are_written_together_or_not_at_all(file, trajectory, monkeypatch):
-    from disctrack.files import trajectory_file
+    from disctrack.trajectory import file as trajectory_file
 
     axis = {"window": Variable(np.arange(5.0), ("window",), "s", "window")}
     before, writes = file.read_bytes(), []
@@ -345,7 +345,7 @@ def test_a_file_cut_off_by_the_system_is_removed(file, trajectory):
         import resource, signal, sys
         from pathlib import Path
         from disctrack.errors import OutputError
-        from disctrack.files.trajectory_file import read_provenance, read_trajectory, write_trajectory
+        from disctrack.trajectory.file import read_provenance, read_trajectory, write_trajectory
         path = Path(sys.argv[1])
         trajectory, provenance = read_trajectory(path), read_provenance(path)
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -368,7 +368,7 @@ def test_a_killed_writer_leaves_nothing_that_looks_whole(file, trajectory):
     code = """
         import os, sys, time
         from pathlib import Path
-        from disctrack.files.trajectory_file import read_provenance, read_trajectory, write_trajectory
+        from disctrack.trajectory.file import read_provenance, read_trajectory, write_trajectory
         path = Path(sys.argv[1])
         trajectory, provenance = read_trajectory(path), read_provenance(path)
         def wait(descriptor):

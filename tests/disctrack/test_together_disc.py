@@ -11,8 +11,8 @@ from disctrack.diagnosis.disc.plan import Planner, Proposal
 from disctrack.diagnosis.together.loop import diagnose_together
 from disctrack.diagnosis.together.recordings import Recorded
 from disctrack.diagnosis.trials.recordings import K_M, measured
-from disctrack.files.trajectory_file import Provenance, write_trajectory
 from disctrack.scene.description import Scene
+from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles import newton_euler
 
 RIG = 5

@@ -7,8 +7,7 @@ from numpy.testing import assert_allclose
 from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.energy import analyse_energy, energy_quantities
 from disctrack.analyse.propagation import MotionState
-from disctrack.disc import MA_2014
-from disctrack.regular_precession import precession_rate
+from disctrack.disc import MA_2014, precession_rate
 
 TOTAL, POWER, ADIABATIC, LEVEL = 5, 6, 7, 8
 

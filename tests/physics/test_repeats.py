@@ -14,12 +14,12 @@ from scipy import optimize, stats
 from disctrack.analyse.analysis import analyse
 from disctrack.analyse.stage import write_analysis
 from disctrack.disc import MA_2014
-from disctrack.files.trajectory_file import Provenance, write_trajectory
 from disctrack.repeats import compare, write
 from disctrack.repeats.alignment import Curves, align
 from disctrack.repeats.averages import average
 from disctrack.repeats.runs import INDEX, QUANTITIES, UNKNOWN, AnalysedRun, FittedNumber, k_m_of_energy
 from disctrack.repeats.spread import independent_samples, spread
+from disctrack.trajectory.file import Provenance, write_trajectory
 
 # of one smoothed frame, in the order of QUANTITIES: what the analysis of a recorded motion states at 5 degrees
 SIGMA = np.array([0.15e-6, 0.15e-6, 0.15e-6, 1e-4, 6e-6, 1e-4, 0.03, 1e-6])
@@ -166,7 +166,7 @@ def test_average_agrees_with_least_squares_and_says_when_runs_do_not_agree(rng):
 
 
 def test_published_trials_average_to_what_scipy_says_and_no_sigma_is_invented():
-    from disctrack.published import published_table
+    from disctrack.analyse.published import published_table
 
     table = published_table("glass")
     found = average(table.exponents[:, 1], np.full(len(table.exponents), 1.0))

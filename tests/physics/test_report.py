@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from disctrack.analyse.stage import run_analyse
-from disctrack.files.trajectory_file import Provenance, write_trajectory
 from disctrack.pages.palette import BLUE
+from disctrack.trajectory.file import Provenance, write_trajectory
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BLUE_BGR = np.array([int(BLUE[i : i + 2], 16) for i in (5, 3, 1)])  # of the curves

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from disctrack.cli import main
-from disctrack.files.trajectory_file import read_group
+from disctrack.trajectory.file import read_group
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,9 @@ from disctrack.batch import measure as stage
 from disctrack.batch.plan import Places, make_plan
 from disctrack.batch.records import read_record
 from disctrack.cli import main
-from disctrack.files.trajectory_file import read_trajectory
 from disctrack.files.whole import output_error
 from disctrack.track.tracking import prepare
+from disctrack.trajectory.file import read_trajectory
 
 FAST = ["--no-report"]
 MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
@@ -164,7 +164,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_that_looks_whole(one, recording,
     def full(path, *_, **__):
         raise output_error(path, OSError(28, "No space left on device"))
 
-    monkeypatch.setattr("disctrack.files.trajectory_file.write_whole", full)
+    monkeypatch.setattr("disctrack.trajectory.file.write_whole", full)
     result = stage.do(one)
     assert result.status == "failed"
     assert "disk is full" in result.record.reason

@@ -12,7 +12,7 @@ from calibration.rig_file import read_rig
 from disctrack.calibrate.views import find_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
-from disctrack.files.trajectory_file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_findings, read_trajectory
 from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]

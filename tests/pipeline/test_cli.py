@@ -14,8 +14,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.cli import COMMANDS, main
-from disctrack.files.trajectory_file import read_findings, read_trajectory
 from disctrack.trajectory import FrameStatus
+from disctrack.trajectory.file import read_findings, read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 

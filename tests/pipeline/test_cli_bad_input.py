@@ -17,7 +17,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.files import whole as whole_files
-from disctrack.files.trajectory_file import read_trajectory
+from disctrack.trajectory.file import read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 

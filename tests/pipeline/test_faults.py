@@ -13,11 +13,11 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.errors import DiscTrackError, OutputError
-from disctrack.files.trajectory_file import read_findings, read_trajectory
 from disctrack.render import read_truth
 from disctrack.render import recording as render_recording
 from disctrack.scene.description import Scene
 from disctrack.trajectory import FrameStatus
+from disctrack.trajectory.file import read_findings, read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 
 from calibration.rig_file import read_rig
 from disctrack.cli import main
-from disctrack.files.trajectory_file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_findings, read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 CAMERAS = ("left", "right")

@@ -10,8 +10,8 @@ import pytest
 
 from calibration.rig_file import read_rig
 from disctrack.cli import main as disctrack_cli
-from disctrack.files.trajectory_file import read_trajectory
 from disctrack.trajectory import FrameStatus
+from disctrack.trajectory.file import read_trajectory
 from tests.oracles.imperfect_table import truth_of
 from tests.oracles.point_laboratory import errors_and_variances
 

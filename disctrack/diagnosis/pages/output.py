@@ -17,8 +17,8 @@ from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.words import shown, together
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
-from disctrack.files.trajectory_file import write_group
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
+from disctrack.trajectory.file import write_group
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned

@@ -30,8 +30,8 @@ from disctrack.diagnosis.together.reduction import Reduced, Reduction
 from disctrack.diagnosis.together.sharing import Member
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
-from disctrack.files.trajectory_file import read_findings, read_provenance, read_trajectory
 from disctrack.trajectory import MarkerStatus, Trajectory
+from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
 
 SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
 SEEN_PLACES = 60  # frames of a recording whose dots tell where the lenses' fields are needed

@@ -13,9 +13,9 @@ from disctrack.diagnosis.together.recordings import Recorded, read_recorded
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.reuse import origin_of, remember, reusable
-from disctrack.files.trajectory_file import read_setup
 from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.trajectory.file import read_setup
+from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 FOLDER = "together_diagnosis"
 

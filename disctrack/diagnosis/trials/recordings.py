@@ -25,9 +25,8 @@ from disctrack.frames import (
     rotation_from_vector,
     unwrap_euler,
 )
-from disctrack.render import rig_of
-from disctrack.render.cameras import board_poses, rig_after_faults
 from disctrack.rolling import Effect, Model, simulate, steady_precession
+from disctrack.scene.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.scene.description import Faults, Scene
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory

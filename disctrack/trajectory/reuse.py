@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from disctrack.files.software import software_version
-from disctrack.files.trajectory_file import read_setup
 from disctrack.files.whole import write_whole
+from disctrack.trajectory.file import read_setup
 
 FILE_NAME = "made_from.json"
 

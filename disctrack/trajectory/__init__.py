@@ -126,7 +126,7 @@ class Trajectory(Brief):
 
     def to_xarray(self) -> Any:
         """The trajectory as an `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
-        from disctrack.files.exchange.xarray import to_xarray
+        from disctrack.trajectory.exchange.xarray import to_xarray
 
         return to_xarray(self)
 

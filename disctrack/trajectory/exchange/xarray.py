@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from disctrack.errors import OutputError
-from disctrack.files.trajectory_file import labelled
 from disctrack.trajectory import Trajectory
+from disctrack.trajectory.file import labelled
 
 
 def to_xarray(trajectory: Trajectory) -> Any:

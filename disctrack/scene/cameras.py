@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,30 @@ from calibration.arrays import Array
 from calibration.camera import Camera, StereoRig, placed_at
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
-from disctrack.render.rays import View, image_of
 from disctrack.scene.description import CameraFault, Scene
+
+
+class View(NamedTuple):
+    """One camera and where it stands: x_camera = R_camera_world x_world + t_camera_world."""
+
+    camera: Camera
+    R_camera_world: Array  # (3, 3)
+    t_camera_world: Array  # (3,) [m]
+
+
+def image_of(points_world: Array, view: View) -> Array:
+    """Pixels (..., 2) of points (..., 3) [m]: Brown's polynomial as printed, for bounding boxes and truth only.
+
+    Not `calibration.camera`'s, so that a mistake there shows up in the truth.
+    """
+    points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
+    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    k1, k2, p1, p2, k3 = view.camera.distortion
+    s = x**2 + y**2
+    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
+    xd = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x**2)
+    yd = y * radial + p1 * (s + 2 * y**2) + 2 * p2 * x * y
+    return np.stack([view.camera.fx * xd + view.camera.cx, view.camera.fy * yd + view.camera.cy], axis=-1)
 
 
 def rig_of(scene: Scene) -> StereoRig:

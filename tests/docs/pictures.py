@@ -1,9 +1,9 @@
 """The pictures of the documentation, from the sample data and a rendered recording.
 
-python disctrack/docs/pictures.py CLIP SECRET [FOLDER]
+python tests/docs/pictures.py CLIP SECRET [FOLDER]
 
 CLIP : results of `disctrack run sample_data/clip`; SECRET : results of the tour's recording, diagnosed with --figures;
-FOLDER : where the pictures go (default: beside this file, in `pictures`)
+FOLDER : where the pictures go (default: `disctrack/docs/pictures`)
 """
 
 from __future__ import annotations
@@ -65,6 +65,6 @@ def make(clip: Path, secret: Path, folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    target = Path(sys.argv[3]) if len(sys.argv) > 3 else Path(__file__).with_name("pictures")
+    target = Path(sys.argv[3]) if len(sys.argv) > 3 else Path("disctrack/docs/pictures")
     for file in make(Path(sys.argv[1]), Path(sys.argv[2]), target):
         print(file, file.stat().st_size // 1000, "kB")

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from disctrack.files.trajectory_file import labelled
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory.file import labelled
 
 
 def write_mat(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Path:
