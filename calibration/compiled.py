@@ -6,10 +6,9 @@ long as the contents of the function's file and of all modules of these packages
 that were compiled from others are overwritten. A function that is given helpers from elsewhere names them in an
 attribute `compiled_with`.
 
-Of the seconds that the first compilation of a large function takes, a tenth is LLVM's work for the machine at hand; the
-rest does not depend on it. So the largest functions ship as LLVM's intermediate code (folder `ahead`, written by
-tests/ship_compiled.py), which is optimised on the user's machine. It is taken where sources, types, system, Python and
-numba are those that it was made with; everywhere else numba compiles as ever.
+The functions that every user needs ship as machine code (folder `ahead`, written by tests/ship_compiled.py), each for
+two levels of x86-64 processors. It is taken as it is, and nothing is written, where sources, types, system, Python
+and numba are those that it was made with; everywhere else numba compiles as ever.
 """
 
 from __future__ import annotations
@@ -37,6 +36,10 @@ from calibration.sources import PACKAGES, sha256_with_imports
 __all__ = ["cfunc", "dumps", "njit"]
 
 AHEAD = Path(__file__).parent / "ahead"
+# Levels of the x86-64 psABI, and what a processor must have for their code, in LLVM's words; the first that fits is
+# taken. Code for x86-64-v4 was 6 % slower at tracking than that for v3, on a processor that has both.
+_V3 = ("avx", "avx2", "bmi", "bmi2", "cx16", "f16c", "fma", "lzcnt", "movbe", "popcnt", "sahf", "sse4.2", "xsave")
+LEVELS = {"x86-64-v3": frozenset(f"+{feature}" for feature in _V3), "x86-64": frozenset[str]()}
 # Compiled code meets Python by named functions only, the same in these: code made by the first was tried on all.
 SAME_INTERFACE = ((3, 11), (3, 12), (3, 13))
 
@@ -75,7 +78,7 @@ _to_be_told: list[Callable[[], None]] = []
 
 @contextmanager
 def when_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call `tell` whenever a function that is kept is about to be compiled, or optimised from what ships."""
+    """Call `tell` whenever a function that is kept is about to be compiled."""
     _to_be_told.append(tell)
     try:
         yield
@@ -88,28 +91,26 @@ class _ShippedOrKept(FunctionCache):
         # Not numba's own way, which first imports all that its compiler may be asked for (0.35 s of processor time):
         # what is kept needs the runtime's memory alone, and whoever compiles imports the rest.
         rtsys.initialize(target_context)
+        codegen = target_context.codegen()
+        ships = _shipped(self._py_func, sig, self._impl.locator.get_source_stamp(), codegen) if self._enabled else None
+        if ships is not None:
+            return self._impl.rebuild(target_context, ships)
         with self._guard_against_spurious_io_errors():
             kept = self._load_overload(sig, target_context)
-        if kept is not None:
-            return kept
-        for tell in tuple(_to_be_told):
-            tell()
-        codegen = target_context.codegen()
-        entry = _shipped(self._py_func, sig, self._impl.locator.get_source_stamp(), codegen)
-        if entry is None:
-            return None
-        self._cache_file.save(self._index_key(sig, codegen), entry)
-        return super().load_overload(sig, target_context)
+        if kept is None:
+            for tell in tuple(_to_be_told):
+                tell()
+        return kept
 
 
 def shipped_file(function: Callable[..., Any], sig: Any) -> Path:
-    """Where the intermediate code of a function for these argument types is."""
+    """Where the machine code of a function for these argument types is."""
     types = hashlib.sha256(str(sig).encode()).hexdigest()[:8]
     return AHEAD / f"{function.__module__}.{function.__qualname__}-{types}.gz"
 
 
 def made_for(stamp: str, sig: Any) -> tuple[str, ...]:
-    """What must be the same where intermediate code is made and where it is used."""
+    """What must be the same where machine code is made and where it is used."""
     version = tuple(sys.version_info[:2])
     versions = SAME_INTERFACE if version in SAME_INTERFACE else version
     python = f"{sys.implementation.name} {versions}{sys.abiflags}"  # t: a build without its lock, with other objects
@@ -117,21 +118,16 @@ def made_for(stamp: str, sig: Any) -> tuple[str, ...]:
 
 
 def _shipped(function: Callable[..., Any], sig: Any, stamp: str, codegen: Any) -> Any:
-    """What numba would keep of the function, from the intermediate code that ships; None where it is for others."""
+    """What numba would have kept of the function; None where what ships is for others."""
+    able = set(codegen._tm_features.split(","))
+    level = next(level for level, needed in LEVELS.items() if needed <= able)
     try:
         with gzip.open(shipped_file(function, sig)) as file:
             if pickle.load(file) != made_for(stamp, sig):
                 return None
-            name, bitcode, (*others, environments) = pickle.load(file)
+            return pickle.loads(pickle.load(file)[level])
     except (OSError, EOFError, pickle.UnpicklingError):
         return None
-    library = codegen.create_library(name)
-    library._final_module = llvm.parse_bitcode(bitcode)
-    library._optimize_final_module()
-    module = library._final_module
-    left = {variable.name for variable in module.global_variables}
-    used = tuple(environment for environment in environments if environment.env_name in left)
-    return (name, "object", (codegen._tm.emit_object(module), module.as_bitcode())), *others, used
 
 
 def _aware_of_sources(locator: Any) -> Any:

@@ -102,10 +102,10 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def compiling(what: str, seconds: int | str) -> Iterator[None]:
+def compiling(what: str, seconds: int) -> Iterator[None]:
     """Say on stderr what is compiled and for how long, as soon as the compiler begins; nothing where it is only loaded.
 
-    seconds: of processor time that it took where it was measured, with and without code that ships for this Python.
+    seconds: of processor time that it took where it was measured.
     """
     from calibration.compiled import when_compiling  # numba: those who call this have it, others need not wait
 

@@ -155,7 +155,7 @@ def _reusable(path: Path, provenance: Provenance) -> list[str] | None:
 
 
 def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:
-    with compiling("corners", "1 to 8"):
+    with compiling("corners", 8):
         corner_fit.prepare()
         normal_equations.prepare()
     with progress_bar("calibrate", 2 * len(source.views), "image") as advance:

@@ -7,9 +7,11 @@ import argparse
 import numpy as np
 
 from calibration import corner_fit, normal_equations
+from calibration.compiled import when_compiling
 from disctrack.commands import DONE
 from disctrack.progress import compiling
 from disctrack.readers import _png as png
+from disctrack.rolling import _assembly as assembly
 from disctrack.rolling import integrate
 from disctrack.track import _kernels as kernels
 from disctrack.track import dots
@@ -18,19 +20,21 @@ from disctrack.track.tracking import prepare
 
 def run(arguments: argparse.Namespace) -> int:
     """Compile what reading, calibrating, tracking and simulating use; returns the exit code."""
-    with compiling("readers", 1):
-        png.prepare()
-    with compiling("corners", "1 to 8"):
-        corner_fit.prepare()
-        normal_equations.prepare()
-    with compiling("tracking, 8 bit", "5 to 20"):
-        prepare(np.uint8)
-        dots.prepare(np.uint8)
-    with compiling("tracking, 16 bit", "5 to 20"):
-        prepare(np.uint16)
-        dots.prepare(np.uint16)
-    with compiling("the integrator of motions", "2 to 20"):
-        integrate.prepare(float)
-        integrate.prepare(complex)
-    print(f"inner loops are compiled; kept in {kernels.track_frames.stats.cache_path}")
+    compiled: list[None] = []
+    with when_compiling(lambda: compiled.append(None)):
+        with compiling("readers", 1):
+            png.prepare()
+        with compiling("corners", 8):
+            corner_fit.prepare()
+            normal_equations.prepare()
+        for dtype in (np.uint8, np.uint16):
+            with compiling(f"tracking, {8 * np.dtype(dtype).itemsize} bit", 20):
+                prepare(dtype)
+                dots.prepare(dtype)
+        with compiling("the simulation of motions", 30):
+            for scalar in (float, complex):
+                integrate.prepare(scalar)
+                assembly.prepare(scalar)
+    where = f"kept in {kernels.track_frames.stats.cache_path}" if compiled else "those that ship fit this machine"
+    print(f"inner loops are compiled: {where}")
     return DONE

@@ -10,10 +10,19 @@ from numpy.typing import NDArray
 
 from disctrack.rolling import equations
 from disctrack.rolling._compiled import compile_law, compile_system
-from disctrack.rolling.effects.base import HELPERS
+from disctrack.rolling.effects.base import HELPERS, catalogue
 from disctrack.rolling.integrate import CompiledSystem
 from disctrack.rolling.model import Model, body_constants, effect_values
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
+
+
+def prepare(scalar: type) -> None:
+    """Compile the equations of motion and the catalogue's laws for real or complex states, or load them."""
+    for function in (equations.rates, equations.event_margins):
+        compile_system(function, scalar)
+    for kind in catalogue():
+        if kind.law is not None:
+            compile_law(kind.law, tuple(p.name for p in kind.parameters), HELPERS, scalar)
 
 
 class Assembly:

@@ -52,8 +52,17 @@ def system_types(scalar: type) -> Any:
 @lru_cache(maxsize=256)  # the catalogue several times over; whoever calls a law holds it himself
 def compile_law(function: Callable[..., None], parameters: tuple[str, ...], helpers: tuple, scalar: type) -> Any:
     """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call."""
+    may_call(function, helpers)
+    return _compile(function, law_types(parameters, scalar))
+
+
+def may_call(function: Callable[..., None], helpers: tuple) -> None:
+    """Let a compiled function call these Python functions; what is kept of it on disk depends on them, too."""
     for helper in helpers:
         register_jitable(helper)
-    function.compiled_with = helpers  # type: ignore[attr-defined]  # what is kept on disk depends on them, too
-    records = [_record(names, scalar) for names in (parameters, KINEMATICS, WRENCH)]
-    return _compile(function, types.void(*records))
+    function.compiled_with = helpers  # type: ignore[attr-defined]
+
+
+def law_types(parameters: tuple[str, ...], scalar: type) -> Any:
+    """What the C function of a law with parameters of these names takes."""
+    return types.void(*(_record(names, scalar) for names in (parameters, KINEMATICS, WRENCH)))

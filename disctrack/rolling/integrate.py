@@ -80,6 +80,8 @@ def prepare(scalar: type) -> None:
     system = CompiledSystem(0, 0, 1, np.zeros(4, np.int64))
     passed = _passed(system, 0.0, np.zeros(1, scalar), np.zeros(1), RTOL_IMAGINARY, np.zeros(1), 1)
     _dop853.compile(tuple(map(typeof, passed)))
+    row, rows = (typeof(np.zeros(shape, scalar)) for shape in (1, (1, 1)))
+    _evaluate.compile((typeof(0), typeof(system.arguments), row, rows, rows, row, row, rows, rows))
 
 
 def _passed(
@@ -361,7 +363,8 @@ def _evaluate(
     t_box = t[:1].copy()
     for i in range(len(t)):
         _call(function, t[i], Y[i], out[i], t_box, args)
-        firsts[i], seconds[i] = first[0], second[0]
+        _assign(firsts[i], first)
+        _assign(seconds[i], second)
 
 
 def evaluate(
@@ -377,6 +380,7 @@ def evaluate(
     t : (n,), Y : (n, n_y) -> (n, n_out), (n,), (n,)
     """
     out = np.zeros((len(t), n_out), Y.dtype)
-    records = [np.zeros(len(t), s.dtype) for s in scratch]
-    _evaluate(function, arguments, t.astype(Y.dtype), np.ascontiguousarray(Y), out, *scratch, *records)
-    return out, records[0], records[1]
+    first, second = (np.zeros(len(t), s.dtype) for s in scratch)
+    numbers = [s.view(Y.dtype) for s in scratch] + [r.view(Y.dtype).reshape(len(t), -1) for r in (first, second)]
+    _evaluate(function, arguments, t.astype(Y.dtype), np.ascontiguousarray(Y), out, *numbers)
+    return out, first, second

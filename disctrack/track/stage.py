@@ -144,7 +144,7 @@ def measure(
     rate = recording.frame_rate
 
     stamps = usable_times(pairs.left, rate)
-    with compiling("tracking", "5 to 20"):  # not the camera's time: done once per installation
+    with compiling("tracking", 20):  # not the camera's time: done once per installation
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
     span = _span(pairs, rate, settings, threads)

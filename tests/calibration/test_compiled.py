@@ -1,30 +1,70 @@
-"""Functions that ship as intermediate code are those that numba would compile."""
+"""Functions that ship as machine code are those that numba would compile."""
 
 import gzip
+import os
 import pickle
+import subprocess
+import sys
 
+import llvmlite.binding as llvm
 import numpy as np
 import pytest
 
 from calibration import compiled
-from calibration._corner_kernel import fit_corners
-from calibration._normal_kernel import accumulate
 from disctrack.readers import _png
-from disctrack.rolling import equations, integrate
-from disctrack.track._kernels import look, track_frames
-from disctrack.track._pose_kernel import fit
+from tests.ship_compiled import HOW_MANY
 
-SHIPPED = {
-    "fit_corners": (fit_corners.py_func, 1),
-    "accumulate": (accumulate.py_func, 1),
-    "_undo_filters": (_png._undo_filters.py_func, 2),
-    "track_frames": (track_frames.py_func, 2),
-    "look": (look.py_func, 2),
-    "fit": (fit.py_func, 1),
-    "_dop853": (integrate._dop853.py_func, 2),
-    "rates": (equations.rates, 2),
-    "event_margins": (equations.event_margins, 2),
-}
+LEVELS = [  # that a processor of x86-64 has, by what numba takes from the environment
+    pytest.param({"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": ",".join(sorted(needed))}, id=level)
+    for level, needed in compiled.LEVELS.items()
+]
+MOTION = """
+import sys
+from pathlib import Path
+import numpy as np
+from calibration import compiled
+from disctrack.disc import MA_2014 as disc
+from disctrack.rolling import CATALOGUE, Model, sensitivities, steady_precession
+told = []
+if "anew" in sys.argv:
+    compiled.AHEAD = Path("nowhere")
+with compiled.when_compiling(lambda: told.append(1)):
+    model = Model(disc, effects=[CATALOGUE[name]() for name in ("km", "kz", "air_quadratic", "spring")])
+    state = steady_precession(np.radians(12.0), disc)
+    found = sensitivities(model, state, np.linspace(0.0, 0.05, 11), ["km.k_m", "spring.k"])
+print(len(told))
+print(*found.q.ravel())
+print(*found.dq.ravel())
+"""
+
+
+def motion(folder, *words, **environment):
+    """Functions that were compiled, motion and its derivatives, from a process of its own."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder)} | environment
+    told = subprocess.run([sys.executable, "-c", MOTION, *words], env=environment, capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    n, *found = told.stdout.splitlines()
+    return int(n), *(np.array(line.split(), float) for line in found)
+
+
+@pytest.mark.skipif("x86_64-unknown-linux" not in llvm.get_process_triple(), reason="code for Linux, x86-64")
+@pytest.mark.parametrize("environment", LEVELS)
+def test_where_the_code_that_ships_fits_nothing_is_compiled_and_motions_are_those_of_any_level(environment, tmp_path):
+    n, q, dq = motion(tmp_path / "here")
+    n_level, q_level, dq_level = motion(tmp_path / "level", **environment)
+    assert (n, n_level) == (0, 0)
+    assert not list(tmp_path.rglob("*.nb?"))  # and nothing is kept
+    np.testing.assert_allclose(q_level, q, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(dq_level, dq, rtol=1e-9, atol=1e-9 * abs(dq).max())
+
+
+@pytest.mark.slow  # 20 s
+def test_code_that_ships_gives_the_motions_of_code_that_is_compiled_here(tmp_path):
+    _, q, dq = motion(tmp_path / "ships")
+    n, q_anew, dq_anew = motion(tmp_path / "anew", "anew")
+    assert n > 8
+    np.testing.assert_allclose(q_anew, q, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(dq_anew, dq, rtol=1e-9, atol=1e-9 * abs(dq).max())
 
 
 def headers(function):
@@ -34,11 +74,10 @@ def headers(function):
             yield pickle.load(content)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_what_ships_was_made_from_the_present_sources(name):
-    function, n = SHIPPED[name]
+@pytest.mark.parametrize("function", HOW_MANY, ids=lambda function: function.__qualname__)
+def test_what_ships_was_made_from_the_present_sources(function):
     found = list(headers(function))
-    assert len(found) == n
+    assert len(found) == HOW_MANY[function]
     *_, python, numba_version = compiled.made_for("", "")
     if any(made[-2:] != (python, numba_version) for made in found):
         pytest.skip("made for another Python or numba, so it is compiled here")
