@@ -25,47 +25,17 @@ Conventions (frames, angles, units, pixels) have one home: the docstring of disc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from calibration.rig_file import read_rig, write_rig
-    from disctrack.analyse.analysis import Analysis
-    from disctrack.analyse.derivatives import differentiate
-    from disctrack.analyse.stage import run_analyse
-    from disctrack.batch import run_batch
-    from disctrack.calibrate.views import calibrate_recording, calibrate_views, find_views
-    from disctrack.diagnosis.stage import diagnose_trajectory as diagnose
-    from disctrack.diagnosis.stage import run_diagnose
-    from disctrack.disc import Disc
-    from disctrack.errors import DiscTrackError
-    from disctrack.files.software import __version__ as __version__
-    from disctrack.readers import FrameReader, open_frames
-    from disctrack.readers.blocks import iter_pair_blocks
-    from disctrack.recording.declaration import Recording, read_recording
-    from disctrack.render import run_render
-    from disctrack.rolling import Model, State, simulate, steady_precession
-    from disctrack.scene.simulation import run_simulate
-    from disctrack.track.arrays import measure_pairs
-    from disctrack.track.live import LivePose, Tracker
-    from disctrack.track.overlay import write_overlay
-    from disctrack.track.stage import Measurement, measure, open_pairs, trajectory_provenance
-    from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
-    from disctrack.trajectory.file import (
-        Provenance,
-        read_group,
-        read_trajectory,
-        write_csv,
-        write_group,
-        write_trajectory,
-    )
-
-# module -> the names it gives; "name=other" where the module calls it otherwise
+# In the order of the measurement: module -> the names it gives; "name=other" where the module calls it otherwise.
 _HOME = {
-    "calibration.rig_file": ("read_rig", "write_rig"),
-    "disctrack.recording.declaration": ("Recording", "read_recording"),
-    "disctrack.readers": ("FrameReader", "open_frames"),
+    "disctrack.recording.declaration": ("read_recording", "Recording"),
+    "disctrack.readers": ("open_frames", "FrameReader"),
     "disctrack.readers.blocks": ("iter_pair_blocks",),
     "disctrack.calibrate.views": ("find_views", "calibrate_views", "calibrate_recording"),
+    "calibration.rig_file": ("read_rig", "write_rig"),
     "disctrack.disc": ("Disc",),
-    "disctrack.track.stage": ("open_pairs", "Measurement", "measure", "trajectory_provenance"),
+    "disctrack.track.stage": ("open_pairs", "measure", "Measurement", "trajectory_provenance"),
+    "disctrack.track.arrays": ("measure_pairs",),
+    "disctrack.track.live": ("Tracker", "LivePose"),
     "disctrack.trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
     "disctrack.trajectory.file": (
         "Provenance",
@@ -77,67 +47,66 @@ _HOME = {
     ),
     "disctrack.track.overlay": ("write_overlay",),
     "disctrack.analyse.derivatives": ("differentiate",),
-    "disctrack.analyse.analysis": ("Analysis",),
     "disctrack.analyse.stage": ("run_analyse",),
-    "disctrack.batch": ("run_batch",),
-    "disctrack.errors": ("DiscTrackError",),
-    "disctrack.track.arrays": ("measure_pairs",),
-    "disctrack.track.live": ("Tracker", "LivePose"),
+    "disctrack.analyse.analysis": ("Analysis",),
     "disctrack.diagnosis.stage": ("run_diagnose", "diagnose=diagnose_trajectory"),
-    "disctrack.files.software": ("__version__",),
+    "disctrack.batch": ("run_batch",),
     "disctrack.rolling": ("Model", "State", "steady_precession", "simulate"),
     "disctrack.scene.simulation": ("run_simulate",),
     "disctrack.render": ("run_render",),
+    "disctrack.errors": ("DiscTrackError",),
+    "disctrack.files.software": ("__version__",),
 }
 _MODULE_OF = {
     name.partition("=")[0]: (module, name.partition("=")[2] or name)
     for module, names in _HOME.items()
     for name in names
 }
+__all__ = [name for name in _MODULE_OF if name != "__version__"]
 
-__all__ = [  # noqa: RUF022 (in the order of the measurement, not of the alphabet)
-    "read_recording",
-    "Recording",
-    "open_frames",
-    "FrameReader",
-    "iter_pair_blocks",
-    "find_views",
-    "calibrate_views",
-    "calibrate_recording",
-    "read_rig",
-    "write_rig",
-    "Disc",
-    "open_pairs",
-    "measure",
-    "Measurement",
-    "measure_pairs",
-    "Tracker",
-    "LivePose",
-    "Trajectory",
-    "FrameStatus",
-    "MarkerStatus",
-    "trajectory_provenance",
-    "Provenance",
-    "write_trajectory",
-    "read_trajectory",
-    "write_csv",
-    "write_group",
-    "read_group",
-    "write_overlay",
-    "differentiate",
-    "run_analyse",
-    "Analysis",
-    "run_diagnose",
-    "diagnose",
-    "run_batch",
-    "Model",
-    "State",
-    "steady_precession",
-    "simulate",
-    "run_simulate",
-    "run_render",
-    "DiscTrackError",
-]
+if TYPE_CHECKING:
+    from calibration.rig_file import read_rig as read_rig
+    from calibration.rig_file import write_rig as write_rig
+    from disctrack.analyse.analysis import Analysis as Analysis
+    from disctrack.analyse.derivatives import differentiate as differentiate
+    from disctrack.analyse.stage import run_analyse as run_analyse
+    from disctrack.batch import run_batch as run_batch
+    from disctrack.calibrate.views import calibrate_recording as calibrate_recording
+    from disctrack.calibrate.views import calibrate_views as calibrate_views
+    from disctrack.calibrate.views import find_views as find_views
+    from disctrack.diagnosis.stage import diagnose_trajectory as diagnose  # noqa: F401
+    from disctrack.diagnosis.stage import run_diagnose as run_diagnose
+    from disctrack.disc import Disc as Disc
+    from disctrack.errors import DiscTrackError as DiscTrackError
+    from disctrack.files.software import __version__ as __version__
+    from disctrack.readers import FrameReader as FrameReader
+    from disctrack.readers import open_frames as open_frames
+    from disctrack.readers.blocks import iter_pair_blocks as iter_pair_blocks
+    from disctrack.recording.declaration import Recording as Recording
+    from disctrack.recording.declaration import read_recording as read_recording
+    from disctrack.render import run_render as run_render
+    from disctrack.rolling import Model as Model
+    from disctrack.rolling import State as State
+    from disctrack.rolling import simulate as simulate
+    from disctrack.rolling import steady_precession as steady_precession
+    from disctrack.scene.simulation import run_simulate as run_simulate
+    from disctrack.track.arrays import measure_pairs as measure_pairs
+    from disctrack.track.live import LivePose as LivePose
+    from disctrack.track.live import Tracker as Tracker
+    from disctrack.track.overlay import write_overlay as write_overlay
+    from disctrack.track.stage import Measurement as Measurement
+    from disctrack.track.stage import measure as measure
+    from disctrack.track.stage import open_pairs as open_pairs
+    from disctrack.track.stage import trajectory_provenance as trajectory_provenance
+    from disctrack.trajectory import FrameStatus as FrameStatus
+    from disctrack.trajectory import MarkerStatus as MarkerStatus
+    from disctrack.trajectory import Trajectory as Trajectory
+    from disctrack.trajectory.file import Provenance as Provenance
+    from disctrack.trajectory.file import read_group as read_group
+    from disctrack.trajectory.file import read_trajectory as read_trajectory
+    from disctrack.trajectory.file import write_csv as write_csv
+    from disctrack.trajectory.file import write_group as write_group
+    from disctrack.trajectory.file import write_trajectory as write_trajectory
 
 
 def __getattr__(name: str) -> Any:
@@ -148,4 +117,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return list(_MODULE_OF)

@@ -321,6 +321,21 @@ _NOT_NEGATIVE = {
     "render.png_compression",
     "seed",
 }
+_POSITIVE = {
+    "cameras.frame_rate_hz",
+    "rig.mm_per_px",
+    "rig.distance_mm",
+    "disc.radius_mm",
+    "disc.thickness_mm",
+    "disc.mass_g",
+    "markers.diameter_mm",
+    "board.square_mm",
+    "gravity_m_s2",
+    "air_density_kg_m3",
+    "faults.pattern_scale",
+    "faults.left.focal_scale",
+    "faults.right.focal_scale",
+}
 
 
 def _numbers(item: Any, path: str = "") -> Iterator[tuple[str, float]]:
@@ -346,80 +361,49 @@ def _check(scene: Scene, where: str) -> None:
         least, most = 0.0 if key in _NOT_NEGATIVE else -MOST, math.inf if isinstance(value, int) else MOST
         if not least <= value <= most:  # nan, too
             raise SceneError(f"{where}: {key} = {value}; expected a number from {least:g} to {most:g}")
-    cameras, disc, board = scene.cameras, scene.disc, scene.board
-    reach_mm = max((math.hypot(x, y) for x, y in scene.markers.centres_mm), default=0.0) + scene.markers.diameter_mm / 2
-    positive = {
-        "cameras.frame_rate_hz": cameras.frame_rate_hz,
-        "rig.mm_per_px": scene.rig.mm_per_px,
-        "rig.distance_mm": min(scene.rig.distance_mm),
-        "disc.radius_mm": disc.radius_mm,
-        "disc.thickness_mm": disc.thickness_mm,
-        "disc.mass_g": disc.mass_g,
-        "markers.diameter_mm": scene.markers.diameter_mm,
-        "board.square_mm": board.square_mm,
-        "gravity_m_s2": scene.gravity_m_s2,
-        "air_density_kg_m3": scene.air_density_kg_m3,
-        "faults.pattern_scale": scene.faults.pattern_scale,
-        "faults.left.focal_scale": scene.faults.left.focal_scale,
-        "faults.right.focal_scale": scene.faults.right.focal_scale,
-    }
-    for key, value in positive.items():
-        if not 1 / MOST <= value <= MOST:  # its reciprocal is a number, too
+        if key in _POSITIVE and not 1 / MOST <= value <= MOST:  # its reciprocal is a number, too
             raise SceneError(f"{where}: {key} = {value}; expected a positive number, from {1 / MOST:g} to {MOST:g}")
-    complaints = [
-        (len(scene.markers.centres_mm) < 3, "markers.centres_mm", f"{len(scene.markers.centres_mm)} rows", "3 or more"),
-        (reach_mm > disc.radius_mm, "markers.centres_mm", "a dot over the disc's rim", "dots on the face"),
-        (
-            board.n_views < 1 or min(board.inner_corners) < 2,
-            "board",
-            "no view or no corner",
-            "n_views >= 1, corners >= 2",
-        ),
-        (scene.cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", scene.cameras.bit_depth, "8, 10, 12, 16"),
-        (scene.cameras.n_frames < 1, "cameras.n_frames", scene.cameras.n_frames, "at least 1"),
-        (min(scene.cameras.image_size) < 16, "cameras.image_size", scene.cameras.image_size, "at least 16 x 16"),
-        (min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"),
-        (scene.render.png_compression > 9, "render.png_compression", scene.render.png_compression, "0 to 9"),
-        (scene.render.threads < 1, "render.threads", scene.render.threads, "1 or more"),
-        (
-            scene.sensor.hot_pixels > math.prod(cameras.image_size) or max(cameras.image_size) > MOST_PIXELS,
-            "sensor.hot_pixels or cameras.image_size",
-            f"{scene.sensor.hot_pixels} of {cameras.image_size}",
-            f"images of at most {MOST_PIXELS} pixels a side, and no more hot pixels than pixels",
-        ),
-        (board.height_mm[0] > board.height_mm[1], "board.height_mm", board.height_mm, "the lower, then the higher"),
-        (scene.render.subpixels < 2, "render.subpixels", scene.render.subpixels, "2 or more"),
-        (
-            scene.motion.kind not in ("static", "table", "rolling"),
-            "motion.kind",
-            scene.motion.kind,
-            "static, table, rolling",
-        ),
-        (
-            any(len(p) != 6 for p in scene.motion.poses),
-            "motion.poses",
-            "rows",
-            "6 numbers each: x y z mm, psi theta phi deg",
-        ),
-        (
-            not {g.camera for g in scene.light.glare} | {r.camera for r in scene.faults.occluders} <= {"left", "right"},
-            "camera of a glare or occluder",
-            "another word",
-            "left or right",
-        ),
-        (
-            len(scene.faults.misprint_mm) not in (0, len(scene.markers.centres_mm)),
-            "faults.misprint_mm",
-            f"{len(scene.faults.misprint_mm)} rows",
-            f"one per dot ({len(scene.markers.centres_mm)})",
-        ),
-        (
-            any(not 0 <= k < len(scene.markers.centres_mm) for k in scene.faults.hidden_markers),
-            "faults.hidden_markers",
-            scene.faults.hidden_markers,
-            f"numbers from 0 to {len(scene.markers.centres_mm) - 1}",
-        ),
-    ]
-    for bad, key, found, expected in complaints:
+    for bad, key, found, expected in (*_of_the_disc(scene), *_of_the_images(scene), *_of_the_rest(scene)):
         if bad:
             raise SceneError(f"{where}: {key} = {found}; expected {expected}")
+
+
+_Complaint = tuple[bool, str, object, str]  # is it so, key, what was found, what was expected
+
+
+def _of_the_disc(scene: Scene) -> Iterator[_Complaint]:
+    centres, hidden, misprints = scene.markers.centres_mm, scene.faults.hidden_markers, scene.faults.misprint_mm
+    n = len(centres)
+    reach_mm = max((math.hypot(x, y) for x, y in centres), default=0.0) + scene.markers.diameter_mm / 2
+    yield n < 3, "markers.centres_mm", f"{n} rows", "3 or more"
+    yield reach_mm > scene.disc.radius_mm, "markers.centres_mm", "a dot over the disc's rim", "dots on the face"
+    yield len(misprints) not in (0, n), "faults.misprint_mm", f"{len(misprints)} rows", f"one per dot ({n})"
+    outside = any(not 0 <= k < n for k in hidden)
+    yield outside, "faults.hidden_markers", hidden, f"numbers from 0 to {n - 1}"
+
+
+def _of_the_images(scene: Scene) -> Iterator[_Complaint]:
+    cameras, render, size = scene.cameras, scene.render, scene.cameras.image_size
+    yield cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", cameras.bit_depth, "8, 10, 12, 16"
+    yield cameras.n_frames < 1, "cameras.n_frames", cameras.n_frames, "at least 1"
+    yield min(size) < 16, "cameras.image_size", size, "at least 16 x 16"
+    yield max(size) > MOST_PIXELS, "cameras.image_size", size, f"at most {MOST_PIXELS} pixels a side"
+    hot = scene.sensor.hot_pixels
+    yield hot > math.prod(size), "sensor.hot_pixels", hot, f"no more than the {math.prod(size)} pixels of an image"
+    yield min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"
+    yield render.png_compression > 9, "render.png_compression", render.png_compression, "0 to 9"
+    yield render.threads < 1, "render.threads", render.threads, "1 or more"
+    yield render.subpixels < 2, "render.subpixels", render.subpixels, "2 or more"
+
+
+def _of_the_rest(scene: Scene) -> Iterator[_Complaint]:
+    board, kind = scene.board, scene.motion.kind
+    empty = board.n_views < 1 or min(board.inner_corners) < 2
+    yield empty, "board", "no view or no corner", "n_views >= 1, corners >= 2"
+    upside_down = board.height_mm[0] > board.height_mm[1]
+    yield upside_down, "board.height_mm", board.height_mm, "the lower, then the higher"
+    yield kind not in ("static", "table", "rolling"), "motion.kind", kind, "static, table, rolling"
+    short = any(len(p) != 6 for p in scene.motion.poses)
+    yield short, "motion.poses", "rows", "6 numbers each: x y z mm, psi theta phi deg"
+    named = {g.camera for g in scene.light.glare} | {r.camera for r in scene.faults.occluders}
+    yield not named <= {"left", "right"}, "camera of a glare or occluder", "another word", "left or right"

@@ -20,7 +20,7 @@ from disctrack.track.exposure import shift_by_exposure
 from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.least_squares import step_to_minimum
-from disctrack.track.own_scatter import SharedFaults, split_scatter, without_shared_faults
+from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.slips import slips_in_words
@@ -68,86 +68,45 @@ class Tracking:
     doubts: tuple[str, ...] = ()  # what puts the result in question: images that are copies of others
 
 
-def assemble(
-    followers: list[Follower],
-    tables: Tables,
-    settings: TrackingSettings,
-    frame_rate: float,
-    gravity: float,
-    time: Array,
-    pairs: range,
-) -> Tracking:
+@dataclass(frozen=True)
+class Taken:
+    """When the pairs were taken, and under which gravity."""
+
+    pairs: range
+    time: Array  # (n,) [s]
+    frame_rate: float  # [Hz]
+    gravity: float  # [m/s^2]
+
+
+def assemble(followers: list[Follower], tables: Tables, settings: TrackingSettings, taken: Taken) -> Tracking:
     """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds."""
     if any(settings.exposure):  # which frames to trust with the acceleration is known when all have been judged
         unmoved = replace(settings, exposure=(0.0, 0.0))
-        blurred = assemble(followers, deepcopy(tables), unmoved, frame_rate, gravity, time, pairs)
+        blurred = assemble(followers, deepcopy(tables), unmoved, taken)
         tables.pixels -= shift_by_exposure(blurred.trajectory, settings.exposure)
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
-    alone = repeated & ~repeated.all(axis=1, keepdims=True)
-    tables.pixels[alone] = np.nan  # over the edges of stretches, too
-    tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
-    tables.covariance_px2 *= unexpected_misfit(tables.misfit, tables.n_pixels)[..., None, None]
-    field = first.setup.rig.lens_field
-    if field is not None:
-        tables.pixels = field.corrected(tables.pixels)
-    outlying = _outlying(tables, first.setup.rig, first.setup.disc)
-    as_built, faults = _shared(tables, first.setup, settings, outlying)
-    if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
-        centres = first.setup.disc.marker_centres_body + faults.marker_shift
-        more = _outlying(tables, first.setup.rig, replace(first.setup.disc, marker_centres_body=centres)) & ~outlying
-        if more.any():
-            outlying |= more
-            as_built, faults = _shared(tables, first.setup, settings, outlying)
-    if settings.refine_markers and faults is not None:
-        as_built = _without_false_shifts(as_built, first.setup.rig, first.setup.disc, faults)
+    _clean(tables, repeated, first.setup.rig)
+    as_built, faults, outlying = _shared(tables, first.setup, settings)
     fits = _fit_all(tables, as_built, settings.reject_outliers)
-    ordinary = replace(
-        fits,
-        degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
-        used=fits.used & ~outlying[:, None, None],
-    )
-    scatter = split_scatter(ordinary, tables.covariance_px2, faults)
-    factor, noise_factor = scatter.whole, scatter.noise
-    tables.covariance_px2 *= noise_factor  # in place: nobody else holds them
-    systematic = fits.covariance * scatter.systematic
-    fits.covariance[...] *= noise_factor
-    fits = replace(fits, chi_square=fits.chi_square / factor)
-    struck = (np.isfinite(tables.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
-    verdicts = judge_poses(
-        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / frame_rate, as_built.disc.radius
-    )
-    contradicted = verdicts.status == FrameStatus.CONTRADICTED
-    slips = slips_in_words(
-        contradicted, fits, tables.pixels, tables.covariance_px2, as_built.rig, as_built.disc.marker_centres_body, pairs
-    )
-    fits.covariance[...] *= verdicts.factor[:, None, None]
-    fits = replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED))
-    misplaced = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)[0] > 0
-    by_pattern = _by_pattern(as_built, fits.R_world_body) if misplaced else None
-    fits, systematic, rig, table = table_from_disc(
-        fits, systematic, as_built.rig, as_built.disc, settings.table, by_pattern
-    )
-    if by_pattern is not None:
-        for first_row in range(0, len(systematic), FITTED_AT_ONCE):
-            part = by_pattern[first_row : first_row + FITTED_AT_ONCE]
-            systematic[first_row : first_row + FITTED_AT_ONCE] += part @ part.swapaxes(1, 2)
+    fits, systematic, scatter = _scattered(fits, tables, faults, outlying)
+    fits, verdicts, slips = _judged(fits, tables, as_built, repeated, outlying, taken)
+    fits, systematic, as_built, table = _on_the_table(fits, systematic, as_built, settings.table)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
     poses = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(poses.factor, poses.factor))
-    shared = _shared_sigma(fits, systematic, as_built, rig)
-    as_built = replace(as_built, rig=rig)
-    trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, time, pairs, frame_rate, gravity)
+    shared = _shared_sigma(fits, systematic, as_built)
+    trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    warnings = warnings_of(first, factor, faults, scatter, poses, table, trajectory)
+    warnings = warnings_of(first, faults, scatter, poses, table, trajectory)
     return Tracking(
         trajectory=trajectory,
         noise=first.law.noise,
         blur_px=first.law.blur,
         as_built=as_built,
-        variance_factor=factor,
-        noise_factor=noise_factor,
+        variance_factor=scatter.whole,
+        noise_factor=scatter.noise,
         pose_scatter=poses,
         shared_sigma=shared,
         systematic_px=scatter.systematic_px,
@@ -155,23 +114,95 @@ def assemble(
         acquisitions=sum(f.acquisitions for f in followers),
         warnings=warnings,
         doubts=(
-            *repeats_in_words(repeated, pairs),
+            *repeats_in_words(repeated, taken.pairs),
             *slips,
             *(text for text in warnings if text.startswith((MISFIT, ONE_SIDED))),
         ),
     )
 
 
+def _clean(tables: Tables, repeated: Mask, rig: StereoRig) -> None:
+    """Take out dots of images (n, 2) that are copies of others, state misfits beyond noise, take off the lens field."""
+    alone = repeated & ~repeated.all(axis=1, keepdims=True)
+    tables.pixels[alone] = np.nan  # over the edges of stretches, too
+    tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
+    tables.covariance_px2 *= unexpected_misfit(tables.misfit, tables.n_pixels)[..., None, None]
+    if rig.lens_field is not None:
+        tables.pixels = rig.lens_field.corrected(tables.pixels)
+
+
 def _shared(
+    tables: Tables, setup: TrackingSetup, settings: TrackingSettings
+) -> tuple[AsBuilt, SharedFaults | None, Mask]:
+    """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
+    outlying = _outlying(tables, setup.rig, setup.disc)
+    as_built, faults = _refined(tables, setup, settings, outlying)
+    if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
+        centres = setup.disc.marker_centres_body + faults.marker_shift
+        more = _outlying(tables, setup.rig, replace(setup.disc, marker_centres_body=centres)) & ~outlying
+        if more.any():
+            outlying |= more
+            as_built, faults = _refined(tables, setup, settings, outlying)
+    if settings.refine_markers and faults is not None:
+        as_built = _without_false_shifts(as_built, setup.rig, setup.disc, faults)
+    return as_built, faults, outlying
+
+
+def _refined(
     tables: Tables, setup: TrackingSetup, settings: TrackingSettings, outlying: Mask
 ) -> tuple[AsBuilt, SharedFaults | None]:
-    """What the frames share, from those that are not outlying (n,)."""
+    """Dots and rig as built, and the faults that frames share, from those that are not outlying (n,)."""
     R, t = (np.where(outlying.reshape(-1, *[1] * (part.ndim - 1)), np.nan, part) for part in (tables.R, tables.t))
     seen = tables.pixels, tables.covariance_px2, setup.rig, setup.disc, R, t
     as_built = refine_as_built(
         *seen, refine_markers=settings.refine_markers, refine_rig=settings.refine_rig, max_frames=SHARED_FRAMES
     )
     return as_built, without_shared_faults(*seen, max_frames=SHARED_FRAMES)
+
+
+def _scattered(
+    fits: PoseFits, tables: Tables, faults: SharedFaults | None, outlying: Mask
+) -> tuple[PoseFits, Array, Scatter]:
+    """Poses and dots with covariances of the noise they have, the part (n, 6, 6) that repeats, and what was found."""
+    ordinary = replace(
+        fits,
+        degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
+        used=fits.used & ~outlying[:, None, None],
+    )
+    scatter = split_scatter(ordinary, tables.covariance_px2, faults)
+    tables.covariance_px2 *= scatter.noise  # in place: nobody else holds them
+    systematic = fits.covariance * scatter.systematic
+    fits.covariance[...] *= scatter.noise
+    return replace(fits, chi_square=fits.chi_square / scatter.whole), systematic, scatter
+
+
+def _judged(
+    fits: PoseFits, tables: Tables, as_built: AsBuilt, repeated: Mask, outlying: Mask, taken: Taken
+) -> tuple[PoseFits, Verdicts, tuple[str, ...]]:
+    """Poses without those that are refused, what each is worth, and exchanged images in words."""
+    struck = (np.isfinite(tables.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
+    verdicts = judge_poses(
+        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / taken.frame_rate, as_built.disc.radius
+    )
+    contradicted = verdicts.status == FrameStatus.CONTRADICTED
+    centres = as_built.disc.marker_centres_body
+    slips = slips_in_words(contradicted, fits, tables.pixels, tables.covariance_px2, as_built.rig, centres, taken.pairs)
+    fits.covariance[...] *= verdicts.factor[:, None, None]
+    return replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED)), verdicts, tuple(slips)
+
+
+def _on_the_table(
+    fits: PoseFits, systematic: Array, as_built: AsBuilt, source: str
+) -> tuple[PoseFits, Array, AsBuilt, TableFromDisc | None]:
+    """Poses, rig and what frames share (n, 6, 6) in the axes of the table that the rim touched, and that table."""
+    misplaced = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)[0] > 0
+    by_pattern = _by_pattern(as_built, fits.R_world_body) if misplaced else None
+    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, source, by_pattern)
+    if by_pattern is not None:
+        for first_row in range(0, len(systematic), FITTED_AT_ONCE):
+            part = by_pattern[first_row : first_row + FITTED_AT_ONCE]
+            systematic[first_row : first_row + FITTED_AT_ONCE] += part @ part.swapaxes(1, 2)
+    return fits, systematic, replace(as_built, rig=rig), table
 
 
 def _outlying(tables: Tables, rig: StereoRig, disc: Disc) -> Mask:
@@ -230,9 +261,7 @@ def _by_pattern(as_built: AsBuilt, R: Array) -> Array:
     return np.asarray(motions_of_pattern(R, as_built.disc) * np.sqrt([place, place, turn]))
 
 
-def _shared_sigma(
-    fits: PoseFits, systematic: Array, as_built: AsBuilt, rig: StereoRig
-) -> tuple[tuple[float, str], ...]:
+def _shared_sigma(fits: PoseFits, systematic: Array, as_built: AsBuilt) -> tuple[tuple[float, str], ...]:
     """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what."""
     rows = np.flatnonzero(fits.converged & np.isfinite(systematic).all(axis=(1, 2)))
     if not rows.size:
@@ -241,20 +270,12 @@ def _shared_sigma(
     whole = np.mean(np.diagonal(systematic[rows], axis1=1, axis2=2), axis=0)
     by_pattern = np.mean(np.sum(_by_pattern(as_built, fits.R_world_body[rows]) ** 2, axis=2), axis=0)
     further = {"what repeats in the dots": whole - by_pattern, OF_PATTERN: by_pattern}
-    sigma, most = causes(rig, fits.sensitivity[rows], further)
+    sigma, most = causes(as_built.rig, fits.sensitivity[rows], further)
     return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
 
 
 def _trajectory(
-    fits: PoseFits,
-    verdicts: Verdicts,
-    systematic: Array,
-    tables: Tables,
-    as_built: AsBuilt,
-    time: Array,
-    pairs: range,
-    frame_rate: float,
-    gravity: float,
+    fits: PoseFits, verdicts: Verdicts, systematic: Array, tables: Tables, as_built: AsBuilt, taken: Taken
 ) -> Trajectory:
     euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
     euler[~fits.converged] = np.nan
@@ -279,8 +300,8 @@ def _trajectory(
         rms = np.sqrt(squared.sum(axis=2) / per_camera)
         quaternion = frames.continuous_quaternions(frames.quaternion_from_rotation(fits.R_world_body))
     return Trajectory(
-        time=time,
-        frame=np.array(pairs, dtype=np.int64),
+        time=taken.time,
+        frame=np.array(taken.pairs, dtype=np.int64),
         q=np.column_stack([fits.t_world_body, euler]),
         pose_covariance=fits.covariance,
         calibration_sensitivity=fits.sensitivity,
@@ -295,6 +316,6 @@ def _trajectory(
         marker_status=marker_status,
         disc=as_built.disc,
         rig=as_built.rig,
-        frame_rate=frame_rate,
-        gravity=gravity,
+        frame_rate=taken.frame_rate,
+        gravity=taken.gravity,
     )

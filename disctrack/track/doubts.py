@@ -105,7 +105,6 @@ def _shaken_in_words(poses: PoseScatter, trajectory: Trajectory) -> str:
 
 def warnings_of(
     follower: Follower,
-    variance_factor: float,
     faults: SharedFaults | None,
     scatter: Scatter,
     poses: PoseScatter,
@@ -114,7 +113,7 @@ def warnings_of(
 ) -> tuple[str, ...]:
     """One sentence each."""
     warnings = []
-    own = variance_factor if faults is None else max(1.0, faults.reduced_chi_square)
+    own = scatter.whole if faults is None else max(1.0, faults.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
     one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
     if one > both:
@@ -136,9 +135,9 @@ def warnings_of(
             )
     if misplaced := misplaced_in_words(follower.setup.disc, trajectory.disc.marker_centres_body):
         warnings.append(f"{misplaced}. Poses rest on these; that their middle is the disc's is as declared")
-    if variance_factor > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
+    if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
         warnings.append(
-            f"{MISFIT} by {np.sqrt(variance_factor / own):.1f} times their own "
+            f"{MISFIT} by {np.sqrt(scatter.whole / own):.1f} times their own "
             f"scatter ({systematic_px:.3f} px): a camera moved, was refocused or lags since the calibration. "
             "disctrack diagnose tells which; calibrate again, or check the synchronisation"
         )

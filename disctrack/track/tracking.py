@@ -25,7 +25,7 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.track import following, pose
 from disctrack.track.arrangement import arrangement_found
-from disctrack.track.assembly import Tracking, TrackingSettings, assemble
+from disctrack.track.assembly import Taken, Tracking, TrackingSettings, assemble
 from disctrack.track.doubts import MOVED, ONE_SIDED
 from disctrack.track.following import (
     Follower,
@@ -129,15 +129,15 @@ def track(
         raise TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}")
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
-    when = np.asarray(timestamps, float)
-    tracking = assemble(followers, tables, settings, frame_rate, gravity, when, pairs)
+    taken = Taken(pairs, np.asarray(timestamps, float), frame_rate, gravity)
+    tracking = assemble(followers, tables, settings, taken)
     found = tracking.trajectory.disc
     if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not tracking.doubts:
         again = replace(setup, disc=found)
         followers, tables = _followed(read_blocks, edges, again, settings, workers, lambda n: None)
         for follower in followers:
             follower.setup = setup
-        tracking = assemble(followers, tables, settings, frame_rate, gravity, when, pairs)
+        tracking = assemble(followers, tables, settings, taken)
     tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
     status = tracking.trajectory.frame_status
     one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)

@@ -109,8 +109,3 @@ def test_xarray_holds_time_units_and_both_sigmas(taken):
     assert dataset.attrs["air_density_kg_m3"] == by_files.trajectory.air_density
     assert np.array_equal(dataset.x_sigma_calibration, by_files.trajectory.calibration_sigma[:, 0])
     assert dataset.marker_centre_px.sel(camera="right").shape == (len(dataset.time), 6, 2)
-
-
-def test_every_name_at_the_top_is_there():
-    for name in disctrack.__all__:
-        assert getattr(disctrack, name) is not None
