@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import base64
 import io
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from disctrack.files.whole import whole_file
+from disctrack.files.whole import whole_file, write_whole
 from disctrack.pages.html import Markup
 from disctrack.pages.palette import GRID, INK, MUTED
 
 DPI = 150
+END_OF_HEADER = 33  # of a PNG file: its signature and the chunk IHDR
 NO_TITLE = (0.95, 0.15, 0.55, 0.15)  # margins [in] of labelled axes
 LARGE = 400_000  # [bytes] vector graphics beyond it go into a page as a bitmap: thousands of points
 
@@ -87,16 +91,33 @@ def lay_out(
 
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure whole; the format follows from the name. Raises OutputError."""
-    FigureCanvasAgg(figure)
     kind = path.suffix[1:]
-    # of a PNG: a file a tenth larger than by the default level, in half the time
-    options: dict[str, Any] = {
-        "png": {"pil_kwargs": {"compress_level": 2}},
-        "pdf": {"metadata": {"CreationDate": None}},
-    }
+    if kind == "png":
+        write_whole(path, png_of(figure))
+        return path
+    FigureCanvasAgg(figure)
+    options: dict[str, Any] = {"pdf": {"metadata": {"CreationDate": None}}}
     with whole_file(path) as part:
         figure.savefig(part, format=kind, dpi=DPI, **options.get(kind, {}))
     return path
+
+
+def png_of(figure: Figure) -> bytes:
+    """The figure as the bytes of a PNG file.
+
+    Its rows are not filtered: of lines and letters on white that takes a third of the time of matplotlib's own encoder.
+    """
+    import cv2
+
+    plain = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE] if hasattr(cv2, "IMWRITE_PNG_FILTER") else []
+    canvas, figure.dpi = FigureCanvasAgg(figure), DPI
+    canvas.draw()
+    picture = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
+    png = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3, *plain])[1].tobytes()
+    per_metre = round(DPI / 0.0254)
+    size = b"pHYs" + struct.pack(">IIB", per_metre, per_metre, 1)
+    size = struct.pack(">I", len(size) - 4) + size + struct.pack(">I", zlib.crc32(size))
+    return png[:END_OF_HEADER] + size + png[END_OF_HEADER:]
 
 
 def draw(
@@ -118,16 +139,12 @@ def draw(
 
 def _inline(figure: Figure) -> str:
     """The figure as a data URI: vector graphics, or a bitmap where those would be larger."""
-    kind, content = "svg+xml", _bytes(figure, "svg", {"Date": None})
-    if len(content) > LARGE:
-        kind, content = "png", _bytes(figure, "png")
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _bytes(figure: Figure, kind: str, metadata: dict[str, None] | None = None) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
-    return buffer.getvalue()
+    figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
+    kind, content = "svg+xml", buffer.getvalue()
+    if len(content) > LARGE:
+        kind, content = "png", png_of(figure)
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> Markup:

@@ -5,12 +5,13 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from calibration.camera import Camera, StereoRig, rotation_from_vector
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, quaternion_from_rotation, rotation_from_euler
-from disctrack.pages.figures import save_figure
+from disctrack.pages.figures import DPI, save_figure
 from disctrack.track import figures as plots
 from disctrack.track import overlay
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -75,6 +76,15 @@ def test_every_figure_is_drawn_and_not_blank(trajectory, tmp_path, name):
     path = save_figure(plots.FIGURES[name](trajectory), tmp_path / f"{name}.png")
     assert cv2.imread(str(path)).std() > 5
     assert [file.name for file in tmp_path.iterdir()] == [f"{name}.png"]
+
+
+def test_a_png_file_shows_what_matplotlib_writes_at_the_same_size_on_paper(trajectory, tmp_path):
+    figure = plots.coordinates_figure(trajectory)
+    figure.savefig(tmp_path / "expected.png", dpi=DPI)
+    path = save_figure(figure, tmp_path / "ours.png")
+    ours, expected = (Image.open(file) for file in (path, tmp_path / "expected.png"))
+    np.testing.assert_array_equal(np.asarray(ours), np.asarray(expected)[..., :3])
+    assert ours.info["dpi"] == pytest.approx(expected.info["dpi"])
 
 
 @pytest.mark.parametrize("name", sorted(plots.FIGURES))
