@@ -10,6 +10,7 @@ from calibration import corner_fit, normal_equations
 from calibration.compiled import when_compiling
 from disctrack.commands import DONE
 from disctrack.progress import compiling
+from disctrack.readers import _lzw as lzw
 from disctrack.readers import _png as png
 from disctrack.rolling import _assembly as assembly
 from disctrack.rolling import integrate
@@ -24,6 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     with when_compiling(lambda: compiled.append(None)):
         with compiling("readers", 1):
             png.prepare()
+            lzw.prepare()
         with compiling("corners", 8):
             corner_fit.prepare()
             normal_equations.prepare()

@@ -75,16 +75,12 @@ def _undo_filters(rows: NDArray, pixel_bytes: int, out: NDArray) -> bool:  # pra
         if kind == 0:
             for i in range(stride):
                 out[y, i] = rows[y, i + 1]
-        elif kind == 1 and pixel_bytes == 1:
-            total = np.uint8(0)  # kept in a register: reading back what was just stored would cost four times as much
-            for i in range(stride):
-                total = np.uint8(total + rows[y, i + 1])
-                out[y, i] = total
         elif kind == 1:
-            for i in range(pixel_bytes):
-                out[y, i] = rows[y, i + 1]
-            for i in range(pixel_bytes, stride):
-                out[y, i] = rows[y, i + 1] + out[y, i - pixel_bytes]
+            for lane in range(pixel_bytes):  # a sum in a register: reading what was just stored costs four times more
+                total = np.uint8(0)
+                for i in range(lane, stride, pixel_bytes):
+                    total = np.uint8(total + rows[y, i + 1])
+                    out[y, i] = total
         elif kind == 2:
             for i in range(stride):
                 out[y, i] = rows[y, i + 1] + (out[y - 1, i] if y > 0 else 0)

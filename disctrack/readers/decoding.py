@@ -13,9 +13,11 @@ from calibration.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.readers._png import PngHeader, decode_plain_grey
 from disctrack.readers.raw import MOST_PIXELS
-from disctrack.readers.tiff_directories import size_of_first_page
+from disctrack.readers.tiff_directories import Code, Tiff, TiffContent
+from disctrack.readers.tiff_pixels import plain_grey
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # A header may claim any size, and decoding must not exhaust the memory. Even a black image does not shrink by more than
 # this when compressed (deflate: 1032); small ones are let pass.
 _MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
@@ -29,12 +31,12 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     """
     try:
         header = _checked_container(content)
+        image = _plain_tiff(content) if content[:4] in _TIFF_SIGNATURES else None
     except _Damaged as fault:
         raise RecordingError(f"{where}: {fault}. Copy or export this image again.") from fault
-    image = None
     if header is not None and header.is_plain_grey:
         image = decode_plain_grey(content, header, out)
-    else:
+    elif image is None:
         try:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         except (cv2.error, MemoryError) as error:
@@ -81,9 +83,18 @@ def _checked_container(content: bytes) -> PngHeader | None:
             raise _Damaged(f"the BMP file ends after {len(content)} of {declared} bytes")
         width, height = struct.unpack_from("<ii", content, 18)
         _check_size(abs(width), abs(height), len(content))
-    if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        _check_size(*size_of_first_page(content), len(content))
     return None
+
+
+def _plain_tiff(content: bytes) -> NDArray | None:
+    """Pixels of the first page; None where libtiff must say what it is."""
+    try:
+        tiff = Tiff(TiffContent(content))
+        tags, _ = tiff.directory(tiff.first)
+        _check_size(tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT), len(content))
+        return plain_grey(tiff, tags, tiff.pieces(tags, ""))
+    except RecordingError:
+        return None
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """TIFF files of many pages: one file per camera, or several that continue one another.
 
-Pages without compression are read at the speed of memory; any other page goes to libtiff as a file of its own, made of
-the page's directory and its compressed bytes.
+Pages without compression are read at the speed of memory, grey strips by LZW or deflate are decoded here; any other
+page goes to libtiff as a file of its own, made of the page's directory and its compressed bytes.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.readers._inflate import inflated
 from disctrack.readers.base import FrameReader, Frames, first_readable
 from disctrack.readers.decoding import as_grey, decode
 from disctrack.readers.raw import MOST_PIXELS, RawFile, RawFrames, check_frame_size
 from disctrack.readers.tiff_directories import Code, Tag, Tiff, assembled, chain
+from disctrack.readers.tiff_pixels import plain_grey
 
-_NOT_COMPRESSED, _DEFLATE = 1, (8, 32946)
 _REDUCED_IMAGE = 1  # bit of tag 254: a thumbnail of another page
 
 
@@ -146,14 +145,12 @@ class TiffPages(Frames):
 
 
 def _decoded_page(tiff: Tiff, offset: int, where: str) -> NDArray:
-    """Pixels of the page whose directory lies at `offset`, by libtiff; tiles one by one."""
+    """Pixels of the page with its directory at `offset`, by libtiff unless they are plain grey; tiles one by one."""
     tags, _ = tiff.directory(offset)
     pieces, fields = tiff.pieces(tags, where), tiff.fields(tags, where)
     if Code.TILE_OFFSETS not in tags:
-        strips = _inflated_strips(tiff, tags, pieces, where)
-        if strips is not None:
-            fields[Code.COMPRESSION] = (3, 1, np.array(_NOT_COMPRESSED, tiff.order + "u2").tobytes())
-        return decode(assembled(tiff.order, fields, strips or pieces), where)
+        pixels = plain_grey(tiff, tags, pieces)
+        return decode(assembled(tiff.order, fields, pieces), where) if pixels is None else pixels
     width, height = tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
     tile_width, tile_height = tiff.value(tags, Code.TILE_WIDTH), tiff.value(tags, Code.TILE_HEIGHT)
     check_frame_size(width, height, where)
@@ -170,30 +167,6 @@ def _decoded_page(tiff: Tiff, offset: int, where: str) -> NDArray:
         raise RecordingError(f"{where}: tiles of other sizes than announced; the page is damaged. Copy it again.")
     lines = [np.hstack(tiles[row * columns : (row + 1) * columns]) for row in range(rows)]
     return np.ascontiguousarray(np.vstack(lines)[:height, :width])
-
-
-def _inflated_strips(
-    tiff: Tiff, tags: Mapping[int, Tag], pieces: Sequence[bytes], where: str
-) -> list[bytes | bytearray] | None:
-    """Strips of a page that deflate alone compressed; None of another, and where one is not what the page announces.
-
-    libtiff, which then gets them as they are, has zlib inflate them, in twice the time.
-    """
-    if tiff.value(tags, Code.COMPRESSION, _NOT_COMPRESSED) not in _DEFLATE or tiff.value(tags, Code.PREDICTOR, 1) != 1:
-        return None
-    width, height = tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
-    check_frame_size(width, height, where)
-    bits = tiff.value(tags, Code.BITS, 1) * tiff.value(tags, Code.SAMPLES, 1)
-    rows = min(tiff.value(tags, Code.ROWS_PER_STRIP, height), height)
-    if bits not in (8, 16) or rows < 1 or len(pieces) != -(-height // rows):
-        return None
-    strips = []
-    for i, piece in enumerate(pieces):
-        strip = inflated(piece, min(rows, height - i * rows) * width * bits // 8)
-        if strip is None:
-            return None
-        strips.append(strip)
-    return strips
 
 
 def _pages(tiff: Tiff, number: int) -> tuple[list[_Page], str | None]:

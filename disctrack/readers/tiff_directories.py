@@ -37,6 +37,7 @@ class Code(IntEnum):
     FILL_ORDER = 266
     DESCRIPTION = 270
     STRIP_OFFSETS = 273
+    ORIENTATION = 274
     SAMPLES = 277
     ROWS_PER_STRIP = 278
     STRIP_COUNTS = 279
@@ -48,23 +49,14 @@ class Code(IntEnum):
     SAMPLE_FORMAT = 339
 
 
-def size_of_first_page(content: bytes) -> tuple[int, int]:
-    """Width and height that the first page of a TIFF file's content claims; 0 where none can be read."""
-    try:
-        tiff = Tiff(_Bytes(content))
-        tags, _ = tiff.directory(tiff.first)
-        return tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
-    except RecordingError:
-        return 0, 0
-
-
-class _Bytes:
+class TiffContent:
     """A file's content that was read already, with the part of RawFile that directories need."""
 
     def __init__(self, content: bytes) -> None:
         self._content, self.size, self.path = content, len(content), Path("TIFF content")
 
     def bytes_at(self, offset: int, size: int, where: str) -> bytes:
+        """Bytes from an offset on. Raises RecordingError where there are fewer."""
         if offset < 0 or size < 0 or offset + size > self.size:
             raise RecordingError(f"{where}: {size} bytes at byte {offset} are announced, but there are {self.size}.")
         return self._content[offset : offset + size]
@@ -87,7 +79,7 @@ class Tag:
 class Tiff:
     """The directories of one file. Raises RecordingError if it is no TIFF file."""
 
-    def __init__(self, file: RawFile | _Bytes) -> None:
+    def __init__(self, file: RawFile | TiffContent) -> None:
         self.file, self._where = file, str(file.path)
         head = file.bytes_at(0, min(16, file.size), self._where)
         magic = {b"II*\0": ("<", False), b"MM\0*": (">", False), b"II+\0": ("<", True), b"MM\0+": (">", True)}
