@@ -85,9 +85,54 @@ def refine_as_built(
 
     prior_sigma = np.concatenate([np.sqrt(np.diag(rig.covariance)), np.full(2 * m, DOT_SIGMA)])
     free = np.concatenate([(prior_sigma[:N_RIG] > 0) & refine_rig, np.full(2 * m, refine_markers)])
+    joint = _fitted_jointly(
+        (markers_px[rows], markers_covariance_px2[rows]), rig, disc, (R[rows], t[rows]), free, prior_sigma
+    )
+    shift, remaining, current_rig = joint.shift, joint.covariance, rig.perturbed(joint.shift[:N_RIG])
+    sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
+    if refine_rig:
+        current_rig = replace(current_rig, covariance=remaining[:N_RIG, :N_RIG], allowances=())
+    moved = shift[N_RIG:].reshape(m, 2)
+    size, size_sigma, size_share = 0.0, float("nan"), 0.0
+    if refine_markers and not refine_rig:
+        size, size_sigma = pattern_size(disc, moved, remaining[N_RIG:, N_RIG:])
+        current_rig, size_share = sized_by_pattern(rig, size, size_sigma)
+        moved = moved + size_share * size * _from_middle(disc)
+    kept = share_of_places(disc, moved, sigma) * declared_places_kept(disc, moved)
+    current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
+    return AsBuilt(
+        rig=current_rig,
+        disc=current_disc,
+        marker_shift=kept,
+        marker_shift_sigma=sigma,
+        rig_shift_sigmas=in_sigmas,
+        reduced_chi_square_before=joint.before,
+        reduced_chi_square_after=joint.after,
+        n_frames=len(rows),
+        size=size,
+        size_sigma=size_sigma,
+        size_share=size_share,
+    )
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """Rig and dots fitted together, with a free pose for every frame."""
+
+    shift: Array  # (30 + 2m,) of RIG_PARAMETERS and of the dots' places
+    covariance: Array  # (30 + 2m, 30 + 2m) of it; nought where it was not free
+    before: float  # reduced chi-square, as declared
+    after: float
+
+
+def _fitted_jointly(
+    seen: tuple[Array, Array], rig: StereoRig, disc: Disc, poses: tuple[Array, Array], free: Mask, prior_sigma: Array
+) -> _Joint:
+    """Fit what is free (30 + 2m,) to `seen`, dots and their covariances, from `poses`, attitudes and places."""
+    (observed, covariance), (R, t), m = seen, poses, disc.n_markers
     information = _prior_information(rig.covariance, free, m)
-    observed, covariance = markers_px[rows], markers_covariance_px2[rows]
-    R, t = R[rows], t[rows]
     shift = np.zeros(N_RIG + 2 * m)
     current_rig, current_disc = rig, disc
     before = after = np.nan
@@ -117,32 +162,7 @@ def refine_as_built(
             break
     remaining = np.zeros((len(shift), len(shift)))
     remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
-    sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
-    if refine_rig:
-        current_rig = replace(current_rig, covariance=remaining[:N_RIG, :N_RIG], allowances=())
-    moved = shift[N_RIG:].reshape(m, 2)
-    size, size_sigma, size_share = 0.0, float("nan"), 0.0
-    if refine_markers and not refine_rig:
-        size, size_sigma = pattern_size(disc, moved, remaining[N_RIG:, N_RIG:])
-        current_rig, size_share = sized_by_pattern(rig, size, size_sigma)
-        moved = moved + size_share * size * _from_middle(disc)
-    kept = share_of_places(disc, moved, sigma) * declared_places_kept(disc, moved)
-    current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
-    return AsBuilt(
-        rig=current_rig,
-        disc=current_disc,
-        marker_shift=kept,
-        marker_shift_sigma=sigma,
-        rig_shift_sigmas=in_sigmas,
-        reduced_chi_square_before=before,
-        reduced_chi_square_after=after,
-        n_frames=len(rows),
-        size=size,
-        size_sigma=size_sigma,
-        size_share=size_share,
-    )
+    return _Joint(shift, remaining, before, after)
 
 
 def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
