@@ -43,16 +43,15 @@ class Setup:
     phase: float = 0.0  # [rad] of the oscillation there
 
 
-@dataclass(frozen=True)
-class Reading:
-    """What the experimenter does to the motion, and may do wrong; the defaults are right."""
-
-    t_f_bias: float = 0.0  # [s] instant called t_f minus that of collapse
-    cut_shift: float = 0.0  # [s] shortest time left minus `Setup.shortest`
-    theta_zero: float = 0.0  # [rad] added to every nutation
-    height_zero: float = 0.0  # [m] added to every height
-    attitude_variance: float = 0.0  # [rad^2] noise of the attitude per axis and frame
-    smoothing_square: float = 0.0  # [s^2] square of the span of a moving average over all quantities
+# What the experimenter does to the motion, and may do wrong; nought is right.
+READING = (
+    "t_f.bias",  # [s] instant called t_f minus that of collapse
+    "cut.shift",  # [s] shortest time left minus `Setup.shortest`
+    "theta_zero.shift",  # [rad] added to every nutation
+    "height_zero.shift",  # [m] added to every height
+    "attitude_noise.variance",  # [rad^2] noise of the attitude per axis and frame
+    "smoothing.square",  # [s^2] square of the span of a moving average over all quantities
+)
 
 
 class LastStage:
@@ -77,29 +76,29 @@ class LastStage:
         # ln theta, ln psidot, energy against time
         self.curve = CubicSpline(motion.time[:n][last], curves[:n][last], axis=0) if ended else None
 
-    def outcomes(self, reading: Reading | None = None) -> Array:
-        """(4,) OUTCOMES; NaN where there is no collapse."""
+    def outcomes(self, reading: Mapping[str, float] | None = None) -> Array:
+        """(4,) OUTCOMES; NaN where there is no collapse. reading : those of READING that are not nought."""
         if self.curve is None:
             return np.full(len(OUTCOMES), np.nan)
-        left, *quantities = self._read(self.curve, reading or Reading())
+        left, *quantities = self._read(self.curve, dict.fromkeys(READING, 0.0) | dict(reading or {}))
         return np.array([*(slope(left, v) for v in quantities), np.log(self.duration)])
 
-    def _read(self, curve: CubicSpline, reading: Reading) -> tuple[Array, Array, Array, Array]:
+    def _read(self, curve: CubicSpline, reading: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
         """Time left as the experimenter has it, nutation, precession rate, energy, (n,) each."""
         setup, disc = self.setup, self.setup.disc
         # a fixed number of instants, so that nothing jumps when a quantity of the fit moves
         n = round((setup.longest - setup.shortest) / FRAME) + 1
-        left = np.linspace(setup.longest, setup.shortest + reading.cut_shift, n)
-        time = self.duration + reading.t_f_bias - left
-        half = np.sqrt(max(reading.smoothing_square, 0.0) / 12)  # two points stand for the mean to third order
+        left = np.linspace(setup.longest, setup.shortest + reading["cut.shift"], n)
+        time = self.duration + reading["t_f.bias"] - left
+        half = np.sqrt(max(reading["smoothing.square"], 0.0) / 12)  # two points stand for the mean to third order
         if time[-1] + half > curve.x[-1] or left[-1] <= 0:
             return (left, *np.full((3, n), np.nan))
         ln_theta, ln_psidot, energy = (0.5 * (curve(time - half) + curve(time + half))).T
-        theta, psidot = np.exp(ln_theta) + reading.theta_zero, np.exp(ln_psidot)
-        rate_variance = reading.attitude_variance / (2 * FRAME**2)  # of central differences
+        theta, psidot = np.exp(ln_theta) + reading["theta_zero.shift"], np.exp(ln_psidot)
+        rate_variance = reading["attitude_noise.variance"] / (2 * FRAME**2)  # of central differences
         psidot = psidot * np.exp(-0.5 * rate_variance / (psidot * np.sin(theta)) ** 2)  # mean of the noisy logarithm
         energy = energy + 0.5 * (2 * disc.moment_diametral + disc.moment_axial) * rate_variance
-        energy = energy + disc.mass * setup.gravity * reading.height_zero
+        energy = energy + disc.mass * setup.gravity * reading["height_zero.shift"]
         return left, theta, psidot, energy
 
 

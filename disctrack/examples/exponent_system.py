@@ -10,7 +10,7 @@ rolling disc has nothing to say to them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from disctrack.diagnosis.disc.motion import SLIP, motion_candidates
 from disctrack.diagnosis.engine.system import Values
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
-from disctrack.examples.exponent_model import LastStage, Reading, Setup
+from disctrack.examples.exponent_model import READING, LastStage, Setup
 from disctrack.rolling import CATALOGUE, Model, effects
 
 ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin
@@ -82,22 +82,21 @@ def published_series() -> tuple[Series, ...]:
     return tuple(series_of(setup_of(s), published_table(s).exponents[:, ORDER]) for s in SURFACES)
 
 
-# What the reading may do wrong: attribute of `Reading`, quantity, title and source, by the name of the effect.
-_READING = {
-    "t_f": ("t_f_bias", Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2),
-            "the instant called t_f is not that of collapse", "section 4a"),
-    "cut": ("cut_shift", Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02),
-            "the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),
-    "theta_zero": ("theta_zero", Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05)),
-                   "zero of the nutation (plane of the table)", "section 3b: accuracy 0.05 deg"),
-    "height_zero": ("height_zero", Quantity("height_zero.shift", "m", 1e-6, typical=2e-5),
-                    "zero of the height (plane of the table)", "section 3b: accuracy 5 um"),
-    "attitude_noise": (
-        "attitude_variance", Quantity("attitude_noise.variance", "rad^2", 1e-8, 0.0, 0.0, typical=np.radians(0.05)**2),
-        "noise of the attitude, which central differences turn into bias", "section 3b"),
-    "smoothing": ("smoothing_square", Quantity("smoothing.square", "s^2", 1e-6, 0.0, 0.0, 0.06**2, typical=0.01**2),
-                  "moving average over the record", "section 3b: 'a differential method'"),
-}  # fmt: skip
+# What the reading may do wrong: quantity, title and source of READING's errors, in its order.
+_ERRORS_OF_READING = (
+    (Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2),
+     "the instant called t_f is not that of collapse", "section 4a"),
+    (Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02),
+     "the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),
+    (Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05)),
+     "zero of the nutation (plane of the table)", "section 3b: accuracy 0.05 deg"),
+    (Quantity("height_zero.shift", "m", 1e-6, typical=2e-5),
+     "zero of the height (plane of the table)", "section 3b: accuracy 5 um"),
+    (Quantity("attitude_noise.variance", "rad^2", 1e-8, 0.0, 0.0, typical=np.radians(0.05)**2),
+     "noise of the attitude, which central differences turn into bias", "section 3b"),
+    (Quantity("smoothing.square", "s^2", 1e-6, 0.0, 0.0, 0.06**2, typical=0.01**2),
+     "moving average over the record", "section 3b: 'a differential method'"),
+)  # fmt: skip
 
 
 def at(name: str, surface: str) -> str:
@@ -116,7 +115,8 @@ def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = N
         shared = CATALOGUE[c.effect].__module__.rpartition(".")[2] in _SHARED and not c.threshold
         quantities = c.quantities if shared else tuple(q for own in c.quantities for q in _per_surface(own, surfaces))
         found.append(replace(c, quantities=quantities))
-    for name, (_, quantity, title, source) in _READING.items():
+    for quantity, title, source in _ERRORS_OF_READING:
+        name = quantity.name.partition(".")[0]
         found.append(Candidate(name, name, "measurement", title, source, (quantity,)))
         if len(surfaces) > 1:
             each, title = _per_surface(quantity, surfaces), f"{title}, each surface its own"
@@ -169,7 +169,8 @@ class ExponentSystem:
 
     def outcomes(self, index: int, values: Values) -> Array:
         """(4,) predicted means of one series: n_theta, n_psidot, n_energy, ln duration."""
-        return self._stage(index, values).outcomes(self._reading(index, values))
+        own = self.seen_by(index, values)
+        return self._stage(index, own).outcomes({name: own[name] for name in READING if name in own})
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, 1) and derivative (n, 1, k) by central differences, one-sided at bounds."""
@@ -216,18 +217,11 @@ class ExponentSystem:
                 own[plain] = own.get(plain, 0.0) + value
         return own
 
-    def _reading(self, index: int, values: Values) -> Reading:
-        own = self.seen_by(index, values)
-        given = {field: own.get(q.name, 0.0) for field, q, *_ in _READING.values()}
-        assert set(given) == {f.name for f in fields(Reading)}
-        return Reading(**given)
-
-    def _stage(self, index: int, values: Values) -> LastStage:
-        own = self.seen_by(index, values)
+    def _stage(self, index: int, seen: Values) -> LastStage:
+        own = dict(seen)
         spin = own.pop(SPIN, SPIN_AT_REST)
         inverse = own.pop(SLIP, 0.0)
-        reading = {q.name for _, q, *_ in _READING.values()}
-        laws = {name: value for name, value in own.items() if name not in reading and (value or name == "km.k_m")}
+        laws = {name: value for name, value in own.items() if name not in READING and (value or name == "km.k_m")}
         if inverse > 0:
             laws["slip.mu"] = 1 / inverse
         key = (index, spin, *sorted(laws.items()))

@@ -13,7 +13,7 @@ from disctrack.diagnosis.engine.fit import fit
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
-from disctrack.examples.exponent_model import LastStage, Reading, Setup, slope
+from disctrack.examples.exponent_model import LastStage, Setup, slope
 from disctrack.examples.exponent_system import (
     ExponentSystem,
     Series,
@@ -104,7 +104,7 @@ def test_an_early_t_f_lowers_the_exponents_as_for_an_exact_power_law():
     left = np.linspace(0.4, np.exp(-3), 351)
     for bias in (-0.03, -0.01, 0.005):
         expected = slope(left, (left - bias) ** (2 / 3)) - 2 / 3
-        found = stage.outcomes(Reading(t_f_bias=bias)) - stage.outcomes()
+        found = stage.outcomes({"t_f.bias": bias}) - stage.outcomes()
         assert_allclose(found[:3], [expected, -expected / 2, expected], rtol=0.05)
         assert found[3] == 0  # the duration is not read off t_f
 
