@@ -73,13 +73,12 @@ def plane_point(eye: Array, dx: float, dy: float, dz: float, height: float) -> t
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def between(corners: tuple[Array, Array, Array, Array], p: float, q: float) -> tuple[float, float]:
-    """Bilinear interpolation at row fraction p, column fraction q of directions at a pixel's corners 00, 01, 10, 11."""
-    r00, r01, r10, r11 = corners
+def between(rays: Array, v: int, u: int, p: float, q: float) -> tuple[float, float]:
+    """Bilinear interpolation at row fraction p, column fraction q of directions at the corners of pixel (v, u)."""
     a, b, c, d = (1 - p) * (1 - q), (1 - p) * q, p * (1 - q), p * q
     return (
-        a * r00[0] + b * r01[0] + c * r10[0] + d * r11[0],
-        a * r00[1] + b * r01[1] + c * r10[1] + d * r11[1],
+        a * rays[v, u, 0] + b * rays[v, u + 1, 0] + c * rays[v + 1, u, 0] + d * rays[v + 1, u + 1, 0],
+        a * rays[v, u, 1] + b * rays[v, u + 1, 1] + c * rays[v + 1, u, 1] + d * rays[v + 1, u + 1, 1],
     )
 
 

@@ -32,7 +32,7 @@ def _nearest_line(x: float, n: int, margin: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _board_grid(
-    grid: Array, p0: float, q0: float, size: float, corners: tuple[Array, Array, Array, Array], R: Array, eye: Array,
+    grid: Array, p0: float, q0: float, size: float, rays: Array, row: int, column: int, R: Array, eye: Array,
     bent: Array,
 ) -> bool:  # fmt: skip
     """Board coordinates of 3 x 3 points of a cell (size: of the pixel), and whether the rays all meet the board.
@@ -44,7 +44,7 @@ def _board_grid(
     for i in range(3):
         for j in range(3):
             p, q = p0 + 0.5 * i * size, q0 + 0.5 * j * size
-            rx, ry = between(corners, p, q)
+            rx, ry = between(rays, row, column, p, q)
             dx, dy, dz = ray_in_body(R, rx, ry)
             x, y, meets = plane_point(eye, dx, dy, dz, 0.0)
             if bent[0] != 0.0:
@@ -58,21 +58,33 @@ def _board_grid(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _beyond(grid: Array, k: int, line: float) -> tuple[float, float, float]:
+    """`cell_part` of what lies beyond a line of coordinate k."""
+    return cell_part(
+        grid[1, 1, k] - line, grid[0, 0, k] - line, grid[0, 2, k] - line, grid[2, 0, k] - line, grid[2, 2, k] - line
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _within(grid: Array, k: int, p: float, q: float) -> float:
+    """Coordinate k at row fraction p and column fraction q of a cell."""
+    return (1 - p) * ((1 - q) * grid[0, 0, k] + q * grid[0, 2, k]) + p * ((1 - q) * grid[2, 0, k] + q * grid[2, 2, k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) -> tuple[float, float, float]:
     """Mean grey of one cell that lines may cross, and its first moments."""
-    x, y = grid[1, 1]
+    x, y = grid[1, 1, 0], grid[1, 1, 1]
     line_x, line_y = _nearest_line(x, n_x, margin), _nearest_line(y, n_y, margin)
-    g = grid - np.array([line_x, line_y])
-    part_x = cell_part(g[1, 1, 0], g[0, 0, 0], g[0, 2, 0], g[2, 0, 0], g[2, 2, 0])
-    part_y = cell_part(g[1, 1, 1], g[0, 0, 1], g[0, 2, 1], g[2, 0, 1], g[2, 2, 1])
+    part_x, part_y = _beyond(grid, 0, line_x), _beyond(grid, 1, line_y)
     cut_x, cut_y = 0.0 < part_x[0] < 1.0, 0.0 < part_y[0] < 1.0
     if cut_x and cut_y:
         value = m_x = m_y = 0.0
         for i in range(16):
             for j in range(16):
                 p, q = (i + 0.5) / 16, (j + 0.5) / 16
-                point = (1 - p) * ((1 - q) * grid[0, 0] + q * grid[0, 2]) + p * ((1 - q) * grid[2, 0] + q * grid[2, 2])
-                grey = colours[_board_colour(point[0], point[1], n_x, n_y, margin)] / 256.0
+                x, y = _within(grid, 0, p, q), _within(grid, 1, p, q)
+                grey = colours[_board_colour(x, y, n_x, n_y, margin)] / 256.0
                 value, m_x, m_y = value + grey, m_x + grey * (q - 0.5), m_y + grey * (p - 0.5)
         return value, m_x, m_y
     if not (cut_x or cut_y):
@@ -104,12 +116,13 @@ def draw_board(
     grid = np.empty((3, 3, 2))
     for row in range(cells.shape[0] // s):
         for column in range(cells.shape[1] // s):
-            corners = (rays[row, column], rays[row, column + 1], rays[row + 1, column], rays[row + 1, column + 1])
-            ahead = _board_grid(grid, 0.0, 0.0, 1.0, corners, R, eye, bent)
-            x, y = grid[1, 1]
+            ahead = _board_grid(grid, 0.0, 0.0, 1.0, rays, row, column, R, eye, bent)
+            x, y = grid[1, 1, 0], grid[1, 1, 1]
             y0, x0 = row * s, column * s
             if not ahead or abs(x) > 1e3 or abs(y) > 1e3:
-                cells[y0 : y0 + s, x0 : x0 + s] += background[y0 : y0 + s, x0 : x0 + s]
+                for i in range(s):
+                    for j in range(s):
+                        cells[y0 + i, x0 + j] += background[y0 + i, x0 + j]
                 continue
             reach_x = 1.5 * max(
                 abs(grid[0, 0, 0] - x), abs(grid[0, 2, 0] - x), abs(grid[2, 0, 0] - x), abs(grid[2, 2, 0] - x)
@@ -125,7 +138,7 @@ def draw_board(
                 continue
             for i in range(s):
                 for j in range(s):
-                    _board_grid(grid, i / s, j / s, 1.0 / s, corners, R, eye, bent)
+                    _board_grid(grid, i / s, j / s, 1.0 / s, rays, row, column, R, eye, bent)
                     colours[0] = background[y0 + i, x0 + j]
                     value, m_x, m_y = _board_cell(grid, colours, n_x, n_y, margin)
                     deposit(cells, y0 + i, x0 + j, value, m_x, m_y)
