@@ -225,6 +225,7 @@ def tracking(table: Table, recording: Recording, rig: StereoRig, played: Played,
     )
     memory_1 = found["measured from memory, 1 core"]
     roofline(table, trajectory, images, memory_1.processor)
+    two_cores(table, in_memory(2), n, memory_1.processor)
     if table.seconds_left < 0:
         raise TimeIsUp("the plain script")
     script = timed(lambda: plain_script(recording, rig, images[:few], trajectory), few)
@@ -250,6 +251,21 @@ def roofline(table: Table, trajectory: Trajectory, images: np.ndarray, processor
         "least for the bytes: us per pair": 1e6 * by_bytes,
         "least for the arithmetic: us per pair": 1e6 * by_operations,
     }
+
+
+def two_cores(table: Table, action: Callable[[], object], n: int, processor: float) -> None:
+    """What two free cores reach, by processor time: one thread alone puts the poses together, the others follow."""
+    alone, all_threads = [], []
+    for _ in range(table.repeats):
+        began = time.thread_time(), time.process_time()
+        action()
+        alone.append((time.thread_time() - began[0]) / n)
+        all_threads.append((time.process_time() - began[1]) / n - alone[-1])
+    serial, shared = min(alone), min(all_threads)
+    rate = 1 / (serial + shared / 2)
+    print(f"  two threads: {1e6 * serial:.0f} us by one of them alone, {1e6 * shared:.0f} us shared; on two free cores")
+    print(f"  {rate:.0f} pairs/s, by two processes that know nothing of each other {2 / processor:.0f}")
+    table.figures |= {"two cores, by one thread alone: us": 1e6 * serial, "two cores, shared: us": 1e6 * shared}
 
 
 def bytes_per_second() -> float:
