@@ -122,7 +122,8 @@ def follow(
                 slip_steps += stretch.n_steps
             else:
                 stretch = integrate.integrate(system, t, y, grid[i:], rtol, atol)
-            pieces.append(_sample(assembly, regime, grid[i : i + stretch.n_filled], stretch.y[: stretch.n_filled]))
+            if stretch.n_filled:  # none where the steps are used up before the first instant
+                pieces.append(_sample(assembly, regime, grid[i : i + stretch.n_filled], stretch.y[: stretch.n_filled]))
             i += stretch.n_filled
             t, y = stretch.t_last, stretch.y_last
             if stretch.status == integrate.REACHED_END:

@@ -1,6 +1,7 @@
 """The engine on a system that is no disc: a damped oscillator with a known answer."""
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
 from disctrack.diagnosis.engine.fit import compress, fit, solve_bounded, triangle
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
 from disctrack.diagnosis.engine.score import Linearisation, angle, score_all
+from disctrack.diagnosis.engine.system import GivenUp, TrialGivenUp
 from disctrack.diagnosis.engine.whiteness import ljung_box, no_memory, whiteness
 
 SIGMA = 0.01
@@ -272,3 +274,73 @@ def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
         assert stats.binomtest(seen, 20_000, level).proportion_ci(1 - 1e-4).high > 0.7 * level
         assert seen / 20_000 < 1.3 * level + 4 * np.sqrt(level / 20_000)
     assert np.mean(stats.chi2.sf(statistic, 20) < 1e-3) > 2.5e-3
+
+
+class Impatient(Oscillator):
+    """Will not follow the drift, when it is in a hurry; nor at all, if it `gives_up`."""
+
+    in_a_hurry = gives_up = False
+
+    def hurried(self, share):
+        one = copy(self)
+        one.in_a_hurry = True
+        return one
+
+    def linearise(self, values, names):
+        if values.get("drift"):
+            if self.gives_up:
+                raise GivenUp
+            if self.in_a_hurry:
+                raise TrialGivenUp
+        return super().linearise(values, names)
+
+
+def test_a_hypothesis_that_takes_too_long_is_left_and_the_others_are_tried(rng):
+    system = oscillator(rng, {"drift": 0.02, "hum_c": 0.05})
+    assert sorted(f.candidate.name for f in diagnose(system, START).found) == ["drift", "hum"]
+    impatient = Impatient(system.observed, system.time)
+    answer = diagnose(impatient, START)  # the twin of the drift does what the drift did
+    assert sorted(f.candidate.name for f in answer.found) == ["hum", "twin"]
+    assert not any(r.candidate.name == "drift" for f in answer.found for r in f.cannot_be_told_from)
+    impatient.gives_up = True  # all patience at an end is another matter
+    with pytest.raises(GivenUp):
+        diagnose(impatient, START)
+
+
+def test_a_fit_that_leaves_much_is_found_to_a_share_of_its_own_scatter(rng):
+    """What no fit reaches makes all sigmas wider: to go on within them gains nothing, and takes as long."""
+    system = oscillator(rng, {"hum_c": 3.0})
+    near, exact = (fit(system, system.base, START, n) for n in (40, 40))
+    assert near.converged
+    assert near.reduced_chi_square > 1000
+    for _ in range(5):  # Gauss-Newton from there on, to rounding
+        residual, derivative = system.linearise(exact.values, exact.names)
+        step = np.linalg.lstsq(derivative[:, 0], residual[:, 0])[0]
+        exact = replace(exact, values={k: exact.values[k] + d for k, d in zip(exact.names, step, strict=True)})
+    scatter = np.sqrt(near.reduced_chi_square) * np.array([near.sigma(n) for n in near.names])
+    off = np.array([near.values[n] - exact.values[n] for n in near.names])
+    assert np.abs(off / scatter).max() < np.sqrt(1e-3)
+
+
+class Kinked:
+    """Promises that a step of 1 removes all, but a step beyond 0.5 makes it worse, and a shorter one gains nearly 0."""
+
+    time, weights, candidates = np.zeros(1), np.ones(1), ()
+    base = (Quantity("x", "1", 0.1),)
+
+    def __init__(self):
+        self.at = 0.0
+
+    def linearise(self, values, names):
+        far = values["x"] - self.at > 0.5
+        self.at = values["x"] if names and not far else self.at
+        residual = 20.0 if far else 10.0 - 1e-4 * values["x"]
+        return np.full((1, 1), residual), np.full((1, 1, len(names)), 10.0)
+
+
+def test_a_fit_that_crawls_is_ended_only_where_it_must_not_crawl():
+    patient, not_so = (fit(Kinked(), Kinked.base, {"x": 0.0}, 30, may_crawl=may) for may in (True, False))
+    assert not patient.converged
+    assert not not_so.converged
+    assert patient.n_iterations == 30
+    assert not_so.n_iterations == 3

@@ -43,7 +43,6 @@ CREEPS_BESIDE = (
 )
 EXCESS = 10.0  # variances of the noise; above it slip at mm/s is looked for over ...
 LASTS = 5  # ... so many frames at least: contact velocities that are errors of a fit stop within one
-FEW_SLIP_STEPS = 1000  # for every frame, in which that is settled: true slip takes a few hundred
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
@@ -147,14 +146,13 @@ def _slips_slowly(
     slipping = DiscSystem(
         trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=rolling.systematic
     )
-    slipping.patience = Patience(FEW_SLIP_STEPS * len(rolling.time))
+    soon = slipping.hurried()
     try:
-        alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
-        if not _at_noise(slipping, alone, settings):
+        alone = fit(soon, soon.base, soon.start(faults), MAX_ITERATIONS)
+        if not _at_noise(soon, alone, settings):
             return False
     except GivenUp:
         return False
-    slipping.patience.without_end()
     motion = simulated(slipping, alone.values)
     return bool((motion.regime[:LASTS] == Regime.SLIPPING).all())
 

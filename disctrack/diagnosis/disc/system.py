@@ -25,7 +25,7 @@ from disctrack.diagnosis.disc.sought import sought
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.diagnosis.engine.fit import triangle
-from disctrack.diagnosis.engine.system import Candidate, GivenUp, Quantity, Values
+from disctrack.diagnosis.engine.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
@@ -39,6 +39,7 @@ RTOL = 1e-10  # of the integration: a millionth of the noise
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
+TRIAL_SLIP_STEPS = 1_000  # of them in a fit that is one trial among many; where slip is true, a fit takes hundreds
 MOST_SLIP_STEPS = 17_000  # of the integrator for every frame, 8 us each: longer recordings need more in proportion
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
@@ -61,14 +62,18 @@ class Patience:
     take as short a step. A count of steps, and not of seconds, so that an answer does not depend on the machine.
     """
 
-    def __init__(self, steps: int = MAX_SLIP_STEPS) -> None:
-        self.left = steps
+    def __init__(self, steps: int = MAX_SLIP_STEPS, of: Patience | None = None) -> None:
+        """Of : what is taken is taken from this, too; then it is the patience with one trial among many."""
+        self.left: int = steps if of is None else min(steps, of.left)
+        self._of = of
 
     def take(self, steps: int) -> None:
-        """Count. Raises GivenUp when the last is taken."""
+        """Count. Raises GivenUp when the last is taken, TrialGivenUp where that is a trial's last only."""
+        if self._of is not None:
+            self._of.take(steps)
         self.left = max(self.left - steps, 0)
         if self.left == 0:
-            raise GivenUp
+            raise GivenUp if self._of is None else TrialGivenUp
 
     def without_end(self) -> None:
         """An answer has been found: what is still asked of it is asked to the end."""
@@ -272,6 +277,12 @@ class DiscSystem:
         for name in ("time", "used", "_observed", "_whiten", "weights", "_nuisance_columns"):
             setattr(part, name, getattr(self, name)[:n])
         return part
+
+    def hurried(self, share: float = 1.0) -> DiscSystem:
+        """The same system, that gives up with TrialGivenUp after this share of the steps of slip that a trial has."""
+        one = copy(self)
+        one.patience = Patience(int(share * TRIAL_SLIP_STEPS * len(self.time)), self.patience)
+        return one
 
     def knowing(self, law: type[Effect]) -> DiscSystem:
         """The same system, in whose values parameters of this law may be named."""

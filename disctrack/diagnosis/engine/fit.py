@@ -14,8 +14,9 @@ from disctrack.diagnosis.engine.nuisances import Projection, is_linear, projecti
 from disctrack.diagnosis.engine.system import Quantity, System, Values
 
 MAX_ITERATIONS = 40
-TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less
+TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less, over what is left per datum
 NEAR = 1e-3  # sigmas from a bound, within which a quantity stands at it
+CRAWLING, CRAWLED = 1e-3, 3  # share of chi-square that a halved step gains at most, so many times in a row
 _HALVINGS = 8
 NO_DERIVATIVE = np.zeros(0)
 
@@ -112,11 +113,17 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
     return np.where(inside.active_mask < 0, lower, np.where(inside.active_mask > 0, upper, found))
 
 
-def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
+def fit(
+    system: System,
+    quantities: Sequence[Quantity],
+    start: Values,
+    max_iterations: int = MAX_ITERATIONS,
+    may_crawl: bool = True,
+) -> Fit:
     """Minimise chi-square over `quantities` from `start`; whatever else `start` holds stays as it is.
 
     A step that leads where there is no prediction, or uphill, is halved. `converged` is False where that does not help
-    or the iterations run out.
+    or the iterations run out; or where it has to be done again and again to gain next to nothing, unless it may crawl.
     """
     quantities = tuple(quantities)
     values = {q.name: q.null for q in quantities} | dict(start)
@@ -127,9 +134,10 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
     names = [q.name for q in moved]
     lower, upper = np.array([q.lower for q in moved]), np.array([q.upper for q in moved])
     residual, derivative = system.linearise(values, names)
+    n_data = int(np.sum(system.weights))
     prior, prior_matrix = prior_rows(moved, values)
     cost = _cost(residual, prior, derivative, common)
-    converged, iteration = False, 0
+    converged, iteration, crawled = False, 0, 0
     matrix, right = np.zeros((0, len(names))), np.zeros(0)
     while np.isfinite(cost) and iteration < max_iterations:
         iteration += 1
@@ -138,7 +146,7 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
         x = np.array([values[n] for n in names])
         step = solve_bounded(right, matrix, lower - x, upper - x)
         expected = right @ right - np.sum((right - matrix @ step) ** 2)
-        if expected < TOLERANCE:
+        if expected < TOLERANCE * max(1.0, cost / n_data):
             converged = True
             break
         for halving in range(_HALVINGS):
@@ -155,8 +163,10 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             # rounding of the prediction: no step lowers chi-square although the next one promises next to nothing
             converged = bool(expected < max(0.1, 1e-7 * cost))
             break
+        crawled = crawled + 1 if halving and cost - new_cost < CRAWLING * cost else 0
         values, residual, derivative, prior, cost = trial, new_residual, new_derivative, new_prior, new_cost
-    n_data = int(np.sum(system.weights))
+        if crawled == CRAWLED and not may_crawl:
+            break
     covariance = covariance_within(matrix, right, np.array([values[n] for n in names]), lower, upper)
     chi_square, penalty = float(cost), 0.0
     if np.isfinite(cost):
@@ -174,6 +184,12 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
     elif common.names:
         covariance = np.zeros((len(quantities), len(quantities)))
     return Fit(quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration)
+
+
+def no_fit(quantities: Sequence[Quantity], values: Values) -> Fit:
+    """What became of a fit that was given up: nothing that any other could be worse than."""
+    k = len(quantities)
+    return Fit(tuple(quantities), dict(values), np.zeros((k, k)), np.inf, 0.0, 0, False, 0)
 
 
 def _joint(covariance: Array, common: Projection, derivative: Array) -> Array:

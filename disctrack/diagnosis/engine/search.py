@@ -16,17 +16,18 @@ from scipy import stats
 
 from calibration.arrays import Mask
 from disctrack.diagnosis.engine.chance import Chance, chance
-from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.fit import Fit, fit, no_fit
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_all, score_pairs
-from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, Values, hurried
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
+SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
@@ -103,6 +104,7 @@ class Diagnosis:
     tried: tuple[Tried, ...]
     settings: Settings = field(default_factory=Settings)
     partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
+    nearest: Fit | None = None  # with them
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
@@ -171,7 +173,8 @@ class _Search:
             self.noise = min(self.noise, self._noise(current.fit))
             linear = Linearisation(self.system, current.fit, self.candidates)
         if current.candidates and not self._worth_naming(before, current):
-            return replace(self._answer(before, before, (), scores, partial=current), chance=by_chance)
+            answer = self._answer(before, before, (), scores, partial=current)
+            return replace(answer, chance=by_chance, nearest=current.fit)
         current = self._standing(current)
         current, rivals = self._settled(current)
         found = tuple(self._found(current, c, rivals[c.name]) for c in current.candidates)
@@ -216,7 +219,8 @@ class _Search:
             self.free_runs.append((fit_, known))
         return known
 
-    def _fit(self, candidates: Sequence[Candidate], start: Values) -> Fit:
+    def _fit(self, candidates: Sequence[Candidate], start: Values, patient: bool = False) -> Fit:
+        """With these effects.   patient : however long it takes; else a fit that is given up has not converged"""
         key = frozenset(c.name for c in candidates)
         if key in self.fits:
             return self.fits[key]
@@ -224,7 +228,11 @@ class _Search:
         for c in candidates:
             for name, value in zip(c.names, c.start, strict=False):
                 values.setdefault(name, value)
-        found = fit(self.system, self._quantities(candidates), values)
+        quantities = self._quantities(candidates)
+        try:
+            found = fit(self.system if patient else hurried(self.system), quantities, values)
+        except TrialGivenUp:
+            return no_fit(quantities, values)
         if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
             self.fits[key] = found
         return found
@@ -246,7 +254,10 @@ class _Search:
     def _promising(self, current: Trial, together: Sequence[Candidate], start: Values) -> bool:
         """Have some steps from this start removed a good part of the residual?"""
         values = dict(current.fit.values) | dict(start)
-        few = fit(self.system, self._quantities(together), values, max_iterations=FIRST_STEPS)
+        try:
+            few = fit(hurried(self.system, SOON), self._quantities(together), values, max_iterations=FIRST_STEPS)
+        except TrialGivenUp:
+            return False
         return few.cost < PROMISING * current.fit.cost
 
     def _judged(self, current: Trial, trial: Trial) -> Trial:
@@ -431,7 +442,7 @@ class _Search:
 
     def _found(self, trial: Trial, candidate: Candidate, rivals: list[Rival]) -> Found:
         rest = tuple(c for c in trial.candidates if c is not candidate)
-        without = self._fit(rest, _without(trial.fit.values, candidate, rest))
+        without = self._fit(rest, _without(trial.fit.values, candidate, rest), patient=True)
         held = self._held_out(without)
         held_gain = 2 * (self._log_density(trial) - held.log_density) / self.noise
         gain = self._cost(without) - self._cost(trial.fit)

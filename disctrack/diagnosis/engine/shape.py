@@ -8,6 +8,7 @@ something unexplained, its laws with a shape get a second trial with the shape f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +19,11 @@ from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.score import Linearisation, score
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
-from disctrack.diagnosis.engine.system import Candidate, Quantity, System
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, hurried
 
 MAX_TRIALS = 24  # values of a shape at which the rest is refitted
+ALONG = 5.0  # times the time of a trial, for all that follows from the best start
+HOPELESS = 0.02  # of what is still too much: a step that gains less does not lead to noise
 ENOUGH = 0.01  # of chi-square: a tenth of a sigma, beyond which a shape is not pursued
 STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour says nothing of the valley's floor
 NARROW = 1e-6  # of a shape's size: as close as two values need to be
@@ -75,10 +78,12 @@ def _refined(system: System, diagnosis: Diagnosis, position: int) -> tuple[Diagn
     return replace(diagnosis, found=everything, after=fitted, held_out_after=held), notes
 
 
-def profiled(system: System, fitted: Fit, q: Quantity, step: float) -> Fit:
+def profiled(system: System, fitted: Fit, q: Quantity, step: float, goal: float = np.inf) -> Fit:
     """The fit with one more quantity free, found along its profile: the others are refitted at each value of it.
 
     An exponent and the amounts of two laws lie in a curved valley in which Gauss-Newton halves its steps for ever.
+
+    goal : cost down to which it has to lead; where no step leads there, the search for the best one ends
     """
     points: dict[float, Fit] = {}
 
@@ -103,7 +108,7 @@ def profiled(system: System, fitted: Fit, q: Quantity, step: float) -> Fit:
             if y[side] - y[1] > STEEP and (target - x[1]) * (x[side] - x[1]) <= 0:
                 # where another number comes to stand at its bound the profile has a kink: no parabola fits its sides
                 target, gain = 0.5 * float(x[1] + x[side]), np.inf
-            if gain < ENOUGH or x[2] - x[0] < NARROW * _size(q, float(x[1])):
+            if gain < max(ENOUGH, HOPELESS * (y[1] - goal)) or x[2] - x[0] < NARROW * _size(q, float(x[1])):
                 break
             at(target)
         else:
@@ -152,7 +157,10 @@ def _second_trial(system: System, diagnosis: Diagnosis) -> Diagnosis:
     """A single law with a free shape in place of all that was found, if it leaves noise and is the shorter answer."""
     best, chosen = diagnosis, _length(system, diagnosis) if diagnosis.found else np.inf
     for candidate in system.candidates:
-        answer = _with_free_shape(system, diagnosis, candidate) if candidate.shape else None
+        try:
+            answer = _with_free_shape(system, diagnosis, candidate) if candidate.shape else None
+        except TrialGivenUp:
+            continue
         if answer is not None and _length(system, answer) < chosen:
             best, chosen = answer, _length(system, answer)
     return best
@@ -182,7 +190,13 @@ def _started(system: System, base: Fit, candidate: Candidate, shape: dict[str, f
 def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate) -> Diagnosis | None:
     base, before = diagnosis.before, diagnosis.held_out_before
     starts = [dict(zip(_names(candidate.shape), s, strict=True)) for s in system.starts(candidate, base.values)]
-    fits = [_started(system, base, candidate, shape) for shape in starts or _grid(candidate)]
+    fits = []
+    for shape in starts or _grid(candidate):
+        with suppress(TrialGivenUp):
+            fits.append(_started(hurried(system), base, candidate, shape))
+    if not fits:
+        return None
+    system = hurried(system, ALONG)
     first = min(fits, key=lambda f: f.cost)
     excess = [f.chi_square / diagnosis.noise - f.degrees_of_freedom for f in (base, first)]
     if not excess[1] < WORTH_A_SHAPE * excess[0]:
@@ -190,9 +204,10 @@ def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate)
     expected = {q.name: _first_order(system, first, q) for q in candidate.shape}
     free = tuple(q for q in candidate.shape if np.isfinite(expected[q.name]))
     fitted = first
-    for q in free:
-        fitted = profiled(system, fitted, q, expected[q.name])
     noise, settings = diagnosis.noise, diagnosis.settings
+    goal = settings.at_noise * noise * first.degrees_of_freedom + first.penalty
+    for q in free:
+        fitted = profiled(system, fitted, q, expected[q.name], goal)
     at_noise = fitted.reduced_chi_square <= settings.at_noise * noise
     if not (fitted.converged and at_noise and all(_determined(fitted, q) for q in free)) or before is None:
         return None

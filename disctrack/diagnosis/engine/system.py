@@ -93,6 +93,19 @@ class GivenUp(Exception):
     """A hypothesis would take too long to follow: the one who put it forward goes on without it."""
 
 
+class TrialGivenUp(GivenUp):
+    """One of many hypotheses would take too long: the others are still to be tried."""
+
+
+def hurried(system: System, share: float = 1.0) -> System:
+    """The system as one trial among many sees it: raises TrialGivenUp where following it takes too long.
+
+    share : of the time that a whole fit may take
+    """
+    of = getattr(system, "hurried", None)
+    return system if of is None else of(share)
+
+
 class Wrapped:
     """A system as another sees it: all as it is, but for what a subclass changes."""
 
@@ -128,6 +141,10 @@ class Wrapped:
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
         """As the system's."""
         return self._system.starts(candidate, values)
+
+    def hurried(self, share: float) -> Wrapped:
+        """As the system's."""
+        return self.over(hurried(self._system, share))
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the system's."""
