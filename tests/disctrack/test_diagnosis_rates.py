@@ -51,6 +51,19 @@ def test_a_trial_tells_what_became_of_the_hidden_effect():
     assert verdict.at_noise
     assert verdict.extra == 0
     assert verdict.free_run_before > 1.2
+    assert verdict.can_be_told
+    # by itself it gains what it stands out by; scatter of a normal number
+    assert verdict.stands_out == pytest.approx(np.sqrt(verdict.gain), abs=4)
+
+
+def test_an_effect_below_its_sigma_is_not_asked_for():
+    """A hundredth of what is found leaves a bound; two that the recording cannot tell apart do so, however large."""
+    faint = trial([hidden_effect("time_offset")], [1e-7], seed=3)
+    assert not faint.named
+    assert not faint.can_be_told
+    alike = trial([hidden_effect("frame_rate"), hidden_effect("gravity")], [0.012, 0.05], seed=3)
+    assert alike.gain > 1e4
+    assert not alike.can_be_told
 
 
 def test_a_trial_without_an_effect_finds_nothing():
@@ -74,3 +87,14 @@ def test_an_effect_stands_out_by_what_its_refit_gains():
     assert predicted.probability(size) > 0.999
     assert predicted.probability(0.01 * size) < 0.01
     assert 0 < predicted.smallest(0.5) < predicted.smallest(0.9) < size
+
+
+@pytest.mark.slow
+def test_beside_an_effect_that_was_looked_for_another_of_the_catalogue_is_tried_before_a_law_outside_of_it():
+    """A shaken table and a dot 20 um off: the shaking alone left chi-square 1.006, but no noise."""
+    effects = [hidden_effect(name) for name in ("table_shaken", "misprint")]
+    verdict = trial(effects, [e.size for e in effects], 10, 500.0)
+    assert verdict.named
+    assert verdict.within
+    assert verdict.verdict == "found"
+    assert verdict.extra == 0

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from scipy import stats
 
 from disctrack.diagnosis import DiscDiagnosis, diagnose_trajectory
-from disctrack.diagnosis.engine.fit import Fit
+from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.system import Values
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted, hidden_effect
 from disctrack.diagnosis.trials.recordings import Unseen, measured
@@ -76,6 +77,16 @@ class Verdict:
     free_run_after: float
     gain: float  # of chi-square by all effects claimed
     seconds: float
+    stands_out: float  # of the hidden effects the least, in sigmas, with all others fitted beside it; NaN: not known
+    needed: float  # sigmas that a claim takes
+
+    @property
+    def can_be_told(self) -> bool:
+        """Does the recording determine every hidden effect beside the others, so that it may be asked for?
+
+        What stands out by less than a claim takes leaves a bound only, whoever looks.
+        """
+        return not self.stands_out < self.needed
 
     @property
     def at_noise(self) -> bool:
@@ -180,7 +191,38 @@ def trial(effects: Sequence[HiddenEffect], sizes: Sequence[float], seed: int, ra
         result.after.ratio_to_floor if result.after else nan,
         (d.before.cost - d.after.cost) / d.noise,
         seconds,
+        *_standing_out(result, parts),
     )
+
+
+def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> tuple[float, float]:
+    """By how many sigmas the least of the planted effects stands out of the joint model, and how many a claim takes.
+
+    Fisher's information at the truth: the gain is a' C^-1 a for amounts a with covariance C, all else fitted along, the
+    other planted effects, too. NaN where the joint model has no fit, or the catalogue no such numbers.
+    """
+    system, d = result.system, result.diagnosis
+    nan = float("nan")
+    own = [next((c for c in system.candidates if set(p.truth) <= set(c.names)), None) for p in parts]
+    if not parts or not d.before.converged or None in own:
+        return nan, nan
+    quantities = {q.name: q for q in system.base} | {q.name: q for c in own if c for q in c.quantities}
+    truth = {k: v for p in parts for k, v in (*p.effects.items(), *p.truth.items())}
+    joint = fit(system, tuple(quantities.values()), d.before.values | truth)
+    if not joint.converged:
+        return nan, nan
+    found = []
+    for part, candidate in zip(parts, own, strict=True):
+        assert candidate is not None
+        index = [joint.names.index(n) for n in candidate.names]
+        amount = np.array([part.truth.get(q.name, q.null) - q.null for q in candidate.quantities])
+        size = np.sqrt(np.diag(joint.covariance)[index])
+        seen = np.where(size > 0, size, np.inf)  # no variance where the data show nothing
+        inverse = np.linalg.pinv(joint.covariance[np.ix_(index, index)] / np.outer(seen, seen), hermitian=True)
+        sigmas = float(np.sqrt((amount / seen) @ inverse @ (amount / seen) / d.noise))
+        needed = stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index))
+        found.append((sigmas, float(np.sqrt(needed))))
+    return min(found, key=lambda one: one[0] / one[1])
 
 
 def _class_text(names: Sequence[str]) -> str:
@@ -212,7 +254,9 @@ class Rates:
     hidden: tuple[str, ...]
     size: tuple[float, ...]
     n: int
+    can_be_told: int  # trials in which the recording determines all that is hidden
     named: int
+    named_of_those: int
     within: int
     at_noise: int
     extra: int  # trials with a claim too many
@@ -229,7 +273,9 @@ def rates(
         tuple(e.name for e in effects),
         tuple(sizes),
         len(verdicts),
+        sum(v.can_be_told for v in verdicts),
         sum(v.named for v in verdicts),
+        sum(v.named and v.can_be_told for v in verdicts),
         sum(v.within for v in verdicts),
         sum(v.at_noise for v in verdicts),
         sum(v.extra > 0 for v in verdicts),
@@ -245,12 +291,14 @@ def line(r: Rates) -> str:
     share = lambda k: f"{k}/{r.n}"  # noqa: E731
     seconds = np.median([v.seconds for v in r.verdicts])
     return (
-        f"| {what} | {sizes} | {share(r.named)} | {share(r.within)} | {share(r.at_noise)} | {share(r.extra)} "
+        f"| {what} | {sizes} | {share(r.can_be_told)} | {share(r.named)} | {share(r.within)} | {share(r.at_noise)} "
+        f"| {share(r.extra)} "
         f"| {r.sigmas:.3g} | {seconds:.1f} s |"
     )
 
 
-HEADER = "| hidden | size | named | within 3 sigma | noise left | claim too many | sigmas | time |\n" + "|---" * 8 + "|"
+COLUMNS = ("hidden", "size", "can be told", "named", "within 3 sigma", "noise left", "claim too many", "sigmas", "time")
+HEADER = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|"
 
 
 def _arguments() -> argparse.Namespace:
@@ -316,9 +364,13 @@ def main() -> None:
                     f"    seed {v.recording.seed} ({v.recording.theta_deg:.1f} deg, {v.recording.n}): {v.verdict}; "
                     f"{'; '.join(v.found) or '-'}; pull {v.pull:.1f}, chi2 {v.chi_square_before:.3f} -> "
                     f"{v.chi_square_after:.3f}, free run {v.free_run_before:.2f} -> {v.free_run_after:.2f}, "
-                    f"{v.seconds:.1f} s",
+                    f"stands out by {v.stands_out:.1f} sigma of {v.needed:.1f}, {v.seconds:.1f} s",
                     flush=True,
                 )
+    told = [r for r in done if r.hidden]
+    if told:
+        counts = [sum(getattr(r, name) for r in told) for name in ("n", "can_be_told", "named", "named_of_those")]
+        print("named {2} of {0}; {3} of {1} that their recordings determine".format(*counts))
     if arguments.output:
         write_whole(arguments.output, json_file([asdict(r) for r in done]))
 
