@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from calibration.brief import Brief
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
 from disctrack.diagnosis.disc.form_misfit import with_form
-from disctrack.diagnosis.disc.learned_law import LearnedLaw, learn, with_law, without_idle_terms
+from disctrack.diagnosis.disc.learned_law import UNLIKELY, LearnedLaw, learn, with_law, without_idle_terms
 from disctrack.diagnosis.disc.left_over import LeftOver, left_over
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.disc.plan import open_questions, plan, separations
 from disctrack.diagnosis.disc.regimes import regimes
 from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit
+from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
 from disctrack.diagnosis.engine.memory import with_memory
-from disctrack.diagnosis.engine.search import Diagnosis, Settings
+from disctrack.diagnosis.engine.score import Linearisation, score_all
+from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
@@ -34,6 +37,7 @@ from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
 
+TRIED_BESIDE = 3  # effects of the catalogue beside what was found, where what is left is not noise
 DOUBTFUL = 0.05  # probability of what a single known effect leaves, below which laws outside the catalogue compete
 
 
@@ -68,7 +72,10 @@ def diagnose_trajectory(
     diagnosis, remarks = refine_shapes(system, diagnosis)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    learned, also = _beyond_the_catalogue(system, diagnosis, left)
+    if diagnosis.verdict == "found" and _doubtful(left):
+        diagnosis = _with_another_known(system, diagnosis)
+        left = left_over(system, diagnosis.after, diagnosis.noise)
+    learned, kept, also = _beyond_the_catalogue(system, diagnosis, left)
     parts = None
     if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
         parts = regimes(system, _judged(diagnosis, system), diagnosis.before, diagnosis.noise)
@@ -78,7 +85,8 @@ def diagnose_trajectory(
         reason = (
             f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
         )
-        diagnosis = replace(diagnosis, verdict="unexplained", found=(), reason=reason)
+        enlarged = learned.fit if kept else diagnosis.after
+        diagnosis = replace(diagnosis, verdict="unexplained", found=kept, after=enlarged, reason=reason)
     if answer.slip is not None:
         diagnosis = with_slip(diagnosis, answer.slip)
     held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
@@ -140,52 +148,168 @@ def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:
     return diagnosis.judged.over(system) if isinstance(diagnosis.judged, Wrapped) else system
 
 
+@dataclass(frozen=True)
+class _Beside:
+    """A law outside the catalogue with the known effects that stay beside it."""
+
+    law: LearnedLaw
+    system: DiscSystem  # knows the law
+    fit: Fit
+    kept: tuple[Found, ...]  # of the effects found
+    length: float  # chi-square with the price of its numbers, and of having been looked for
+
+
+def _doubtful(left: LeftOver | None) -> bool:
+    return left is not None and min(left.pose_p_value, left.other_p_value) < DOUBTFUL
+
+
+def _with_another_known(system: DiscSystem, diagnosis: Diagnosis) -> Diagnosis:
+    """With one more effect of the catalogue, where chi-square is that of noise and what is left is not.
+
+    A law whose frequency or place was looked for took the place of all others, and none was tried beside it.
+    """
+    settings, noise = diagnosis.settings, diagnosis.noise
+    if len(diagnosis.found) >= settings.max_effects or diagnosis.held_out_after is None:
+        return diagnosis
+    judged, fitted = _judged(diagnosis, system), diagnosis.after
+    taken = {q.name for f in diagnosis.found for q in f.candidate.quantities}
+    others = [c for c in system.candidates if not (c.sought or c.threshold or taken & set(c.names))]
+    rows = training_rows(system, settings.train_fraction)
+    best = diagnosis
+    for s in score_all(Linearisation(judged, fitted, others), others)[:TRIED_BESIDE]:
+        candidate = s.candidate
+        enough = float(stats.chi2.isf(settings.false_alarm / len(system.candidates), len(candidate.names)))
+        if s.gain / noise < enough:
+            break
+        quantities = {q.name: q for q in (*fitted.quantities, *candidate.quantities)}
+        enlarged = fit(judged, tuple(quantities.values()), fitted.values)
+        gain = (fitted.cost - enlarged.cost) / noise
+        if not (enlarged.converged and gain > enough):
+            continue
+        held = held_out(judged, enlarged.quantities, enlarged.values, rows)
+        held_gain = 2 * (held.log_density - diagnosis.held_out_after.log_density) / noise
+        found = (*diagnosis.found, Found(candidate, float(gain), float(held_gain), enough, ()))
+        answer = replace(diagnosis, found=found, after=enlarged, held_out_after=held)
+        shorter = _length(system, answer, enlarged, found) < _length(system, best, best.after, best.found)
+        best = answer if held_gain > 0 and shorter else best
+    return best
+
+
 def _beyond_the_catalogue(
     system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
-) -> tuple[Learned | None, tuple[str, ...]]:
+) -> tuple[Learned | None, tuple[Found, ...], tuple[str, ...]]:
     """A law outside the catalogue if that describes the data better, for its length, than the catalogue does.
 
-    Beside it remarks on what describes them as well. A single known effect has to compete where what it leaves is
-    less like noise than that of one recording in twenty: it may stand in for a law that is not known.
+    Beside it the known effects that stay, and remarks on what describes the data as well. A single known effect has to
+    compete where what it leaves is less like noise than that of one recording in twenty: it may stand in for a law that
+    is not known. So may each of several, or all: the law is looked for in the place of all of them, and beside each.
+    Faults of the measurement stay beside it, unless the law makes them idle: no force displaces a dot on the face.
     """
-    doubtful = left is not None and min(left.pose_p_value, left.other_p_value) < DOUBTFUL
-    if diagnosis.verdict == "nothing missing" or (
-        diagnosis.verdict == "found" and len(diagnosis.found) < 2 and not doubtful
-    ):
-        return None, ()
+    doubtful = _doubtful(left)
+    explained = diagnosis.verdict == "found"
+    of_motion, faults = (
+        tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
+    )
+    sets: list[tuple[Found, ...]] = [faults]
+    if diagnosis.verdict == "nothing missing" or (explained and len(of_motion) < 2 and not doubtful):
+        return None, (), ()
+    if diagnosis.held_out_before is None:
+        return None, (), ()
     base = diagnosis.before
-    law = learn(system, base, diagnosis.noise, diagnosis.after if diagnosis.verdict == "found" else None)
-    if law is None or diagnosis.held_out_before is None:
-        return None, ()
-    system = system.knowing(law.effect)
+    known = _length(system, diagnosis, diagnosis.after, diagnosis.found)
+    if explained:
+        sets += [(*faults, f) for f in of_motion]
+    answers = [_law_beside(system, diagnosis, kept) for kept in sets]
+    best = min((a for a in answers if a is not None), key=lambda a: (not a.fit.converged, a.length), default=None)
+    if best is None:
+        return None, (), ()
+    law, system, fitted = best.law, best.system, best.fit
+    law = replace(law, rivals=_rivals(best, [a for a in answers if a is not best], diagnosis, explained))
     judged = _judged(diagnosis, system)
-    fitted = with_law(judged, base, law)
-    shorter = without_idle_terms(law, fitted)
-    if fitted.converged and shorter is not law:
-        law, system = shorter, system.knowing(shorter.effect)
-        judged = _judged(diagnosis, system)
-        fitted = with_law(judged, base, law)
-    price = float(np.log(np.sum(system.weights)))
-    lengths = [sum(not np.isfinite(q.prior_sigma) for q in f.quantities) for f in (fitted, diagnosis.after)]
-    saved = (diagnosis.after.cost - fitted.cost) / diagnosis.noise - price * (lengths[0] - lengths[1])
-    if diagnosis.verdict == "found":  # both were looked for, among so many laws, and among so many effects
-        saved += 2.0 * float(np.log(len(diagnosis.tried))) * len(diagnosis.found) - law.looked * len(law.families)
+    saved = known - best.length
+    if not (fitted.converged and saved > 0):
+        return None, (), _also(diagnosis, law, fitted)
     rows = training_rows(system, diagnosis.settings.train_fraction)
     held = held_out(judged, fitted.quantities, fitted.values, rows)
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise
-    if not (fitted.converged and saved > 0):
-        return None, _also(diagnosis, law, fitted)
     gain = (base.cost - fitted.cost) / diagnosis.noise
     work = energy_balance(system, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(system.time[-1] - system.time[0])
     notes = [f"{other} describes what is missing as well" for other in law.alike]
     if diagnosis.found and diagnosis.after.reduced_chi_square <= diagnosis.settings.at_noise * diagnosis.noise:
-        known = ", ".join(f.candidate.name for f in diagnosis.found)
+        known_ones = ", ".join(f.candidate.name for f in diagnosis.found)
         notes.append(
-            f"known effects together ({known}) leave {diagnosis.after.reduced_chi_square:.4g} of the expected variance "
-            f"where the law leaves {fitted.reduced_chi_square:.4g}: with their prices the law is ahead by {saved:.4g}"
+            f"known effects together ({known_ones}) leave {diagnosis.after.reduced_chi_square:.4g} of the expected "
+            f"variance where the law leaves {fitted.reduced_chi_square:.4g}: with their prices the law is ahead by "
+            f"{saved:.4g}"
         )
-    return Learned(law, fitted, held, gain, float(held_gain), power), tuple(notes)
+    return Learned(law, fitted, held, gain, float(held_gain), power), best.kept, tuple(notes)
+
+
+def _length(system: DiscSystem, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
+    """Chi-square with the price of the fitted numbers and, where one explains all, of having picked known effects."""
+    numbers = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
+    length = fitted.cost / diagnosis.noise + numbers * float(np.log(np.sum(system.weights)))
+    if diagnosis.verdict == "found":  # both were looked for, among so many laws, and among so many effects
+        length += 2.0 * float(np.log(len(diagnosis.tried))) * len(found)
+    return length
+
+
+def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> _Beside | None:
+    """The law that takes the place of what was found but for `kept`; None if there is none."""
+    explained = diagnosis.verdict == "found"
+    base = _beside_them(diagnosis.before, kept)
+    along = diagnosis.after if explained else diagnosis.nearest
+    law = learn(system, base, diagnosis.noise, along, along.cost / diagnosis.noise if explained and along else np.inf)
+    if law is None:
+        return None
+    known = system.knowing(law.effect)
+    judged = _judged(diagnosis, known)
+    fitted = with_law(judged, base, law)
+    shorter = without_idle_terms(law, fitted)
+    if fitted.converged and shorter is not law:
+        law, known = shorter, system.knowing(shorter.effect)
+        judged = _judged(diagnosis, known)
+        fitted = with_law(judged, base, law)
+    again = list(kept)
+    for found in kept:  # in what the law leaves, is it still an effect?
+        rest = [f for f in again if f is not found]
+        held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
+        without = with_law(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
+        gain = (without.cost - fitted.cost) / diagnosis.noise
+        if without.converged and gain < found.threshold:
+            again, fitted = rest, without
+        else:
+            again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
+    length = _length(system, diagnosis, fitted, again)
+    if explained:
+        length += law.looked * len(law.families)
+    return _Beside(law, known, fitted, tuple(again), length)
+
+
+def _rivals(
+    best: _Beside, others: Sequence[_Beside | None], diagnosis: Diagnosis, explained: bool
+) -> tuple[tuple[LearnedLaw, float], ...]:
+    """Whatever describes the data as well, with its odds: other laws, beside other effects, and known effects alone."""
+
+    def odds(fitted: Fit) -> float:
+        return float(np.exp(-0.5 * max(fitted.cost - best.fit.cost, 0.0) / diagnosis.noise))
+
+    rivals = list(best.law.rivals)
+    for other in others:
+        if other is not None and other.fit.converged:
+            share = odds(other.fit)
+            rivals.append((replace(other.law, values=other.fit.values), share))
+            rivals += [(law, share * its) for law, its in other.law.rivals]
+    if explained:
+        rivals.append((replace(best.law, values=diagnosis.after.values), odds(diagnosis.after)))
+    return tuple((law, share) for law, share in rivals if share > UNLIKELY)
+
+
+def _beside_them(base: Fit, kept: Sequence[Found]) -> Fit:
+    """The base fit, with the quantities of these effects to be fitted along."""
+    quantities = {q.name: q for q in base.quantities} | {q.name: q for f in kept for q in f.candidate.quantities}
+    return replace(base, quantities=tuple(quantities.values()))
 
 
 def _also(diagnosis: Diagnosis, law: LearnedLaw, fitted: Fit) -> tuple[str, ...]:

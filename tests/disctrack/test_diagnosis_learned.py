@@ -6,13 +6,25 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
-from disctrack.diagnosis.disc.law_library import Family
-from disctrack.diagnosis.disc.learned_law import _law, learn, learned_moment, missing_moment, probe, without_idle_terms
+from disctrack.diagnosis.disc.law_library import Family, families
+from disctrack.diagnosis.disc.learned_law import (
+    _busy,
+    _law,
+    _Scan,
+    learn,
+    learned_moment,
+    missing_moment,
+    probe,
+    with_law,
+    without_idle_terms,
+)
 from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import measured
+from tests.oracles.unknown_laws import recording
 
 
 def hiding(name: str, component: str, formula: str, size: float, **options):
@@ -86,5 +98,53 @@ def test_a_term_that_the_refit_finds_to_be_zero_is_dropped():
     assert shorter.formulas == {"M_z": "c_0 * (sin(2.0 * phi))"}
     assert shorter.candidate.start == (-3.9e-4,)
     assert shorter.candidate.name == "test_idle"
+    assert shorter.title == "twice"
+    other = without_idle_terms(law, replace(fitted, values={first.name: 1e-6, second.name: 4e-4}))
+    assert other.title == "twice, without its first term"
     busy = replace(fitted, values={first.name: -3.9e-4, second.name: 4e-5})
     assert without_idle_terms(law, busy) is law
+
+
+def test_of_terms_that_move_together_those_stay_that_do_for_all(rng):
+    """Two columns nearly alike: each amount alone is open, together they are not. One is enough: as least squares."""
+    t = np.linspace(0, 1, 300)
+    A = np.stack([np.ones_like(t), 1.0 + 1e-3 * t, np.cos(9 * t)], axis=1)
+    y = 0.5 * A[:, 0] + rng.standard_normal(300)
+    values, covariance = np.linalg.lstsq(A, y)[0], np.linalg.inv(A.T @ A)
+    names = ("one", "nearly", "wave")
+    quantities = tuple(Quantity(name, "1", 1.0) for name in names)
+    fitted = Fit(quantities, dict(zip(names, values, strict=True)), covariance, 1.0, 0.0, 300, True, 3)
+    assert (np.abs(values / np.sqrt(np.diag(covariance))) < 3).all()
+    ((which, amount),) = _busy(fitted, names).items()
+    assert which in (0, 1)
+    assert amount == pytest.approx(A[:, which] @ y / (A[:, which] @ A[:, which]), rel=1e-6)
+    silent = replace(fitted, values=dict(zip(names, 0.1 * values, strict=True)))
+    assert _busy(silent, names) == {}
+
+
+def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
+    """A spring that grows as the distance: from no spring at all nothing is near, beside a linear one its law is read.
+
+    The motion is the oracle's, with 40 N/m^2.
+    """
+    trajectory = recording("quadratic_spring").trajectory
+    system = DiscSystem(trajectory, declared_model(trajectory).model)
+    base = fit(system, system.base, system.start())
+    spring = next(c for c in system.candidates if c.name == "spring")
+    along = fit(system, (*base.quantities, *spring.quantities), base.values)
+    assert along.reduced_chi_square < 0.01 * base.reduced_chi_square
+    scan, far = _Scan(system, along, base.quantities), _Scan(system, base)
+    library = families(scan.motion.q, scan.motion.time, 500.0, system.disc)
+    square = [f for f in library if f.title.endswith("distance squared")]
+    (near,), (wrong,) = scan.proposals(square), far.proposals(square)
+    n = np.sum(system.weights)
+    assert scan.chi_square - near.gain < 1.1 * n < 1.5 * n < far.chi_square - wrong.gain
+    assert near.values[0] == pytest.approx(40.0, abs=1.0)
+    assert wrong.values[0] > 60.0  # linear in the law, but along a motion that is no longer its own
+    law = learn(system, base, 1.0, along, rival=along.cost)
+    assert law is not None
+    assert [f.title for f in law.families] == [f.title for f in square]
+    fitted = with_law(system.knowing(law.effect), base, law)
+    assert fitted.reduced_chi_square < 1.1
+    strength = law.candidate.names[0]
+    assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength)

@@ -6,9 +6,11 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.diagnosis import diagnose_trajectory
+from disctrack.rolling.effects import effect_from_formulas
 from disctrack.scene.description import Scene
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
+from tests.oracles.unknown_laws import recording as unknown
 
 pytestmark = pytest.mark.slow
 
@@ -123,3 +125,26 @@ def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction()
     for i, true in enumerate(half * growing[:2]):  # the middle's force has the numbers c_0_0 and c_0_1
         name = f"learned.c_0_{2 + i}"
         assert abs(fit.values[name] - true) < 3 * fit.sigma(name)
+
+
+def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
+    """A spring that grows with the distance, 40 N/m^2: as a linear one with an inertia and a yielding table, at noise.
+
+    Pivoting friction beside it is truly there, and stays.
+    """
+    alone = diagnose_trajectory(unknown("quadratic_spring").trajectory, separate=False)
+    assert alone.diagnosis.found == ()
+    x, y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"
+    forces = {"X_n": f"-k * {x} * sqrt(x * x + y * y)", "X_m": f"-k * {y} * sqrt(x * x + y * y)"}
+    hidden, planted = effect_from_formulas("hidden_square", forces), {"hidden_square.k": 40.0, "kz.k_z": 6e-5}
+    made = measured(planted, laws=[hidden], seed=5, n=250, declared_rate=500.0, theta_deg=11.0)
+    beside = diagnose_trajectory(made, separate=False)
+    assert [found.candidate.name for found in beside.diagnosis.found] == ["kz"]
+    for result in (alone, beside):
+        assert result.learned is not None
+        assert result.learned.law.title == "a force towards a point that grows as the distance squared"
+        fitted = result.learned.fit
+        (strength,) = result.learned.law.candidate.names
+        assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength) < 0.2
+    assert abs(fitted.values["kz.k_z"] - 6e-5) < 3 * fitted.sigma("kz.k_z") < 2e-6
+    assert "Missing in the model: pivoting friction" in beside.sentence

@@ -153,7 +153,10 @@ def _by_velocity() -> Iterator[Parts]:
 
 
 def _drifts(time: Array) -> Iterator[Family]:
-    """Forces of the room that change slowly: a draught, a table that settles, a magnet that is moved away."""
+    """What changes slowly: a draught, a table that settles, a magnet that is moved away; friction, as surfaces do.
+
+    Friction that lags behind the motion follows no rate of the instant, and changes with time as its mean does.
+    """
     middle, half = 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
     u = f"((time - {middle!r}) / {half!r})"
     powers = [" * ".join([u] * n) or "1.0" for n in range(DRIFT_DEGREE + 1)]
@@ -162,6 +165,9 @@ def _drifts(time: Array) -> Iterator[Family]:
         yield Family(f"a level force that changes with time, degree {n}", level, kind="drift")
         upright = tuple({"X_z": f} for f in powers[: n + 1])
         yield Family(f"a vertical force that changes with time, degree {n}", upright, kind="drift Z")
+        for axis in ("m", "z"):
+            friction = tuple({f"load_{axis}": f} for f in powers[: n + 1])
+            yield Family(f"a moment M_{axis} by the load that changes with time, degree {n}", friction, kind="drift M")
 
 
 def _magnets() -> Iterator[Family]:
@@ -253,7 +259,7 @@ def _uneven(q: Array, path: Array) -> Iterator[Family]:
     drag = {c: f"-v_{c[-1]} * {beyond}" for c in ("X_n", "X_m")}
     for direction in np.arange(0, 2 * np.pi, np.pi / 6):
         across = q[:, :2] @ np.array([np.cos(direction), np.sin(direction)])
-        for share in (0.2, 0.4, 0.6, 0.8):
+        for share in np.linspace(0.1, 0.9, 9):
             shape = {"direction": float(direction), "edge": float(np.quantile(across, share))}
             yield Family("a drag on a part of the table", (drag,), shape, "drag on a part")
 

@@ -39,12 +39,16 @@ RESAMPLES = 40
 MAX_TERMS = 3
 REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
+LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
 MAX_ITERATIONS = 15  # of a law that describes the data; others wander
 WIDTHS = ("width", "softness", "length")  # shapes of a law that go with its amount
+IDLE = 1e-12  # share of an amount's variance that is none
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the residual is large
 UNLIKELY = 1e-3  # odds below which a law does not count
 ALIKE = 10.0  # chi-square with its price, by which two laws differ that both describe the residual
+NEARLY = 20.0  # chi-square by which a refit may be better than the first order ...
+COARSE = 0.1  # ... and share of what is missing, by which one may be that moves a shape off the library's grid
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
 CHUNK = 240  # columns of the library that are held at a time
@@ -196,16 +200,24 @@ class _Scan:
 
     A column of the least-squares problem is D g: D (n, w, 8) by the initial state, g (n, 8) the response. Inner
     products of columns, cleared of what the fitted quantities W absorb, are sums over g' (D' D) g less those of W' D g.
+
+    beside : quantities to be fitted beside a law, if not those of the fit. What the others do is given back to the
+    residual to first order: so a law is looked for in their place, along a motion that follows the data.
     """
 
-    def __init__(self, system: DiscSystem, fit_: Fit) -> None:
+    def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None = None) -> None:
         along = responding(system, fit_)
         assert along is not None
         self.motion, self._frames = along
-        moved = [q for q in fit_.quantities if not is_linear(q)]
-        common = projection(system, fit_.quantities, fit_.values)
+        fitted = fit_.quantities if beside is None else tuple(beside)
+        moved = [q for q in fitted if not is_linear(q)]
+        common = projection(system, fitted, fit_.values)
         values = fit_.values | dict(zip(common.names, common.null.tolist(), strict=True))
-        residual, derivative = system.linearise(values, [q.name for q in moved])
+        names = {q.name for q in fitted}
+        replaced = [q for q in fit_.quantities if q.name not in names]
+        residual, derivative = system.linearise(values, [q.name for q in (*moved, *replaced)])
+        residual = residual + derivative[..., len(moved) :] @ np.array([values[q.name] - q.null for q in replaced])
+        derivative = derivative[..., : len(moved)]
         right, matrix = prior_rows(moved, fit_.values)
         stacked = common.cleared(np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)]))
         stacked = np.vstack([stacked, np.column_stack([matrix, right])])
@@ -283,36 +295,51 @@ def _proposal(family: Family, gram: Array, before: Array, right: Array) -> GainO
     return GainOfFamily(family, float(np.sum(along**2 / eigenvalues[seen])), values)
 
 
-def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None) -> LearnedLaw | None:
+def learn(
+    system: DiscSystem, base: Fit, noise: float, along: Fit | None = None, rival: float = np.inf
+) -> LearnedLaw | None:
     """The law of few terms that describes what is missing; None if none survives, or where the disc slips.
 
     The law is called "learned", or "learned_2" and so on where the model has learned laws already.
     noise : variance of the residual's noise over that stated
-    rival : known effects that describe the data; then only a law of a single term is sought, and only one that may,
-    by its first-order gain, come as near to the data
+    along : fit of other effects that follows the data more closely than the base does: the law is looked for along its
+    motion, in the place of what it has beyond the base
+    rival : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
+    only one that may, to first order, come as near to the data
     """
     name = _free_name(system.model)
     price = float(np.log(np.sum(system.weights)))
     rate = float(1.0 / np.median(np.diff(system.time)))
     law: LearnedLaw | None = None
     current, length, alike = base, base.cost / noise, tuple[str, ...]()
+    if along is not None and responding(system, along) is None:
+        along = None
     rivals = tuple[tuple[LearnedLaw, float], ...]()
     at_noise = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
     looked = 0.0
-    most_terms = MAX_TERMS if rival is None else 1
+    most_terms = 1 if np.isfinite(rival) else MAX_TERMS
     while law is None or (len(law.families) < most_terms and current.reduced_chi_square > at_noise):
         known = system if law is None else system.knowing(law.effect)
         if responding(known, current) is None:
             break
-        scan = _Scan(known, current)
+        scan = _Scan(known, current) if law is not None or along is None else _Scan(known, along, base.quantities)
         library = list(families(scan.motion.q, scan.motion.time, rate, system.disc))
         looked = 2.0 * float(np.log(len(library)))
         worth = [p for p in scan.proposals(library) if p.gain / noise > price * p.family.n_numbers + looked]
-        if rival is not None:
-            worth = [p for p in worth if scan.chi_square - p.gain < rival.chi_square + EXACT * scan.chi_square]
-        trials = [
-            _refitted(system, base, law, current, p, name) for p in _various(worth, scan.chi_square, noise, price)
-        ]
+        if np.isfinite(rival):
+            beyond = COARSE * max(scan.chi_square / noise - rival, 0.0)
+            to_beat = {True: rival + NEARLY + beyond, False: rival + NEARLY}  # with a shape that a refit moves
+            left = [(scan.chi_square - p.gain) / noise for p in worth]
+            worth = [p for p, it in zip(worth, left, strict=True) if it < to_beat[bool(p.family.shape)]]
+        begin = current if law is not None or along is None else _with_base_only(base, along)
+        chosen = _various(worth, scan.chi_square, noise, price)
+        if np.isfinite(
+            rival
+        ):  # what fits as well in more numbers is not named, but counts in what is known of the force
+            kinds = {p.family.kind for p in chosen}
+            longer = sorted((p for p in worth if p.family.kind not in kinds), key=lambda p: -p.gain)
+            chosen += longer[:LONGER]
+        trials = [_refitted(system, base, law, begin, p, name) for p in chosen]
         lengths = [t.cost / noise + price * _numbers(one) + looked * len(one.families) for one, t in trials]
         if not trials or min(lengths) >= length:
             break
@@ -329,6 +356,12 @@ def learn(system: DiscSystem, base: Fit, noise: float, rival: Fit | None = None)
         return None
     law = replace(law, alike=alike, rivals=rivals, looked=looked, share=_stability(system, law, current, noise))
     return without_idle_terms(law, current)
+
+
+def _with_base_only(base: Fit, along: Fit) -> Fit:
+    """The base fit, to start where the other one ended, without the effects that it has beyond the base."""
+    beyond = {q.name: q.null for q in along.quantities if q.name not in base.names}
+    return replace(base, values=base.values | along.values | beyond)
 
 
 def _numbers(law: LearnedLaw) -> int:
@@ -363,18 +396,21 @@ def _refitted(
     start = replace(enlarged, values=current.values)
     known = system.knowing(enlarged.effect)
     fitted = with_law(known, base, start)
-    if not fitted.converged:
-        fitted = min(fitted, _one_by_one(known, base, start), key=lambda f: (not f.converged, f.cost))
+    if not fitted.converged and (widths := _widths(enlarged)):
+        fitted = min(fitted, _one_by_one(known, base, start, widths), key=lambda f: (not f.converged, f.cost))
     reached = replace(enlarged.candidate, start=tuple(fitted.values[n] for n in enlarged.candidate.names))
     return replace(enlarged, candidate=reached, values=fitted.values), fitted
 
 
-def _one_by_one(system: System, base: Fit, law: LearnedLaw) -> Fit:
+def _widths(law: LearnedLaw) -> list[Quantity]:
+    return [q for q in law.candidate.quantities if q.name.partition(".")[2].partition("_")[0] in WIDTHS]
+
+
+def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
     """The law's fit with its widths found along their profiles: in a short time a blow's width hardly shows."""
     values = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    widths = [q for q in law.candidate.quantities if q.name.partition(".")[2].partition("_")[0] in WIDTHS]
     others = [q for q in law.candidate.quantities if q not in widths]
-    fitted = fit(system, (*base.quantities, *others), values, MAX_ITERATIONS)
+    fitted = fit(system, (*base.quantities, *others), values, MAX_ITERATIONS, may_crawl=False)
     for q in widths:
         fitted = profiled(system, fitted, q, 0.3 * fitted.values[q.name])
     return fitted
@@ -383,7 +419,7 @@ def _one_by_one(system: System, base: Fit, law: LearnedLaw) -> Fit:
 def with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
     """The base model's fit with the law's numbers fitted along."""
     start = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    return fit(system, (*base.quantities, *law.candidate.quantities), start, MAX_ITERATIONS)
+    return fit(system, (*base.quantities, *law.candidate.quantities), start, MAX_ITERATIONS, may_crawl=False)
 
 
 def _free_name(model: Model) -> str:
@@ -491,15 +527,13 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     for number, family in enumerate(law.families):
         own = [next(names) for _ in range(family.n_numbers)]
         amounts = own[: len(family.terms)]
-        busy = [
-            i for i, q in enumerate(amounts) if abs(fitted.values[q.name]) > MIN_SIGMAS * max(fitted.sigma(q.name), 0.0)
-        ]
-        if not busy and not _acts(fitted, [q.name for q in amounts]):
+        busy = _busy(fitted, [q.name for q in amounts])
+        if not busy:
             continue
-        busy = busy or list(range(len(amounts)))
         share += law.share[number : number + 1]
-        kept.append(replace(family, terms=tuple(family.terms[i] for i in busy)))
-        values += [fitted.values[amounts[i].name] for i in busy]
+        title = family.title if 0 in busy else f"{family.title}, without its first term"  # which it has its name from
+        kept.append(replace(family, title=title, terms=tuple(family.terms[i] for i in busy)))
+        values += busy.values()
         values += [fitted.values[q.name] for q in own[len(family.terms) :]]
     if not kept or len(values) == len(law.candidate.quantities):
         return law
@@ -509,16 +543,31 @@ def without_idle_terms(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     )
 
 
-def _acts(fitted: Fit, names: Sequence[str]) -> bool:
-    """Are these amounts together more than noise makes them, as surely as a single one of MIN_SIGMAS?"""
+def _busy(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
+    """Those of the amounts that the data need, with their values while the others are zero; none if all are idle.
+
+    One after the other goes, each judged with those before it out: of two that move together one may do for both.
+    """
     index = [fitted.names.index(n) for n in names]
     amounts = np.array([fitted.values[n] for n in names])
     size = np.sqrt(np.diag(fitted.covariance)[index])
     if not (size > 0).all():
-        return False
+        return {i: float(v) for i, v in enumerate(amounts) if abs(v) > MIN_SIGMAS * size[i]}
     correlation = fitted.covariance[np.ix_(index, index)] / np.outer(size, size)
-    gain = float((amounts / size) @ np.linalg.pinv(correlation, hermitian=True) @ (amounts / size))
-    return as_sigmas(gain, len(names)) > MIN_SIGMAS
+    left = amounts / size
+    if as_sigmas(float(left @ np.linalg.pinv(correlation, hermitian=True) @ left), len(names)) <= MIN_SIGMAS:
+        return {}
+    there = list(range(len(names)))
+    while len(there) > 1:
+        sigmas = np.abs(left[there]) / np.sqrt(np.maximum(np.diag(correlation)[there], IDLE))
+        least = there[int(np.argmin(sigmas))]
+        if sigmas.min() > MIN_SIGMAS:
+            break
+        along = correlation[:, least] / max(correlation[least, least], IDLE)
+        left = left - along * left[least]
+        correlation = correlation - np.outer(along, correlation[least])
+        there.remove(least)
+    return {i: float(left[i] * size[i]) for i in there}
 
 
 def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:
