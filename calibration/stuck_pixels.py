@@ -18,6 +18,8 @@ OFF = 0.12  # of the images' range, by which a pixel differs from the median of 
 STEADY = 0.04  # of the range: it changes by no more than that, whatever passes
 MIN_IMAGES = 4
 MOST = 0.01  # of all pixels: more are a pattern of the scene
+PASSED = 0.3  # of the range, by which the light around a pixel changed: squares, or a board and what is behind it
+OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
 
 
 def stuck_pixels(images: Sequence[Image] | NDArray) -> Mask | None:
@@ -36,6 +38,31 @@ def stuck_pixels(images: Sequence[Image] | NDArray) -> Mask | None:
         np.maximum(high, image, out=high)
     off &= high.astype(np.int32) - low <= STEADY * scale
     return off if 0 < off.sum() <= MOST * off.size else None
+
+
+def blind_pixels(views: Sequence[Image] | NDArray) -> Mask | None:
+    """(height, width) True where a pixel keeps its value while the light around it does not; None where none does.
+
+    Of views of a board (n, height, width), grey: its squares are as dark as a dead pixel and as light as a hot one, so
+    that none differs from its neighbours in every view. It does OFTEN; a pixel of what rests behind the board may be
+    left as it is by an edge that comes near.
+    """
+    if len(views) < MIN_IMAGES:
+        return None
+    low, high = np.array(views[0]), np.array(views[0])
+    around = [cv2.medianBlur(low, 3) for _ in range(2)]
+    scale = float(max(int(view.max()) for view in views) - min(int(view.min()) for view in views))
+    differs = np.zeros(low.shape, np.int32)
+    for view in views:
+        np.minimum(low, view, out=low)
+        np.maximum(high, view, out=high)
+        level = cv2.medianBlur(np.ascontiguousarray(view), 3)
+        np.minimum(around[0], level, out=around[0])
+        np.maximum(around[1], level, out=around[1])
+        differs += np.abs(view.astype(np.int32) - level) > OFF * scale
+    blind = (high.astype(np.int32) - low <= STEADY * scale) & (around[1].astype(np.int32) - around[0] > PASSED * scale)
+    blind &= differs > OFTEN * len(views)
+    return blind if 0 < blind.sum() <= MOST * blind.size else None
 
 
 def repair(images: NDArray, stuck: Mask) -> None:

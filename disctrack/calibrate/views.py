@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
 from calibration.board import Target
 from calibration.stereo import Progress, check_sizes
+from calibration.stuck_pixels import blind_pixels, repair
 from disctrack.calibrate.targets import find_target, other_board
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.frames import CAMERAS
@@ -174,6 +176,7 @@ def calibrate_views(
     names = [(str(views.left[i]), str(views.right[i])) for i in used]
     position = None if table_view is None else used.index(table_view)
     check_sizes(*images, names)
+    blind = [_repaired(side, name) for side, name in zip(images, CAMERAS, strict=True)]
     settings = settings or CalibrationSettings()
     target, seen_left, seen_right = find_target(*images, target, settings.threads, progress)
     try:
@@ -184,7 +187,20 @@ def calibrate_views(
         if other := other_board([*images[0], *images[1]], [*seen_left, *seen_right], target):
             raise CalibrationError(f"{str(error).rstrip('.')}. {other}") from error
         raise
-    return found, tuple(problems)
+    return replace(found, warnings=(*(note for note in blind if note), *found.warnings)), tuple(problems)
+
+
+def _repaired(views: list[NDArray], camera: str) -> str:
+    """Replace pixels that do not see by their neighbours, in copies that take the views' places; what is to be said."""
+    if any(view.ndim != 2 or view.dtype not in (np.uint8, np.uint16) for view in views):
+        return ""  # of a colour image, whose pixels are mixed from several
+    mask = blind_pixels(views)
+    if mask is None:
+        return ""
+    for i, view in enumerate(views):
+        views[i] = np.array(view)
+        repair(views[i], mask)
+    return f"{camera} camera: {int(mask.sum())} pixels show one value in all views; their neighbours stand in for them"
 
 
 def _pixels(view: View, where: str, flat: FlatField | None) -> NDArray:

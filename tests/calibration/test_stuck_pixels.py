@@ -1,9 +1,12 @@
-"""Pixels that do not see are found in a moving scene and replaced; a sharp scene has none."""
+"""Pixels that do not see are found in a moving scene, and in views of a board, and replaced; a sharp scene has none."""
 
+import cv2
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from calibration.stuck_pixels import repair, stuck_pixels
+from calibration import Board, CornerView, find_corners
+from calibration.stuck_pixels import blind_pixels, repair, stuck_pixels
+from disctrack.calibrate.views import calibrate_views, find_views
 
 
 def scene(rng, frames=6, size=120):
@@ -51,3 +54,33 @@ def test_neighbouring_stuck_pixels_do_not_stand_in_for_each_other(rng):
     images[:, mask] = 255
     repair(images[0], mask)
     assert np.all(images[0][mask] < 120)
+
+
+def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_clip, tmp_path, rng):
+    folder, where = sample_clip / "calibration", {}
+    views = {}
+    for side in ("left", "right"):
+        views[side] = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted((folder / side).glob("*.png"))]
+        assert blind_pixels(views[side]) is None
+        where[side] = rng.permutation(views[side][0].size)[:50]
+        (tmp_path / side).mkdir()
+        for i, view in enumerate(views[side]):
+            seen = view.copy()
+            seen.flat[where[side][::2]], seen.flat[where[side][1::2]] = 255, 0
+            cv2.imwrite(str(tmp_path / side / f"{i:03d}.png"), seen)
+    patterns = find_views("left/*.png", "right/*.png", tmp_path)
+    found, _ = calibrate_views(patterns, Board((9, 6), 6e-3))
+    for name, side, corners in zip(("left", "right"), views, found.corner_views, strict=True):
+        told = [text for text in found.warnings if text.startswith(f"{name} camera: ") and "one value" in text]
+        # of those over which the board or its shadow never went nothing is known, and they lie under no corner
+        assert len(told) == 1
+        assert 20 <= int(told[0].split()[2]) <= 50
+        off = []
+        for view, seen in zip(views[side], corners, strict=True):
+            clean = find_corners(view, (9, 6))
+            assert isinstance(clean, CornerView)
+            assert isinstance(seen, CornerView)
+            assert seen.accepted.sum() >= clean.accepted.sum()
+            both = seen.accepted & clean.accepted
+            off.append((seen.points - clean.points)[both])
+        assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1e-3
