@@ -64,8 +64,10 @@ def consistency_factor(refinement: Refinement) -> float:
     return refinement.normal.disagreement(problem.stereo_basis.shape[1])
 
 
-def stereo_covariance(refinement: Refinement) -> Array:
+def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Array:
     """Covariance (s1, s1) of the free stereo parameters, from the corners' noise and from how the views disagree.
+
+    common : (n_views, s, s) covariance of what else the views' gradients contain, see `motion_size`
 
     Errors that are common to a view weigh more in some directions than in others: a board that moves between the two
     exposures spoils the pair's pose, not the focal lengths. The views' shifts, whitened by what noise would make of
@@ -75,7 +77,7 @@ def stereo_covariance(refinement: Refinement) -> Array:
     """
     problem = refinement.problem
     s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
-    shift, spread, inverse = refinement.normal.shifts_by_views(s1)
+    shift, spread, inverse, by_common = refinement.normal.shifts_by_views(s1, common)
     expected = inverse.T @ spread @ inverse
     values, vectors = np.linalg.eigh(expected)
     root = vectors * np.sqrt(np.maximum(values, 1e-12 * values.max()))  # expected = root root^T
@@ -87,14 +89,15 @@ def stereo_covariance(refinement: Refinement) -> Array:
     factor, directions = np.linalg.eigh(kept * seen + (1 - kept) * mean * np.eye(s1))
     least = np.exp(np.mean(np.log(np.maximum(factor, 1e-12 * mean))))
     beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
-    share = s1 / max(float(np.trace(np.linalg.solve(inverse[:s1], expected))), 1e-12)  # noise moves fewer than all
+    at_minimum = inverse[:s1] + by_common
+    share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)  # noise moves fewer than all
     information = refinement.normal.view_information()[0]
     scale = 1.0 / np.sqrt(np.diag(information.sum(0)))
     by_prior = np.zeros((s1, s1))
     if problem.prior is not None:  # it was weighted as if it were one of views that disagree as much
         told = max(problem.prior.weight - 1.0, 0.0) * information[-1] * scale[:, None] * scale
         by_prior = inverse.T @ told @ inverse
-    result: Array = (inverse[:s1] + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
+    result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result
 
 
@@ -223,7 +226,8 @@ def assess(
     chosen = next((c for c in reversed(candidates) if c.terms == refinement.terms), None)
     n_views = len(np.unique(kept.view))
     warnings = _warnings(refinement, share, tilt, spread, n_views, inflation, halves, chosen)
-    if motion is not None and motion.is_seen:
+    named = motion is not None and motion.is_seen and refinement.problem.motion is not None
+    if motion is not None and named:
         warnings = (
             "the pairs are not synchronised, or the lenses are not as modelled: the two images of a pair differ as if "
             f"the board had moved by {motion.distance * 1e3:.2g} mm between them ({motion.pixels:.2g} px; corners "
@@ -250,7 +254,7 @@ def assess(
         place_sigma=place,
         pairs=pairs,
         motion=motion,
-        verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, motion, chosen, wide),
+        verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, named, chosen, wide),
         warnings=warnings,
     )
 
@@ -328,7 +332,7 @@ def _verdict(
     lengths: tuple[float, float],
     pairs: int,
     halves: HalfSets | None,
-    motion: PairMotion | None,
+    moved: bool,
     chosen: TermsTried | None,
     wide: tuple[str, ...],
 ) -> str:
@@ -344,7 +348,7 @@ def _verdict(
         judged.append((2, f"views left out give {held_out:.3f} px where those fitted give {rms:.3f} px"))
     if halves is not None and halves.sigmas > 2:
         judged.append((2, f"odd and even views differ by {halves.sigmas:.1f} of their sigmas"))
-    if motion is not None and motion.is_seen:
+    if moved:
         judged.append((2, "the two images of a pair do not show the board in one place"))
     if triangulation[0] > 1e-3 * distance:
         share = 100 * triangulation[0] / distance

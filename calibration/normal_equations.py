@@ -116,13 +116,15 @@ class Normal:
             self._with_board(shared[-1])
         return shared - self.cross @ carried, self.gradient - np.einsum("vsi,vi->vs", self.cross, own)
 
-    def shifts_by_views(self, s1: int) -> tuple[Array, Array, Array]:
+    def shifts_by_views(self, s1: int, common: Array | None = None) -> tuple[Array, Array, Array, Array]:
         """What each view, left out in turn, tells of the first s1 shared parameters, each in units of a `scale`.
 
         To first order the shift is H^-1 g_v with g_v the view's gradient at the common minimum; noise alone gives
         E[g_v g_v^T] = H_v - H_v H^-1 H_v. A prior is no view, and part of H alone.
 
-        returns : shifts (n_views, s1), the sum of the expected g_v g_v^T (s, s), and H^-1 (s, s1)
+        common : (n_views, s, s) covariance of what else the views' gradients contain, apart from their points' noise
+        returns : shifts (n_views, s1), the sum of the expected g_v g_v^T (s, s), H^-1 (s, s1), and the covariance
+            (s1, s1) by `common`
         """
         information, gradient = self.view_information()
         scale = 1.0 / np.sqrt(np.diag(information.sum(0)))  # the parameters' units differ by 10^6
@@ -131,11 +133,18 @@ class Normal:
         views = information[: self.n_views]
         expected = (views - views @ inverse @ views).sum(0)
         covariance: Array = inverse[:, :s1]
-        return gradient[: self.n_views] @ covariance, expected, covariance
+        by_common = np.zeros((s1, s1))
+        if common is not None:
+            common = common * scale[:, None] * scale
+            total, part = common.sum(0), views @ inverse
+            left = common - part @ common - np.swapaxes(part @ common, 1, 2)
+            expected = expected + (left + part @ total @ np.swapaxes(part, 1, 2)).sum(0)
+            by_common = covariance.T @ total @ covariance
+        return gradient[: self.n_views] @ covariance, expected, covariance, by_common
 
     def disagreement(self, s1: int) -> float:
         """Variance of the first s1 parameters as the views disagree about them, over what the noise predicts."""
-        shift, spread, covariance = self.shifts_by_views(s1)
+        shift, spread, covariance, _ = self.shifts_by_views(s1)
         # the board's own shape is nuisance: compare the stereo parameters' shifts only
         metric = np.linalg.inv(covariance[:s1])
         seen = float(np.einsum("vi,ij,vj->", shift, metric, shift))

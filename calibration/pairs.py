@@ -10,6 +10,7 @@ import numpy as np
 from calibration.arrays import Array, Mask
 from calibration.board_motion import BoardMotion
 from calibration.model_choice import fit_poses
+from calibration.motion_size import likely_motion
 from calibration.normal_equations import inverse_covariance
 from calibration.refinement import Refinement, refine_stereo
 from calibration.stereo_model import Observations, StereoModel, Terms, predict, predict_pixels
@@ -198,16 +199,26 @@ class PairMotion:
     pixels: float  # [px] in the right image
     scatter: float  # [px] of the corners within an image, about a pose of its own
     at_rest: float  # [px] what this scatter alone would give for `pixels`
+    likely: float  # [px] the same by all pairs together: cameras that few views leave open have taken up a part of it
 
     @property
     def is_seen(self) -> bool:
-        """True if it is far beyond what corners that scatter so would show of a board at rest."""
-        return self.pixels > MOVED * max(self.scatter, self.at_rest)
+        """True if the usual pair is far beyond what corners that scatter so would show of a board at rest."""
+        return self.pixels > self._enough
+
+    @property
+    def is_likely(self) -> bool:
+        """True if it is by all pairs together, where the usual one shows more than nothing: few pairs hide it."""
+        return self.is_seen or (self.likely > self._enough and self.pixels > self.at_rest)
 
     def as_random(self, points: Array) -> BoardMotion:
         """As a random motion of boards with these points (n, 3) [m], roughly: what is begun with."""
         reach = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
         return BoardMotion(self.distance / reach, self.distance)
+
+    @property
+    def _enough(self) -> float:
+        return MOVED * max(self.scatter, self.at_rest)
 
 
 def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
@@ -245,4 +256,7 @@ def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
     freedom = max(freedom, 1)
     at_rest = float(np.sqrt(np.median(noise) * whitened / freedom))
     scatter = float(np.sqrt(2 * rest / freedom))
-    return PairMotion(float(np.median(distances)), float(np.median(shifts)), scatter, at_rest)
+    likely = likely_motion(refinement)
+    if likely is None:
+        return None
+    return PairMotion(float(np.median(distances)), float(np.median(shifts)), scatter, at_rest, likely.pixels)

@@ -24,6 +24,7 @@ from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
 from calibration.lens_field import FieldFit, fit_lens_field
 from calibration.model_choice import TermsTried, choose_board
+from calibration.motion_size import likely_motion
 from calibration.pairs import PairsJudged, judge_pairs, motion_between_exposures, own_places, pairs_that_agree
 from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
@@ -264,12 +265,20 @@ def calibrate_from_corners(
         places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
         refinement, again = choose_board(*places, board.points, (refinement.terms.board,), *lens, report)
         candidates = (*candidates, *again)
-    motion = motion_between_exposures(refinement)
-    if motion is not None and motion.is_seen:
+    report("trying a field of the lenses")
+    motion, lens_fit = motion_between_exposures(refinement), fit_lens_field(refinement, board.points)
+    moved = motion is not None and motion.is_likely
+    if motion is not None and moved and lens_fit is not None:
+        # a field puts boards elsewhere for each camera, too, and what is left of it does: by the scatter before it
+        left = motion_between_exposures(lens_fit.refinement) or motion
+        motion = replace(left, scatter=max(motion.scatter, left.scatter))
+        moved = motion.is_seen
+    if motion is not None and moved:
         report("pairs that were not synchronised: with a motion of the board between the exposures")
         begin = motion.as_random(board.points)
         refinement, again = choose_board(*places, board.points, boards, *lens, report, begin)
         candidates = (*candidates, *again)
+        lens_fit = fit_lens_field(refinement, board.points)
     apart = _told_apart(pairs.apart, names, bool(wide))
     warnings += apart
     if table_view is not None and table_view in rejected | pairs.apart:
@@ -282,8 +291,6 @@ def calibrate_from_corners(
         raise CalibrationError(
             f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
         )
-    report("trying a field of the lenses")
-    lens_fit = fit_lens_field(refinement, board.points)
     if lens_fit is not None:
         refinement = lens_fit.refinement
     report("judging")
@@ -291,7 +298,8 @@ def calibrate_from_corners(
     shape = board_shape(refinement, board.points, inflation)
     refinement = as_made(refinement, board.points, shape)
     origin = on_the_table(board.points, shape)
-    covariance = stereo_covariance(refinement)
+    unseen = None if refinement.problem.motion is not None else likely_motion(refinement)
+    covariance = stereo_covariance(refinement, unseen.gradients if unseen else None)
     if refinement.terms.board in shapes:
         left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
         covariance = covariance + left_out

@@ -8,12 +8,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, CalibrationSettings, CornerView, Terms, calibrate_from_corners, refine_stereo
+from calibration.assessment import stereo_covariance
 from calibration.board_motion import BoardMotion, motions, split
+from calibration.motion_size import likely_motion
 from calibration.normal_equations import Problem
+from calibration.pairs import motion_between_exposures
 from calibration.rig_file import read_rig_file, write_rig
+from calibration.stereo import _observations
 from calibration.stereo_model import board_basis, moved, predict_pixels
 from calibration.tolerances import BoardTolerances
-from tests.oracles import moved_boards
+from tests.oracles import imperfect_laboratory as laboratory
+from tests.oracles import moved_boards, point_laboratory
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
@@ -147,6 +152,48 @@ def test_pairs_that_were_synchronised_have_no_motion():
         assert asked.problem.motion.turn < 0.5e-3
 
 
+@pytest.mark.parametrize("seed", [404, 416])
+def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
+    plan = laboratory.Plan(seed)
+    cameras, target, draws = point_laboratory.cameras_of(plan)
+    found = point_laboratory.calibration_of(plan, cameras, target, draws, settings=CalibrationSettings())
+    assert found.lens is not None
+    assert found.refinement.problem.motion is None
+    assert not any("synchronised" in text for text in found.warnings)
+    # without the field it passes for one
+    left, right = found.corner_views
+    begun, terms, points = found.refinement.model, found.refinement.terms, found.board.points
+    plain = refine_stereo(_observations((list(left), list(right))), begun, points, terms)
+    assert motion_between_exposures(plain).is_seen
+    # and boards that do move are still told: 0.1 px are 25 um here
+    moving = [replace(view, points=view.points + 0.1 * rng.normal(size=2)) for view in right]
+    both = calibrate_from_corners(left, moving, found.board, CalibrationSettings(), 0, 3e-3)
+    assert_allclose(both.refinement.problem.motion.shift, 25e-6, rtol=0.5)
+    assert any("synchronised" in text for text in both.warnings)
+
+
+def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
+    ratios, sizes = [], []
+    for seed in range(12):
+        rig = moved_boards.make_rig(100 + seed)
+        found = calibrated(rig, 5, seed, shift=0.1e-3, turn=0.1e-3)
+        assert found.refinement.problem.motion is None
+        likely = likely_motion(found.refinement)
+        sizes.append(likely.size.shift)
+        error, places = errors(found, rig)
+        C = found.rig.covariance[np.ix_(places, places)]
+        by_corners = stereo_covariance(found.refinement)[-6:, -6:]  # and by how the views disagree
+        pair = error[-6:]
+        ratios.append((squared(pair, C[-6:, -6:]), squared(error, C), squared(pair, by_corners)))
+    pair, everything, without = np.mean(ratios, axis=0)
+    assert 0.5 < pair < 1.5  # chi-square of 72 at three sigma
+    assert 0.5 < everything < 1.5
+    assert without > 1.5 * pair
+    assert_allclose(np.median(sizes), 0.1e-3, rtol=0.4)
+    at_rest = [likely_motion(calibrated(moved_boards.make_rig(seed), 8, seed).refinement) for seed in range(3)]
+    assert max(one.size.shift for one in at_rest) < 0.02e-3
+
+
 def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
     found = calibrated(moved_boards.make_rig(1), 6, 1, shift=1e-3, turn=1e-3)
     assert found.refinement.model.boards_right is not None
@@ -161,7 +208,7 @@ def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("size", "n"), [(0.1e-3, 12), (2e-3, 12), (2e-3, 4)])
+@pytest.mark.parametrize(("size", "n"), [(0.1e-3, 12), (0.1e-3, 3), (0.3e-3, 5), (2e-3, 12), (2e-3, 4)])
 def test_sigmas_hold_for_small_and_large_motions(size, n):
     ratios = []
     for seed in range(12):
