@@ -447,3 +447,57 @@ def test_a_contact_too_stiff_for_derivatives_is_said_to_be_one():
     ball = Equations({"h": "v", "v": "-g + Heaviside(-h)*(-k*h - c*v)/0.1"}, {"k": 3.5e4, "c": 12.0}, {"g": 9.81})
     with pytest.raises(AnalysisError, match="stiff contact"):
         diagnose(ball, Run(time, {"h": height}, 5e-4))
+
+
+@pytest.fixture(scope="module")
+def tank():
+    """A tank that overflows, filled by a multisine whose slowest line is the strongest; after a public benchmark."""
+    time = np.arange(0, 800, 1.0)
+    rng = np.random.default_rng(8)
+    lines = np.arange(1, 41) / 800.0
+    size = np.where(np.arange(40) == 0, 0.08, 0.05)
+    phase = rng.uniform(0, 2 * np.pi, len(lines))
+
+    def pump(t):
+        return 1.0 + np.cos(2 * np.pi * np.asarray(t)[..., None] * lines + phase) @ size
+
+    y = motion(lambda t, y: [-0.5 * y[0] + pump(t) - 2.0 * max(y[0] - 2.3, 0.0)], [2.0], time, max_step=0.5)[0]
+    assert 0.1 < np.mean(y > 2.3) < 0.5
+    assert y[0] < 2.3
+    equations = Equations({"y": "-k*y + pump"}, {"k": 0.6}, inputs=["pump"], observed={"level": "y"})
+    return equations, Run(time, {"level": y + 2e-3 * rng.standard_normal(len(time))}, inputs={"pump": pump(time)})
+
+
+def test_what_sets_in_within_a_run_is_found_beside_a_term_that_names_the_channel(tank):
+    """The overflow moves nothing before it begins: its derivative starts from nought at a kink."""
+    equations, run = tank
+    overflow = Term("overflow", {"y": "-o*Max(y - top, 0)"}, parameters={"o": 0.0, "top": Parameter(2.2, shape=True)})
+    answer = diagnose(equations, run, [overflow, terms.sensor_scale("level"), terms.sensor_offset("level")])
+    assert answer.found == ("overflow",)
+    assert within(answer, "k", 0.5)
+    assert within(answer, "overflow.o", 2.0)
+    assert within(answer, "overflow.top", 2.3)
+
+
+def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(tank):
+    """The strongest line of a driven motion may be the slowest: how fast the data change is told by their memory."""
+    equations, run = tank
+    answer = diagnose(equations, run, [terms.sensor_drift("level")])
+    assert answer.verdict == "unexplained"
+
+
+def test_a_term_whose_absence_led_the_fit_far_off_is_fitted_from_the_declared_values(rng):
+    """A motor against dry friction of half its torque: without it the moment of inertia comes out sevenfold."""
+    time = np.arange(0, 20, 0.02)
+    torque = np.where(time < 10, 0.05, 0.06)
+
+    def rates(t, y):
+        return [y[1], ((0.05 if t < 10 else 0.06) - 1.35e-4 * y[1] - 0.0312) / 1.4e-4]
+
+    angle = motion(rates, [0.0, 0.0], time, max_step=0.02)[0] + 0.5 * rng.standard_normal(len(time))
+    motor = Equations({"angle": "w", "w": "(u - B*w)/J"}, {"J": 1.2e-4, "B": 7e-5}, inputs=["u"])
+    run = Run(time, {"angle": angle}, inputs={"u": torque}, hold="hold", known={"w": 0.0})
+    answer = diagnose(motor, run, [terms.quadratic("w"), terms.coulomb("w")])
+    assert answer.found == ("coulomb_w",)
+    assert within(answer, "J", 1.4e-4)
+    assert within(answer, "coulomb_w.c", 0.0312 / 1.4e-4)

@@ -249,6 +249,10 @@ class _Search:
         ):  # a refit beyond a threshold is long: only where it leads somewhere
             starts = [s for s in starts if self._promising(current, together, s)]
         fits = [self._fit(together, current.fit.values | start) for start in starts]
+        declared = {q.name: q.declared for q in self.system.base if q.declared is not None}
+        if declared and fits and not any(f.converged for f in fits):
+            # without the effect the others may have gone so far to make up for it that no step leads back
+            fits.append(self._fit(together, current.fit.values | declared))
         return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else current.fit
 
     def _promising(self, current: Trial, together: Sequence[Candidate], start: Values) -> bool:

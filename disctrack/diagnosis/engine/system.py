@@ -33,6 +33,7 @@ class Quantity:
     typical: float = np.inf  # size that would surprise nobody; decides between explanations that fit alike
     linear: bool = False  # the prediction is linear in it with a derivative that is the same everywhere
     belongs_to: tuple[str, ...] = ()  # what must be the same in two recordings for them to share it; (): never shared
+    declared: float | None = None  # beforehand, if only roughly: where a fit that was led far off may begin anew
 
 
 @dataclass(frozen=True)

@@ -134,6 +134,12 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
                 for i in range(n * c, n * (c + 1)):
                     scale = abs(new[i]) / (size[i - n * c] + 1e-300)
                     top = max(top, scale)
+                if steps > 0 and largest[c - 1] == 0.0:
+                    # what sets in within the step (an overflow, a stop): of a start at a kink no error is small beside
+                    # itself, however short the step; it is small beside what such a slope will have brought by the end
+                    for s in range(13):
+                        for i in range(n * c, n * (c + 1)):
+                            top = max(top, (end - span[0]) * abs(K[s, i]) / (size[i - n * c] + 1e-300))
             for i in range(n * c, n * (c + 1)):
                 a5, a3 = 0.0, 0.0
                 for j in range(13):

@@ -119,6 +119,9 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     rates = [parsed(f, everything, f"equation of {name}") for name, f in equations.rates.items()]
     without_motion = {k: v for k, v in everything.items() if k not in states and k not in inputs}
     observed = {c: parsed(f, everything, f"observed {c}") for c, f in channels.items()}
+    # a term of a sensor may name the channel itself: what it shows as declared. A state of that name comes first
+    shown = {symbol(c): f for c, f in observed.items() if c not in everything}
+    channel_names = {s.name: s for s in shown}
     late = dict.fromkeys(channels, sympy.Integer(0))
     position = {name: i for i, name in enumerate(states)}
     seen: set[str] = set()
@@ -136,7 +139,8 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
             rates[position[name]] += parsed(f, words, f"{here}, rate of {name}")
         for name, f in term.observed.items():
             _known(name, observed, f"{here}, observed")
-            observed[name] += parsed(f, words, f"{here}, observed {name}")
+            found = parsed(f, {**channel_names, **words}, f"{here}, observed {name}")
+            observed[name] += found.xreplace(shown)
         clock = parsed(term.clock, {**without_motion, **mine}, f"{here}, clock")
         for c in late:
             late[c] += clock

@@ -33,6 +33,7 @@ JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a 
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
 MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
+FORGOTTEN = float(np.arccos(1 / np.e) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
@@ -276,7 +277,7 @@ def _with_memory(
         return None, None, ""
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
-    shortest_turn = min(turn(s) for s in system.stretches)
+    shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
     if diagnosis.verdict == "unexplained" and lasting > SLOW * shortest_turn:
         # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
         block = max(2 * shortest_turn, 5 * lasting)
@@ -293,6 +294,16 @@ def _with_memory(
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or remembering), coefficients, text
+
+
+def _pace(s: Samples) -> float:
+    """Turn [s] of the oscillation that would lose its memory as fast as the data do, which an input may drive at will.
+
+    Of such data the strongest line is the slowest, and says nothing of how fast they change.
+    """
+    rows = np.isfinite(s.data)
+    away = np.where(rows, (s.data - np.nanmean(s.data, axis=0)) / s.sigma, 0.0)
+    return persistence(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
 
 
 def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diagnosis:

@@ -93,7 +93,11 @@ class EquationSystem:
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
         typical = p.typical or self.typical.get(name, np.inf)
         names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
-        return [Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical) for n in names]
+        declared = None if "." in name else p.value
+        return [
+            Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
+            for n in names
+        ]
 
     def _name(self, name: str, s: Samples) -> str:
         """Of the quantity that a number is in a stretch. Raises AnalysisError where its run is in no such group."""
