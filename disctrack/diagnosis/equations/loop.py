@@ -30,6 +30,8 @@ from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
+SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over the first
+BLUNT = 0.1  # of chi-square, by which a sharper jump may move the motion: numbers then move by 0.3 sigma at most
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
 MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
@@ -94,6 +96,10 @@ def ask(
         raise AnalysisError(_not_followed(system, values))
     system = _sized(system, values)
     diagnosis = diagnose(system, values, settings, system.training)
+    sharper = _sharp_enough(system, diagnosis.after)
+    if sharper is not system:
+        system = sharper
+        diagnosis = diagnose(system, diagnosis.before.values, settings, system.training)
     if not np.isfinite(diagnosis.before.chi_square):
         raise AnalysisError(
             "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
@@ -151,6 +157,23 @@ def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> d
         count += len(states)
     size = np.sqrt(square / max(count, 1))
     return {w.name: JUMP * (x or 1.0) for w, x in zip(f.widths.values(), size, strict=True)}
+
+
+def _sharp_enough(system: EquationSystem, fitted: Fit) -> EquationSystem:
+    """With jumps so sharp that sharper ones would move the motion by nothing that matters; mostly as it is.
+
+    A thousandth of what jumps is much where a ball's contact is as short, or where a motion starts from rest.
+    """
+    first, residual = system.widths, system.linearise(fitted.values, [])[0]
+    share = 1.0
+    while first and np.isfinite(fitted.chi_square) and share > SHARPEST:
+        share *= SHARPER
+        sharper = system.with_(widths={name: share * w for name, w in first.items()})
+        moved = residual - (residual := sharper.linearise(fitted.values, [])[0])
+        if np.sum(moved**2) < BLUNT * max(1.0, fitted.reduced_chi_square):
+            break
+        system = sharper
+    return system
 
 
 def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
