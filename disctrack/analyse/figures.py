@@ -166,10 +166,10 @@ def slip_speed(analysis: Analysis) -> Drawn | None:
     axes.set(xlabel="time (s)", ylabel="slip (mm/s)")
     axes.set_yscale("log")
     axes.legend(frameon=False, fontsize=9, loc="upper right")
+    path = f"{1e3 * onset.slip_distance:.4f} ± {1e3 * onset.slip_distance_sigma:.4f} mm"
     caption = (
         f"Speed of the disc's own point at the contact. The disc {onset.verdict} (probability of rolling at the end: "
-        f"{onset.probability:.3f}); path of slip {1e3 * onset.slip_distance:.3f} ± "
-        f"{1e3 * onset.slip_distance_sigma:.3f} mm."
+        f"{onset.probability:.3f}){f'; path of slip {path}' if onset.slip_distance > 0 else ''}."
     )
     return Drawn("08_slip", "Slip at the contact", caption, figure)
 
