@@ -90,7 +90,7 @@ def products(v: str, of: Sequence[str], degree: int = 3) -> tuple[Term, ...]:
 
 
 def sensor_scale(channel: str, shown: str = "", name: str = "") -> Term:
-    """The sensor shows too much or too little by a constant factor. `shown`: its formula, where a state has the channel's name."""
+    """The sensor shows too much or too little by a constant factor. `shown`: its formula, if a state has its name."""
     return Term(name or f"scale_{channel}", observed={channel: f"s*({shown or channel})"},
                 parameters={"s": Parameter(0.0, typical=0.01)}, title=f"scale of {channel} wrong")  # fmt: skip
 
