@@ -12,7 +12,7 @@ import numpy as np
 from calibration import Board, CalibrationSettings, CornerView, calibrate_from_corners
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
-from disctrack.track.assembly import TrackingSettings, assemble
+from disctrack.track.assembly import Taken, TrackingSettings, assemble
 from disctrack.track.dots import NoiseModel, TemplateLimits
 from disctrack.track.following import Follower, Law, Tables, TrackingSetup
 from disctrack.trajectory import FrameStatus, MarkerStatus
@@ -136,7 +136,7 @@ def tracked(px, R, t, times, rig, frame_rate):
     nothing = np.zeros((2, 1, 1))
     setup = TrackingSetup(rig, MA_2014, TemplateLimits(), nothing, nothing)
     follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
-    return assemble([follower], tables, TrackingSettings(), frame_rate, laboratory.G, times, range(n))
+    return assemble([follower], tables, TrackingSettings(), Taken(range(n), times, frame_rate, laboratory.G))
 
 
 def errors_and_variances(trajectory, R, t):
