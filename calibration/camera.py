@@ -28,6 +28,10 @@ RIG_PARAMETERS = (
     *(f"left_world_translation_{axis}" for axis in "xyz"),
 )
 N_RIG = len(RIG_PARAMETERS)  # 30
+# Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
+OF_LEFT, OF_RIGHT = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
+PAIR_TURN, PAIR_SHIFT = slice(18, 21), slice(21, 24)
+WORLD_TURN, WORLD_SHIFT = slice(24, 27), slice(27, 30)
 
 
 @dataclass(frozen=True)
@@ -259,13 +263,13 @@ class StereoRig(Brief):
 
         arm_world = points_world @ self.R_left_world.T
         d_rig = np.zeros((*points_world.shape[:-2], 2, points_world.shape[-2], 2, N_RIG))
-        d_rig[..., 0, :, :, 0:9] = d_k_left
-        d_rig[..., 1, :, :, 9:18] = d_k_right
-        d_rig[..., 1, :, :, 18:21] = rotated(d_right, turned_right)
-        d_rig[..., 1, :, :, 21:24] = d_right
+        d_rig[..., 0, :, :, OF_LEFT] = d_k_left
+        d_rig[..., 1, :, :, OF_RIGHT] = d_k_right
+        d_rig[..., 1, :, :, PAIR_TURN] = rotated(d_right, turned_right)
+        d_rig[..., 1, :, :, PAIR_SHIFT] = d_right
         for camera, d_point in enumerate((d_left, d_right_left)):
-            d_rig[..., camera, :, :, 24:27] = rotated(d_point, arm_world)
-            d_rig[..., camera, :, :, 27:30] = d_point
+            d_rig[..., camera, :, :, WORLD_TURN] = rotated(d_point, arm_world)
+            d_rig[..., camera, :, :, WORLD_SHIFT] = d_point
         d_world = np.stack([d_left @ self.R_left_world, d_right_left @ self.R_left_world], axis=-4)
         return np.stack([pixels_left, pixels_right], axis=-3), d_world, d_rig
 
@@ -274,12 +278,12 @@ class StereoRig(Brief):
         delta = np.asarray(delta, float)
         return replace(
             self,
-            left=Camera.from_parameters(self.left.parameters + delta[0:9], self.left.image_size),
-            right=Camera.from_parameters(self.right.parameters + delta[9:18], self.right.image_size),
-            R_right_left=rotation_from_vector(delta[18:21]) @ self.R_right_left,
-            t_right_left=self.t_right_left + delta[21:24],
-            R_left_world=rotation_from_vector(delta[24:27]) @ self.R_left_world,
-            t_left_world=self.t_left_world + delta[27:30],
+            left=Camera.from_parameters(self.left.parameters + delta[OF_LEFT], self.left.image_size),
+            right=Camera.from_parameters(self.right.parameters + delta[OF_RIGHT], self.right.image_size),
+            R_right_left=rotation_from_vector(delta[PAIR_TURN]) @ self.R_right_left,
+            t_right_left=self.t_right_left + delta[PAIR_SHIFT],
+            R_left_world=rotation_from_vector(delta[WORLD_TURN]) @ self.R_left_world,
+            t_left_world=self.t_left_world + delta[WORLD_SHIFT],
         )
 
 

@@ -8,7 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.camera import N_INTRINSIC, Camera, project, project_with_jacobians, rotation_from_vector
+from calibration.camera import (
+    N_INTRINSIC,
+    OF_LEFT,
+    OF_RIGHT,
+    PAIR_SHIFT,
+    PAIR_TURN,
+    Camera,
+    project,
+    project_with_jacobians,
+    rotation_from_vector,
+)
 from calibration.errors import CalibrationError
 
 DISTORTION_MODELS: dict[str, tuple[str, ...]] = {
@@ -195,11 +205,11 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
         boards_right = rotation_from_vector(poses[:, 6:9]) @ R, t + poses[:, 9:]
     return StereoModel(
         cameras=(
-            Camera.from_parameters(model.cameras[0].parameters + stereo[:9], model.cameras[0].image_size),
-            Camera.from_parameters(model.cameras[1].parameters + stereo[9:18], model.cameras[1].image_size),
+            Camera.from_parameters(model.cameras[0].parameters + stereo[OF_LEFT], model.cameras[0].image_size),
+            Camera.from_parameters(model.cameras[1].parameters + stereo[OF_RIGHT], model.cameras[1].image_size),
         ),
-        R_right_left=rotation_from_vector(stereo[18:21]) @ model.R_right_left,
-        t_right_left=model.t_right_left + stereo[21:24],
+        R_right_left=rotation_from_vector(stereo[PAIR_TURN]) @ model.R_right_left,
+        t_right_left=model.t_right_left + stereo[PAIR_SHIFT],
         R_left_board=turns @ model.R_left_board,
         t_left_board=model.t_left_board + poses[:, 3:6],
         points=model.points + displacement,

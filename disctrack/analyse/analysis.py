@@ -148,7 +148,8 @@ def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, 
                 f"The scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
                 "follow the scatter."
             )
-    height, common = contact.series[2].value, contact.series[2].sigma_calibration
+    lowest = next(series for series in contact.series if series.name == "contact_z")
+    height, common = lowest.value, lowest.sigma_calibration
     offset = float(np.mean(height[np.isfinite(height)])) if np.isfinite(height).any() else 0.0
     allowed = 3 * float(np.nanmax(np.append(common, 0.0))) + HEIGHT_TOLERANCE
     if abs(offset) > allowed:

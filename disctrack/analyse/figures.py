@@ -103,8 +103,8 @@ def _ends(axes: Axes, x: Array) -> None:
 
 def centre_and_contact_path(analysis: Analysis) -> Drawn | None:
     """Paper's figure 6."""
-    motion, series = analysis.motion, analysis.contact.series
-    contact = 1e3 * np.column_stack([series[0].value, series[1].value])
+    motion = analysis.motion
+    contact = 1e3 * np.column_stack([analysis.series(name).value for name in ("contact_x", "contact_y")])
     centre = 1e3 * motion.position
     known = np.flatnonzero(np.isfinite(contact[:, 0]))
     if known.size < 2:
@@ -153,7 +153,7 @@ def nutation_count(analysis: Analysis) -> Drawn | None:
 def slip_speed(analysis: Analysis) -> Drawn | None:
     """Paper's figure 8, with a confidence in place of a threshold by eye."""
     time, onset = analysis.motion.time, analysis.contact.onset
-    n, m = analysis.contact.series[3], analysis.contact.series[4]
+    n, m = analysis.series("slip_n"), analysis.series("slip_m")
     speed = 1e3 * np.hypot(n.value, m.value)
     if _nothing(speed):
         return None
@@ -176,12 +176,13 @@ def slip_speed(analysis: Analysis) -> Drawn | None:
 
 def contact_locus(analysis: Analysis) -> Drawn | None:
     """Paper's figure 9."""
-    circle, series, time = analysis.contact.circle, analysis.contact.series, analysis.motion.time
+    circle, time = analysis.contact.circle, analysis.motion.time
     if not np.isfinite(circle.radius):
         return None
     part = (time >= circle.start) & (time <= circle.end)
     figure, axes = _axes(5.0, 4.8)
-    axes.plot(1e3 * series[0].value[part], 1e3 * series[1].value[part], ".", color=BLUE, markersize=3, label="contact")
+    x, y = (1e3 * analysis.series(name).value[part] for name in ("contact_x", "contact_y"))
+    axes.plot(x, y, ".", color=BLUE, markersize=3, label="contact")
     angle = np.linspace(0, 2 * np.pi, 361)
     x, y = (1e3 * (c + circle.radius * f(angle)) for c, f in zip(circle.centre, (np.cos, np.sin), strict=True))
     axes.plot(x, y, color=RED, linewidth=0.9, label=f"radius {1e3 * circle.radius:.4f} mm")

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.rig_file import read_rig
 from disctrack.calibrate.targets import VIEWS_TRIED, board_size, evenly
-from disctrack.errors import OutputError, RecordingError
+from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
 from disctrack.readers import open_frames
@@ -162,9 +163,6 @@ def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, st
 
 def _rig_beside(folder: Path) -> str | None:
     """A rig file of disctrack in the folder or the one above."""
-    from calibration.rig_file import read_rig
-    from disctrack.errors import DiscTrackError
-
     for place, shown in ((folder, ""), (folder.parent, "../")):
         for file in sorted(place.glob("*.h5")):
             try:

@@ -21,7 +21,7 @@ from disctrack.render.images import Stage, TrueDisc, expected_board_image, expec
 from disctrack.render.sensor import digitise
 from disctrack.render.truth import Truth, write_truth
 from disctrack.scene.cameras import board_poses, rig_after_faults, rig_of
-from disctrack.scene.description import ImperfectionSettings, Scene
+from disctrack.scene.description import ImperfectionSettings, Scene, load_scene
 from disctrack.scene.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
 
 Progress = Callable[[int, int], None]  # images done, images in all
@@ -91,8 +91,6 @@ def run_render(
     scene_path: str | Path, folder: str | Path, truth_path: str | Path | None = None, progress: Progress | None = None
 ) -> Truth:
     """`disctrack render SCENE.toml -o RECORDING`: load, render, write; errors as in load_scene and write_recording."""
-    from disctrack.scene.description import load_scene
-
     return write_recording(folder, load_scene(scene_path), truth_path=truth_path, progress=progress)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.trajectory.file import read_group, read_provenance, read_setup
 
 NUTATION_PER_PRECESSION = 0.785  # of the frequencies, thin disc 0.775 to 0.80 at 20 deg: enough to cut into periods
@@ -166,8 +166,6 @@ def _power_laws(scaling: dict[str, Any]) -> tuple[dict[str, FittedNumber], tuple
 
 def _diagnosed_k_m(path: Path) -> FittedNumber | None:
     """k_m of the model that `disctrack diagnose` ended with, where that was run."""
-    from disctrack.errors import TrajectoryFileError
-
     try:
         _, attributes = read_group(path, "diagnosis", names=[])
         parameters = json.loads(attributes["diagnosis"])["after"]["parameters"]

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.arrays import Array
 from disctrack.errors import SceneError
+from disctrack.rolling import Model, Motion, State, effects_from_tables, simulate, steady_precession, struck_disc
 from disctrack.scene.description import RollingMotion, Scene
-
-if TYPE_CHECKING:
-    from disctrack.rolling import Model, Motion, State
-
 
 _SAMPLES_PER_FRAME = 4  # of the simulated motion; a cubic between them errs by 3e-8 of a nutation oscillation
 
@@ -55,8 +52,6 @@ def _static(scene: Scene) -> SceneMotion:
 
 
 def _table(scene: Scene) -> SceneMotion:
-    from scipy.interpolate import CubicSpline
-
     path = scene.folder / scene.motion.table
     try:
         rows = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
@@ -70,8 +65,6 @@ def _table(scene: Scene) -> SceneMotion:
 
 
 def _rolling(scene: Scene) -> SceneMotion:
-    from scipy.interpolate import CubicHermiteSpline
-
     motion = simulate_scene(scene)
     spline = CubicHermiteSpline(motion.time, motion.q, motion.qdot)
     n = _frames_within(scene, motion.time[0], motion.time[-1], "the rolling model")
@@ -96,8 +89,6 @@ def _frames_within(scene: Scene, start: float, end: float, source: str) -> int:
 
 def rolling_model(scene: Scene) -> Model:
     """Declared disc and gravity with the scene's effects; raises ModelError for an effect that does not exist."""
-    from disctrack.rolling import Model, effects_from_tables
-
     settings = scene.motion.rolling
     effects = effects_from_tables(settings.effects, settings.formulas)
     return Model(scene.declared_disc, scene.gravity_m_s2, effects, scene.air_density_kg_m3)
@@ -116,8 +107,6 @@ def rolling_start(scene: Scene) -> State:
 
     Or, with `struck`, the upright disc just after a ball has hit it.
     """
-    from disctrack.rolling import State, steady_precession
-
     start = scene.motion.rolling
     if start.struck:
         return _struck(scene)
@@ -141,8 +130,6 @@ def rolling_start(scene: Scene) -> State:
 
 
 def _struck(scene: Scene) -> State:
-    from disctrack.rolling import struck_disc
-
     start = scene.motion.rolling
     wanted = {"lateral_mm", "vertical_mm", "impulse_N_s"}
     given = set(start.struck)
@@ -166,8 +153,6 @@ def _struck(scene: Scene) -> State:
 
 def simulate_scene(scene: Scene) -> Motion:
     """The rolling model's motion, four samples per frame; it ends early where the disc comes to rest."""
-    from disctrack.rolling import simulate
-
     before, after = _margin(scene)
     step = 1 / (_SAMPLES_PER_FRAME * true_frame_rate(scene))
     first = -int(np.ceil(before / step + 1e-9))

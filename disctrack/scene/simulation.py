@@ -7,19 +7,21 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 
 from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.labelled_arrays import Variable, flags, write_variables
+from disctrack.files.software import __version__
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion, Regime
 from disctrack.rolling.simulate import simulate
-
-if TYPE_CHECKING:
-    from disctrack.files.labelled_arrays import Variable
+from disctrack.scene.description import load_scene
+from disctrack.scene.motion import effects_in_words, rolling_model, rolling_start
 
 SCHEMA, SCHEMA_VERSION = "disctrack motion", 1
 _CONVENTIONS = {
@@ -52,9 +54,6 @@ def run_simulate(
     duration [s], rate [Hz] : those of the scene's cameras (n_frames, frame_rate_hz) if not given. The file ends earlier
     where the motion does. Raises SceneError, ModelError, OutputError.
     """
-    from disctrack.scene.description import load_scene
-    from disctrack.scene.motion import effects_in_words, rolling_model, rolling_start
-
     keep(scene_path)
     refuse_input(output)
     scene = load_scene(scene_path)
@@ -98,11 +97,6 @@ def summary(motion: Motion) -> str:
 
 def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None = None) -> None:
     """Write a motion as HDF5 that xarray and netCDF readers open: root, groups motion, energy, contact, effects."""
-    import h5py
-
-    from disctrack.files.labelled_arrays import Variable, write_variables
-    from disctrack.files.software import __version__
-
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:
         axes = {
@@ -131,14 +125,10 @@ def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None =
 
 
 def _series(columns: dict[str, tuple[Any, str, str]]) -> dict[str, Variable]:
-    from disctrack.files.labelled_arrays import Variable
-
     return {name: Variable(data, ("time",), unit, text) for name, (data, unit, text) in columns.items()}
 
 
 def _root(motion: Motion) -> dict[str, Variable]:
-    from disctrack.files.labelled_arrays import Variable
-
     q = motion.q.T
     variables = _series(
         {name: (q[i], "m", f"{name} of the geometric centre, world frame") for i, name in enumerate("xyz")}
@@ -197,8 +187,6 @@ def _energy(motion: Motion) -> dict[str, Variable]:
 
 
 def _contact(motion: Motion) -> dict[str, Variable]:
-    from disctrack.files.labelled_arrays import Variable, flags
-
     columns: dict[str, tuple[Any, str, str]] = {}
     for i, axis in enumerate(("n", "m", "z")):
         along = {"n": "n0", "m": "m0", "z": "k"}[axis]

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array, Mask
-from calibration.camera import N_RIG, StereoRig
+from calibration.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.tolerances import SIZE
 from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
@@ -232,11 +232,11 @@ def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, fl
 
 def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoRig, float]:
     """The rig with all lengths longer by its share of `size` +- `sigma`, and that share; see the module."""
-    by_size = [i for i, a in enumerate(rig.allowances) if a.cause == SIZE and a.shift[21:24].any()]
+    by_size = [i for i, a in enumerate(rig.allowances) if a.cause == SIZE and a.shift[PAIR_SHIFT].any()]
     if not by_size:
         return rig, 0.0
     shift = rig.allowances[by_size[0]].shift
-    own = float(np.linalg.norm(shift[21:24])) / rig.baseline
+    own = float(np.linalg.norm(shift[PAIR_SHIFT])) / rig.baseline
     share = own**2 / (own**2 + sigma**2)
     left = np.sqrt(1.0 - share)
     allowances = list(rig.allowances)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import N_RIG, StereoRig
+from calibration.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import vector_from_rotation
 from disctrack.track.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
@@ -24,7 +24,7 @@ TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without an
 MOST_SIGMAS = 4.0  # beyond, it is something else
 FITS_PX = 1.0  # rms of blobs about the fit
 BETTER = 3.0  # times, than with the camera where it was
-_POSE = np.arange(18, 24)  # of RIG_PARAMETERS: the right camera's turn and shift
+_POSE = np.r_[PAIR_TURN, PAIR_SHIFT]  # of RIG_PARAMETERS: the right camera's turn and shift
 
 
 def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array, Mask
-from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, StereoRig
+from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
 from disctrack.disc import Disc
 from disctrack.track.as_printed import (
     DOT_SIGMA,
@@ -32,7 +32,7 @@ ITERATIONS = 3
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
 _WIDE_ROTATION, _WIDE_TRANSLATION = 0.02, 0.01  # [rad], [m]
 _WIDE_DELAY = 1.0  # in frame periods
-_N_RELATIVE = 24  # of RIG_PARAMETERS; the others place the world, which moves all poses alike
+_N_RELATIVE = PAIR_SHIFT.stop  # of RIG_PARAMETERS; the others place the world, which moves all poses alike
 
 
 @dataclass(frozen=True)

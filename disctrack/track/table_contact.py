@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array
-from calibration.camera import N_RIG, Allowance, StereoRig
+from calibration.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.least_squares import chance_beyond
@@ -45,7 +45,6 @@ ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
 _AT_ONCE = 4096  # frames
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
-_CAMERAS = slice(24, 30)  # of RIG_PARAMETERS: the world as the left camera sees it
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,8 @@ def table_from_disc(
     noise = noise + by_place @ by_place.T
     turn = rig.R_left_world
     M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
-    M[24:27] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
-    M[27:30] = turn[:, 2:] * np.array([1.0, *-middle])
+    M[WORLD_TURN] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    M[WORLD_SHIFT] = turn[:, 2:] * np.array([1.0, *-middle])
 
     # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
     by_disc = np.stack([by_radius, 2.0 * by_thickness], axis=1)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.camera import StereoRig
+from calibration.camera import N_RIG, WORLD_TURN, StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.render import render_disc, rig_after_faults
@@ -67,8 +67,8 @@ def planted_faults(scene: Scene, true: StereoRig, own: StereoRig) -> tuple[Contr
     disc, rng = scene.declared_disc, np.random.default_rng([scene.seed, 11])
     q = stress_poses(N_POSES, true, scene, rng)
     turned = replace(scene, faults=Faults(left=CameraFault(rotation_deg=(0.0, float(np.degrees(TURN)), 0.0))))
-    tilt = np.zeros(30)
-    tilt[24] = TURN
+    tilt = np.zeros(N_RIG)
+    tilt[WORLD_TURN.start] = TURN
     shifted = disc.marker_centres_body + MISPRINT * (np.arange(disc.n_markers) == 2)[:, None] * np.array([0.6, 0.8, 0])
     cases = [
         _Case("none", False, true, own, disc, disc),

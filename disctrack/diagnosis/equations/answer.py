@@ -16,9 +16,14 @@ from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.system import System
 from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box
-from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term
+from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.diagnosis.equations.loop import Answered, ask
 from disctrack.diagnosis.equations.system import EquationSystem, fitted_rows
+from disctrack.diagnosis.pages.general import document, table
+from disctrack.diagnosis.pages.words import effect_text
+from disctrack.errors import OutputError
+from disctrack.files.json_text import json_file, plain
+from disctrack.files.whole import write_whole
 
 
 @dataclass(frozen=True)
@@ -109,8 +114,6 @@ class Answer:
         begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
         before : by the equations as declared (and fitted)
         """
-        from disctrack.diagnosis.equations.declared import checked
-
         (samples,) = checked(self.equations, [run])
         if not run.name:
             first = self.system.stretches[0]
@@ -145,8 +148,6 @@ class Answer:
     @property
     def sentence(self) -> str:
         """The answer in plain words."""
-        from disctrack.diagnosis.pages.words import effect_text
-
         d = self.diagnosis
         level = ", ".join(
             f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")
@@ -166,8 +167,6 @@ class Answer:
 
     def __str__(self) -> str:
         """The answer, before and after, and remarks."""
-        from disctrack.diagnosis.pages.general import table
-
         lines = [self.sentence, *(f"Note: {note}." for note in self.notes), ""]
         lines.append(f"{'':<30}{'before':>12}{'after':>12}{'noise':>12}")
         for c in self.system.formulas.channels:
@@ -178,9 +177,6 @@ class Answer:
 
     def document(self) -> dict[str, Any]:
         """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
-        from disctrack.diagnosis.pages.general import document
-        from disctrack.files.json_text import plain
-
         sides = [{"channels": {c: vars(e) for c, e in errors.items()}} for errors in (self.before, self.after)]
         found = document(self.diagnosis, self.equations.name, self.sentence, *sides)
         found |= {
@@ -194,9 +190,6 @@ class Answer:
     def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
         """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
         from disctrack.diagnosis.equations.page import written_page
-        from disctrack.errors import OutputError
-        from disctrack.files.json_text import json_file
-        from disctrack.files.whole import write_whole
 
         paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
         for path in paths:
