@@ -67,7 +67,7 @@ def friction_numbers(trajectory: Trajectory) -> Numbers:
     nothing: Numbers = {"k_m_m_s2": None, "k_m_sigma_m_s2": None, "k_m_reduced_chi_square": None}
     try:
         declared = declared_model(trajectory)
-        system = DiscSystem(trajectory, declared.model, candidates=())
+        system = DiscSystem(trajectory, declared.model, candidates=(), known=declared.faults)
         found = fit(system, system.base, system.start(declared.faults))
     except AnalysisError as error:
         return nothing | {"k_m_undetermined": str(error)}

@@ -169,9 +169,12 @@ def _assumed(trajectory: Trajectory, model: Model, names: tuple[str, ...], stati
         stretch = free_stretch(seen)
     except AnalysisError:
         return None
-    systematic = find_systematic(DiscSystem(seen, model, stretch=stretch), noise, static.values, beside=names)
-    system = DiscSystem(seen, model, stretch=stretch, systematic=systematic, freed=candidates)
-    base = fit(system, system.base, system.start(static.values))
+    systematic = find_systematic(
+        DiscSystem(seen, model, stretch=stretch, known=static.values), noise, static.values, beside=names
+    )
+    known = static.values
+    system = DiscSystem(seen, model, stretch=stretch, systematic=systematic, freed=candidates, known=known)
+    base = fit(system, system.base, system.start(known))
     return Assumed(system, base, candidates, static.gain) if np.isfinite(base.cost) else None
 
 
@@ -184,7 +187,12 @@ def find_clock(system: DiscSystem, known: Values) -> Assumed | None:
     (q,) = candidate.quantities
     change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q.lower, q.upper))
     freed = DiscSystem(
-        system.trajectory, system.model, stretch=system.stretch, systematic=system.systematic, freed=(candidate,)
+        system.trajectory,
+        system.model,
+        stretch=system.stretch,
+        systematic=system.systematic,
+        freed=(candidate,),
+        known=known,
     )
     base = fit(freed, freed.base, freed.start(dict(known) | {q.name: change}))
     return Assumed(freed, base, (candidate,), np.inf) if base.converged else None

@@ -73,7 +73,7 @@ def diagnose_motion(
     as_tracked = trajectory
     trajectory, noise = with_noise_of_frames(trajectory)
     stretch = free_stretch(trajectory)
-    rolling = DiscSystem(trajectory, model, stretch=stretch)
+    rolling = DiscSystem(trajectory, model, stretch=stretch, known=faults)
     systematic = find_systematic(rolling, noise)
     # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
     settings = replace(settings, at_noise=settings.at_noise * systematic.left)
@@ -81,7 +81,7 @@ def diagnose_motion(
     if assumed is not None:
         return _with_large(assumed, settings)
     if systematic != rolling.systematic:
-        rolling = DiscSystem(trajectory, model, stretch=stretch, systematic=systematic)
+        rolling = DiscSystem(trajectory, model, stretch=stretch, systematic=systematic, known=faults)
     base = fit(rolling, rolling.base, rolling.start(faults))
     if not base.converged:
         assumed = find_clock(rolling, faults)
@@ -95,7 +95,7 @@ def diagnose_motion(
     except GivenUp:
         # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
         others = _without_slip(rolling)
-        rolling = DiscSystem(trajectory, model, others, stretch=stretch, systematic=rolling.systematic)
+        rolling = DiscSystem(trajectory, model, others, stretch=stretch, systematic=rolling.systematic, known=faults)
         notes = (*stretch.notes, CREEPS)
         return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=notes)
 
@@ -117,13 +117,17 @@ def _rolling_or_slipping(
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
         if _contact_lies_elsewhere(rolling, base):
-            others = DiscSystem(trajectory, model, _without_slip(rolling), stretch=stretch, systematic=systematic)
+            others = DiscSystem(
+                trajectory, model, _without_slip(rolling), stretch=stretch, systematic=systematic, known=faults
+            )
             diagnosis, remarks = refine_shapes(others, diagnose(others, base.values, settings))
             if diagnosis.verdict == "found":
                 return SlipDiagnosis(others, diagnosis, notes=(*stretch.notes, *remarks))
         return _slipping(trajectory, model, faults, settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
-        slipping = DiscSystem(trajectory, model, stretch=stretch, starts_in_slip=True, systematic=systematic)
+        slipping = DiscSystem(
+            trajectory, model, stretch=stretch, starts_in_slip=True, systematic=systematic, known=faults
+        )
         slipping.patience = rolling.patience
         alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
@@ -144,7 +148,7 @@ def _slips_slowly(
     numbers that do away with all of an EXCESS are not those of another effect.
     """
     slipping = DiscSystem(
-        trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=rolling.systematic
+        trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=rolling.systematic, known=faults
     )
     soon = slipping.hurried()
     try:
@@ -209,13 +213,17 @@ def _slipping(
 ) -> SlipDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     systematic = rolling.systematic
-    system = DiscSystem(trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
+    system = DiscSystem(
+        trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic, known=faults
+    )
     system.patience = rolling.patience
     crept: tuple[str, ...] = ()
     try:
         diagnosis = diagnose(system, system.start(faults), settings)
     except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
-        system = DiscSystem(trajectory, model, (), stretch=rolling.stretch, starts_in_slip=True, systematic=systematic)
+        system = DiscSystem(
+            trajectory, model, (), stretch=rolling.stretch, starts_in_slip=True, systematic=systematic, known=faults
+        )
         diagnosis, crept = diagnose(system, system.start(faults), settings), (CREEPS_BESIDE,)
     if not crept and diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
         later = _after_slip(rolling, faults, settings, onset, diagnosis)
@@ -251,6 +259,7 @@ def _after_slip(
             _without_slip(rolling),  # the beginning has shown that its law is not Coulomb's
             stretch=stretch,
             systematic=rolling.systematic,
+            known=faults,
         )
     except AnalysisError:
         return None

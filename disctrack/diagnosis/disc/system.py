@@ -108,6 +108,7 @@ class DiscSystem:
         starts_in_slip: bool = False,
         systematic: Systematic | None = None,
         freed: tuple[Candidate, ...] = (),
+        known: Values | None = None,
     ) -> None:
         """Model : declared disc, gravity and effects; the parameters of its effects are fitted along.
 
@@ -115,6 +116,7 @@ class DiscSystem:
         stretch : frames to take; those of `free_stretch` if not given
         starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
         freed : faults that are known to be there: every fit moves their quantities
+        known : faults of the measurement with their sizes: tolerances are about these
         systematic : sizes of the dots' systematic errors, that are fitted along as fields with these sizes as priors
         Raises AnalysisError.
         """
@@ -143,7 +145,7 @@ class DiscSystem:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
         of_faults = tuple(q for c in freed for q in c.quantities)
         fitted = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults)
-        sizes = tuple(self._sizes({q.name for q in fitted}))
+        sizes = tuple(self._sizes({q.name for q in fitted}, known or {}))
         # where the rim levelled the table, each recording has a plane of its own, and that is no fault to be found
         in_base = {q.name for q in (*of_slip, *of_faults, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
@@ -151,7 +153,7 @@ class DiscSystem:
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
         self.base = (*fitted, *sizes, *nuisances)
 
-    def _sizes(self, fitted: Set[str]) -> Iterator[Quantity]:
+    def _sizes(self, fitted: Set[str], known: Values) -> Iterator[Quantity]:
         """What the disc's sizes and its table may be off by, as priors: an effect is what goes beyond.
 
         Not those fitted anyway. The table's plane is known to its sigma, which the rig's covariance holds, but for what
@@ -170,8 +172,9 @@ class DiscSystem:
                 sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]
                 owner = () if candidate.name in of_table else q.belongs_to
                 if q.name not in fitted and sigma > 0:
-                    lower, upper = max(q.lower, -most), min(q.upper, most)
-                    yield replace(q, prior_sigma=sigma, lower=lower, upper=upper, belongs_to=owner)
+                    middle = known.get(q.name, q.null)
+                    lower, upper = max(q.lower, middle - most), min(q.upper, middle + most)
+                    yield replace(q, null=middle, prior_sigma=sigma, lower=lower, upper=upper, belongs_to=owner)
 
     def _nuisances(self) -> tuple[tuple[Quantity, ...], Array]:
         """Errors common to all frames, with priors, and their whitened columns (n, 4 m, k).

@@ -141,7 +141,7 @@ class DiscMember:
         self.declared: Declared = declared_model(trajectory, item.model)
         self.stretch: Stretch = free_stretch(trajectory)
         self.trajectory = trajectory
-        system = DiscSystem(trajectory, self.declared.model, stretch=self.stretch)
+        system = DiscSystem(trajectory, self.declared.model, stretch=self.stretch, known=self.declared.faults)
         systematic = find_systematic(system, self.noise)
         assumed = find_large(as_tracked, self.declared.model, systematic, self.declared.faults)
         if assumed is not None:
@@ -153,7 +153,13 @@ class DiscMember:
     def _prepare(self, systematic: Systematic) -> None:
         self.systematic = systematic
         if systematic != self.system.systematic:
-            self.system = DiscSystem(self.trajectory, self.declared.model, stretch=self.stretch, systematic=systematic)
+            self.system = DiscSystem(
+                self.trajectory,
+                self.declared.model,
+                stretch=self.stretch,
+                systematic=systematic,
+                known=self.declared.faults,
+            )
         system = self.system
         self.base = fit(system, system.base, system.start(self.declared.faults))
         if not self.base.converged:
