@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -72,8 +72,9 @@ def diagnose_trajectory(
     diagnosis, remarks = refine_shapes(system, diagnosis)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    if diagnosis.verdict == "found" and _doubtful(left):
-        diagnosis = _with_another_known(system, diagnosis)
+    kinds = _doubtful(left, system) if diagnosis.verdict == "found" else ()
+    if kinds:
+        diagnosis = _with_another_known(system, diagnosis, kinds)
         left = left_over(system, diagnosis.after, diagnosis.noise)
     learned, kept, also = _beyond_the_catalogue(system, diagnosis, left)
     parts = None
@@ -159,12 +160,23 @@ class _Beside:
     length: float  # chi-square with the price of its numbers, and of having been looked for
 
 
-def _doubtful(left: LeftOver | None) -> bool:
-    return left is not None and min(left.pose_p_value, left.other_p_value) < DOUBTFUL
+def _doubtful(left: LeftOver | None, system: DiscSystem) -> tuple[str, ...]:
+    """Of what kind an effect may be missing, although chi-square is that of noise.
+
+    One of the motion, where the poses' part is less like noise than that of one recording in twenty, and the numbers
+    that no pose takes do not show as much of it: what those show is the measurement's, and is in the poses as well. One
+    of the measurement also where those are, unless lenses or dots are seen to err in ways that no effect names.
+    """
+    if left is None:
+        return ()
+    of_all = left.other_p_value < DOUBTFUL
+    if left.pose_p_value < DOUBTFUL and not (of_all and left.as_in_all):
+        return ("motion", "measurement")
+    return ("measurement",) if of_all and not system.systematic.present else ()
 
 
-def _with_another_known(system: DiscSystem, diagnosis: Diagnosis) -> Diagnosis:
-    """With one more effect of the catalogue, where chi-square is that of noise and what is left is not.
+def _with_another_known(system: DiscSystem, diagnosis: Diagnosis, kinds: Collection[str]) -> Diagnosis:
+    """With one more effect of these kinds, where chi-square is that of noise and what is left is not.
 
     A law whose frequency or place was looked for took the place of all others, and none was tried beside it.
     """
@@ -173,7 +185,7 @@ def _with_another_known(system: DiscSystem, diagnosis: Diagnosis) -> Diagnosis:
         return diagnosis
     judged, fitted = _judged(diagnosis, system), diagnosis.after
     taken = {q.name for f in diagnosis.found for q in f.candidate.quantities}
-    others = [c for c in system.candidates if not (c.sought or c.threshold or taken & set(c.names))]
+    others = [c for c in system.candidates if c.kind in kinds and not (c.sought or c.threshold or taken & set(c.names))]
     rows = training_rows(system, settings.train_fraction)
     best = diagnosis
     for s in score_all(Linearisation(judged, fitted, others), others)[:TRIED_BESIDE]:
@@ -201,11 +213,12 @@ def _beyond_the_catalogue(
     """A law outside the catalogue if that describes the data better, for its length, than the catalogue does.
 
     Beside it the known effects that stay, and remarks on what describes the data as well. A single known effect has to
-    compete where what it leaves is less like noise than that of one recording in twenty: it may stand in for a law that
-    is not known. So may each of several, or all: the law is looked for in the place of all of them, and beside each.
+    compete where what it leaves of the motion is less like noise than that of one recording in twenty: it may stand in
+    for a law that is not known. So may each of several, or all: the law is looked for in the place of all of them, and
+    beside each.
     Faults of the measurement stay beside it, unless the law makes them idle: no force displaces a dot on the face.
     """
-    doubtful = _doubtful(left)
+    doubtful = "motion" in _doubtful(left, system)
     explained = diagnosis.verdict == "found"
     of_motion, faults = (
         tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)

@@ -4,6 +4,7 @@ The errors are sums of plane waves and random numbers (trials.imperfect); the di
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from disctrack.diagnosis import DiscSystem, diagnose_trajectory
 from disctrack.diagnosis.disc.left_over import LeftOver
 from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.disc.stretch import at_rest
-from disctrack.diagnosis.disc.systematic import find_systematic, noise_over_stated, with_noise_of_frames
+from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.diagnosis.engine.fit import fit
 from disctrack.diagnosis.engine.memory import inflation, long_run_variance
 from disctrack.diagnosis.engine.system import Quantity
+from disctrack.diagnosis.stage import _doubtful
 from disctrack.diagnosis.trials.imperfect import ORDINARY, Laboratory
 from disctrack.scene.description import CameraFault, Faults
 from tests.oracles.measured_disc import Unseen, measured
@@ -146,3 +148,21 @@ def test_what_is_left_is_the_motions_only_where_the_poses_hold_it():
     assert not LeftOver(1.1, 1.0, 0.5, 0.5, 36).of_the_motion
     assert LeftOver(1.3, 1.2, 1e-9, 1e-9, 36).of_the_measurement
     assert not LeftOver(9.0, 1.2, 1e-9, 1e-9, 36).of_the_measurement
+
+
+@pytest.mark.parametrize(
+    ("pose", "other", "p_pose", "p_other", "systematic", "kinds"),
+    [
+        (1.00, 1.00, 0.4, 0.6, Systematic(), ()),
+        (1.09, 0.99, 0.02, 1.0, Systematic(), ("motion", "measurement")),  # a groove that a tilt stands in for
+        (1.00, 1.03, 0.3, 4e-10, Systematic(), ("measurement",)),  # a misprint beside a shaken table
+        (1.22, 1.27, 0.4, 3e-4, Systematic(lens_px=0.008), ()),  # lenses with fields: nothing of the motion
+        (1.18, 1.18, 2e-3, 5e-3, Systematic(lens_px=0.008), ()),  # likewise, and seen in the poses
+        (1.80, 1.18, 2e-3, 5e-3, Systematic(lens_px=0.008), ("motion", "measurement")),
+    ],
+)
+def test_what_the_measurement_does_to_all_numbers_raises_no_doubt_about_the_motion(
+    pose, other, p_pose, p_other, systematic, kinds
+):
+    left = LeftOver(pose, other, p_pose, p_other, 36)
+    assert _doubtful(left, SimpleNamespace(systematic=systematic)) == kinds

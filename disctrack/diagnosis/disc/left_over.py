@@ -37,15 +37,18 @@ class LeftOver:
     @property
     def of_the_motion(self) -> bool:
         """Do the poses hold more than noise, and more than what the measurement is seen to do to all numbers?"""
-        if self.pose_p_value >= LEVEL:
-            return False
-        return self.pose_chi_square - 1.0 > LIKE * max(self.other_chi_square - 1.0, 0.0)
+        return self.pose_p_value < LEVEL and not self.as_in_all
+
+    @property
+    def as_in_all(self) -> bool:
+        """Do the numbers that no pose takes exceed the noise as the poses do?"""
+        return self.pose_chi_square - 1.0 <= LIKE * max(self.other_chi_square - 1.0, 0.0)
 
     @property
     def of_the_measurement(self) -> bool:
         """Is there more than noise, but as much in the numbers that no pose takes, and not much in all?"""
         excess = self.other_chi_square - 1.0
-        return 0.05 < excess < MUCH and self.pose_chi_square - 1.0 <= LIKE * excess
+        return 0.05 < excess < MUCH and self.as_in_all
 
 
 def left_over(system: DiscSystem, fit: Fit, noise: float) -> LeftOver | None:
