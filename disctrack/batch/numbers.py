@@ -68,7 +68,7 @@ def friction_numbers(trajectory: Trajectory) -> Numbers:
     try:
         declared = declared_model(trajectory)
         system = DiscSystem(trajectory, declared.model, candidates=(), known=declared.faults)
-        found = fit(system, system.base, system.start(declared.faults))
+        found = fit(system, system.base, system.start())
     except AnalysisError as error:
         return nothing | {"k_m_undetermined": str(error)}
     if not found.converged:

@@ -117,8 +117,8 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
 def test_what_rolls_at_first_does_not_begin_in_slip(effects):
     trajectory = measured(effects, seed=100, n=150, theta_deg=20.0)
     system = DiscSystem(trajectory, PAPER)
-    assert fit(system, system.base, system.start({})).reduced_chi_square > slip_start.EXCESS
-    assert not slip_start._slips_slowly(trajectory, PAPER, {}, Settings(), system)
+    assert fit(system, system.base, system.start()).reduced_chi_square > slip_start.EXCESS
+    assert not slip_start._slips_slowly(Settings(), system)
 
 
 def test_slip_to_the_end_of_the_recording_is_found_too():

@@ -169,16 +169,14 @@ def _assumed(trajectory: Trajectory, model: Model, names: tuple[str, ...], stati
         stretch = free_stretch(seen)
     except AnalysisError:
         return None
-    systematic = find_systematic(
-        DiscSystem(seen, model, stretch=stretch, known=static.values), noise, static.values, beside=names
-    )
     known = static.values
+    systematic = find_systematic(DiscSystem(seen, model, stretch=stretch, known=known), noise, known, beside=names)
     system = DiscSystem(seen, model, stretch=stretch, systematic=systematic, freed=candidates, known=known)
-    base = fit(system, system.base, system.start(known))
+    base = fit(system, system.base, system.start())
     return Assumed(system, base, candidates, static.gain) if np.isfinite(base.cost) else None
 
 
-def find_clock(system: DiscSystem, known: Values) -> Assumed | None:
+def find_clock(system: DiscSystem) -> Assumed | None:
     """The same with the frame rate that the precession asks for; None where it is the declared one."""
     speed = precession_over_steady(system)
     if STEADY[0] < speed < STEADY[1]:
@@ -186,15 +184,8 @@ def find_clock(system: DiscSystem, known: Values) -> Assumed | None:
     (candidate,) = (f.candidate() for f in faults_of(system.disc) if f.name == "frame_rate")
     (q,) = candidate.quantities
     change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q.lower, q.upper))
-    freed = DiscSystem(
-        system.trajectory,
-        system.model,
-        stretch=system.stretch,
-        systematic=system.systematic,
-        freed=(candidate,),
-        known=known,
-    )
-    base = fit(freed, freed.base, freed.start(dict(known) | {q.name: change}))
+    freed = system.again(freed=(candidate,), known={**system.known, q.name: change})
+    base = fit(freed, freed.base, freed.start())
     return Assumed(freed, base, (candidate,), np.inf) if base.converged else None
 
 

@@ -333,9 +333,8 @@ def learn(
             worth = [p for p, it in zip(worth, left, strict=True) if it < to_beat[bool(p.family.shape)]]
         begin = current if law is not None or along is None else _with_base_only(base, along)
         chosen = _various(worth, scan.chi_square, noise, price)
-        if np.isfinite(
-            rival
-        ):  # what fits as well in more numbers is not named, but counts in what is known of the force
+        if np.isfinite(rival):
+            # what fits as well in more numbers is not named, but counts in what is known of the force
             kinds = {p.family.kind for p in chosen}
             longer = sorted((p for p in worth if p.family.kind not in kinds), key=lambda p: -p.gain)
             chosen += longer[:LONGER]

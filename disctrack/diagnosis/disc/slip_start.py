@@ -82,77 +82,57 @@ def diagnose_motion(
         return _with_large(assumed, settings)
     if systematic != rolling.systematic:
         rolling = DiscSystem(trajectory, model, stretch=stretch, systematic=systematic, known=faults)
-    base = fit(rolling, rolling.base, rolling.start(faults))
+    base = fit(rolling, rolling.base, rolling.start())
     if not base.converged:
-        assumed = find_clock(rolling, faults)
+        assumed = find_clock(rolling)
         if assumed is not None:
             return _with_large(assumed, settings)
     rolling.patience = Patience(MOST_SLIP_STEPS * len(rolling.time))
     try:
-        answer = _rolling_or_slipping(trajectory, model, faults, settings, rolling, base)
+        answer = _rolling_or_slipping(settings, rolling, base)
         answer.system.patience.without_end()
         return answer
     except GivenUp:
         # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
-        others = _without_slip(rolling)
-        rolling = DiscSystem(trajectory, model, others, stretch=stretch, systematic=rolling.systematic, known=faults)
+        rolling = rolling.again(_without_slip(rolling))
         notes = (*stretch.notes, CREEPS)
         return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=notes)
 
 
-def _rolling_or_slipping(
-    trajectory: Trajectory,
-    model: Model,
-    faults: Mapping[str, float],
-    settings: Settings,
-    rolling: DiscSystem,
-    base: Fit,
-) -> SlipDiagnosis:
+def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> SlipDiagnosis:
     """The diagnosis of a motion without large faults. Raises GivenUp where slip would take too long to follow."""
-    stretch, systematic = rolling.stretch, rolling.systematic
+    trajectory, stretch = rolling.trajectory, rolling.stretch
     large = not base.reduced_chi_square <= EXCESS * noise_variance(rolling, base)
-    if large and _slips_slowly(trajectory, model, faults, settings, rolling):
-        return _slipping(trajectory, model, faults, settings, rolling, base, None)
+    if large and _slips_slowly(settings, rolling):
+        return _slipping(settings, rolling, base, None)
     may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
     onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
         if _contact_lies_elsewhere(rolling, base):
-            others = DiscSystem(
-                trajectory, model, _without_slip(rolling), stretch=stretch, systematic=systematic, known=faults
-            )
+            others = rolling.again(_without_slip(rolling))
             diagnosis, remarks = refine_shapes(others, diagnose(others, base.values, settings))
             if diagnosis.verdict == "found":
                 return SlipDiagnosis(others, diagnosis, notes=(*stretch.notes, *remarks))
-        return _slipping(trajectory, model, faults, settings, rolling, base, onset)
+        return _slipping(settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
-        slipping = DiscSystem(
-            trajectory, model, stretch=stretch, starts_in_slip=True, systematic=systematic, known=faults
-        )
+        slipping = rolling.again(starts_in_slip=True)
         slipping.patience = rolling.patience
-        alone = fit(slipping, slipping.base, slipping.start(faults), MAX_ITERATIONS)
+        alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
-            return _slipping(trajectory, model, faults, settings, rolling, base, onset)
+            return _slipping(settings, rolling, base, onset)
     return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
 
 
-def _slips_slowly(
-    trajectory: Trajectory,
-    model: Model,
-    faults: Mapping[str, float],
-    settings: Settings,
-    rolling: DiscSystem,
-) -> bool:
+def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     """Does slip over the first frames bring a residual far above the noise down to it?
 
     Friction below what rolling needs holds the contact's velocity at mm/s, which no first poses show; a fit does. Three
     numbers that do away with all of an EXCESS are not those of another effect.
     """
-    slipping = DiscSystem(
-        trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=rolling.systematic, known=faults
-    )
+    slipping = rolling.again(starts_in_slip=True)
     soon = slipping.hurried()
     try:
-        alone = fit(soon, soon.base, soon.start(faults), MAX_ITERATIONS)
+        alone = fit(soon, soon.base, soon.start(), MAX_ITERATIONS)
         if not _at_noise(soon, alone, settings):
             return False
     except GivenUp:
@@ -202,31 +182,18 @@ def _onset(trajectory: Trajectory, stretch: Stretch) -> RollingOnset | None:
         return None
 
 
-def _slipping(
-    trajectory: Trajectory,
-    model: Model,
-    faults: Mapping[str, float],
-    settings: Settings,
-    rolling: DiscSystem,
-    base: Fit,
-    onset: RollingOnset | None,
-) -> SlipDiagnosis:
+def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> SlipDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
-    systematic = rolling.systematic
-    system = DiscSystem(
-        trajectory, model, stretch=rolling.stretch, starts_in_slip=True, systematic=systematic, known=faults
-    )
+    system = rolling.again(starts_in_slip=True)
     system.patience = rolling.patience
     crept: tuple[str, ...] = ()
     try:
-        diagnosis = diagnose(system, system.start(faults), settings)
+        diagnosis = diagnose(system, system.start(), settings)
     except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
-        system = DiscSystem(
-            trajectory, model, (), stretch=rolling.stretch, starts_in_slip=True, systematic=systematic, known=faults
-        )
-        diagnosis, crept = diagnose(system, system.start(faults), settings), (CREEPS_BESIDE,)
+        system = rolling.again((), starts_in_slip=True)
+        diagnosis, crept = diagnose(system, system.start(), settings), (CREEPS_BESIDE,)
     if not crept and diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
-        later = _after_slip(rolling, faults, settings, onset, diagnosis)
+        later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
             return later
     if diagnosis.held_out_after is None or not _declares(system):
@@ -244,27 +211,17 @@ def _declares(system: DiscSystem) -> bool:
 
 
 def _after_slip(
-    rolling: DiscSystem,
-    faults: Mapping[str, float],
-    settings: Settings,
-    onset: RollingOnset,
-    slipping: Diagnosis,
+    settings: Settings, rolling: DiscSystem, onset: RollingOnset, slipping: Diagnosis
 ) -> SlipDiagnosis | None:
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
         stretch = free_stretch(rolling.trajectory, onset.high)
-        system = DiscSystem(
-            rolling.trajectory,
-            rolling.model,
-            _without_slip(rolling),  # the beginning has shown that its law is not Coulomb's
-            stretch=stretch,
-            systematic=rolling.systematic,
-            known=faults,
-        )
+        # the beginning has shown that its law is not Coulomb's
+        system = rolling.again(_without_slip(rolling), stretch=stretch)
     except AnalysisError:
         return None
     system.patience = rolling.patience
-    diagnosis = diagnose(system, system.start(faults), settings)
+    diagnosis = diagnose(system, system.start(), settings)
     if diagnosis.verdict == "unexplained":
         return None
     left = f"chi-square {slipping.after.reduced_chi_square:.3g}" if slipping.after.converged else "no fit"

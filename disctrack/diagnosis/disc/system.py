@@ -116,12 +116,13 @@ class DiscSystem:
         stretch : frames to take; those of `free_stretch` if not given
         starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
         freed : faults that are known to be there: every fit moves their quantities
-        known : faults of the measurement with their sizes: tolerances are about these
+        known : faults of the measurement that are held at these values; tolerances are about them
         systematic : sizes of the dots' systematic errors, that are fitted along as fields with these sizes as priors
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
         self.patience = Patience()
+        self.known = dict(known or {})
         self.stretch = stretch or free_stretch(trajectory)
         self.starts_in_slip = starts_in_slip
         rows = self.stretch.rows
@@ -145,7 +146,7 @@ class DiscSystem:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
         of_faults = tuple(q for c in freed for q in c.quantities)
         fitted = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults)
-        sizes = tuple(self._sizes({q.name for q in fitted}, known or {}))
+        sizes = tuple(self._sizes({q.name for q in fitted}))
         # where the rim levelled the table, each recording has a plane of its own, and that is no fault to be found
         in_base = {q.name for q in (*of_slip, *of_faults, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
@@ -153,7 +154,7 @@ class DiscSystem:
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
         self.base = (*fitted, *sizes, *nuisances)
 
-    def _sizes(self, fitted: Set[str], known: Values) -> Iterator[Quantity]:
+    def _sizes(self, fitted: Set[str]) -> Iterator[Quantity]:
         """What the disc's sizes and its table may be off by, as priors: an effect is what goes beyond.
 
         Not those fitted anyway. The table's plane is known to its sigma, which the rig's covariance holds, but for what
@@ -172,7 +173,7 @@ class DiscSystem:
                 sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]
                 owner = () if candidate.name in of_table else q.belongs_to
                 if q.name not in fitted and sigma > 0:
-                    middle = known.get(q.name, q.null)
+                    middle = self.known.get(q.name, q.null)
                     lower, upper = max(q.lower, middle - most), min(q.upper, middle + most)
                     yield replace(q, null=middle, prior_sigma=sigma, lower=lower, upper=upper, belongs_to=owner)
 
@@ -263,14 +264,32 @@ class DiscSystem:
             sizes, pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 
-    def start(self, known: Values | None = None) -> dict[str, float]:
-        """Values of the base quantities from the measured poses, good enough for Gauss-Newton.
-
-        known : faults of the measurement that are held at these values
-        """
+    def start(self) -> dict[str, float]:
+        """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
         from disctrack.diagnosis.disc.start import start_values
 
-        return start_values(self, known or {})
+        return start_values(self, self.known)
+
+    def again(
+        self,
+        candidates: tuple[Candidate, ...] | None = None,
+        *,
+        stretch: Stretch | None = None,
+        starts_in_slip: bool = False,
+        freed: tuple[Candidate, ...] = (),
+        known: Values | None = None,
+    ) -> DiscSystem:
+        """Another question to the same recording and model, with the same systematic errors."""
+        return DiscSystem(
+            self.trajectory,
+            self.model,
+            candidates,
+            stretch=stretch or self.stretch,
+            starts_in_slip=starts_in_slip,
+            systematic=self.systematic,
+            freed=freed,
+            known=self.known if known is None else known,
+        )
 
     def first_part(self, duration: float) -> DiscSystem:
         """The same system with the frames of the first `duration` [s] only."""

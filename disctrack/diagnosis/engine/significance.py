@@ -31,6 +31,14 @@ def as_sigmas(gain: float, n: int) -> float:
     return float(-special.ndtri_exp(log_tail(gain, n) - np.log(2.0))) if gain > 0 else 0.0
 
 
+def wald(amounts: Array, covariance: Array) -> float:
+    """Gain a' C^-1 a of amounts a (k,) with covariance C (k, k); what has no variance gains nothing (Wald 1943)."""
+    sigma = np.sqrt(np.diag(covariance))
+    safe = np.where(sigma > 0, sigma, np.inf)  # a number at its bound, or that the data do not show, tells nothing
+    inverse = np.linalg.pinv(covariance / np.outer(safe, safe), rcond=1e-10, hermitian=True)
+    return float((amounts / safe) @ inverse @ (amounts / safe))
+
+
 def false_discovery(p_values: Sequence[float]) -> Array:
     """For each of many p values, the share of false ones among all that are as small (Benjamini and Hochberg 1995).
 

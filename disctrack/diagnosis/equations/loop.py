@@ -13,6 +13,7 @@ from disctrack.diagnosis.engine.fit import Fit, compress, fit
 from disctrack.diagnosis.engine.held_out import held_out
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.engine.shape import refine_shapes
+from disctrack.diagnosis.engine.significance import wald
 from disctrack.diagnosis.engine.system import System
 from disctrack.diagnosis.equations import terms as library
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
@@ -164,9 +165,11 @@ def _sharp_enough(system: EquationSystem, fitted: Fit) -> EquationSystem:
 
     A thousandth of what jumps is much where a ball's contact is as short, or where a motion starts from rest.
     """
-    first, residual = system.widths, system.linearise(fitted.values, [])[0]
-    share = 1.0
-    while first and np.isfinite(fitted.chi_square) and share > SHARPEST:
+    first, share = system.widths, 1.0
+    if not first or not np.isfinite(fitted.chi_square):
+        return system
+    residual = system.linearise(fitted.values, [])[0]
+    while share > SHARPEST:
         share *= SHARPER
         sharper = system.with_(widths={name: share * w for name, w in first.items()})
         moved = residual - (residual := sharper.linearise(fitted.values, [])[0])
@@ -363,11 +366,7 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diag
 def _wald(names: Sequence[str], fitted: Fit) -> float:
     """Square of the distance from nought in standard deviations, of numbers that move together."""
     here = [fitted.names.index(n) for n in names]
-    sigma = np.sqrt(np.diag(fitted.covariance)[here])
-    safe = np.where(sigma > 0, sigma, np.inf)  # a number at its bound tells nothing
-    values = np.array([fitted.values[n] for n in names]) / safe
-    correlation = fitted.covariance[np.ix_(here, here)] / np.outer(safe, safe)
-    return float(values @ np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) @ values)
+    return wald(np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(here, here)])
 
 
 def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:

@@ -161,7 +161,7 @@ class DiscMember:
                 known=self.declared.faults,
             )
         system = self.system
-        self.base = fit(system, system.base, system.start(self.declared.faults))
+        self.base = fit(system, system.base, system.start())
         if not self.base.converged:
             raise AnalysisError(
                 f"the rolling model cannot be fitted to it alone (chi-square {self.base.reduced_chi_square:.3g})"

@@ -22,6 +22,7 @@ from scipy import stats
 
 from disctrack.diagnosis import DiscDiagnosis, diagnose_trajectory
 from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.significance import wald
 from disctrack.diagnosis.engine.system import Values
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted, hidden_effect
 from disctrack.diagnosis.trials.recordings import Unseen, measured
@@ -216,10 +217,7 @@ def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> tuple[floa
         assert candidate is not None
         index = [joint.names.index(n) for n in candidate.names]
         amount = np.array([part.truth.get(q.name, q.null) - q.null for q in candidate.quantities])
-        size = np.sqrt(np.diag(joint.covariance)[index])
-        seen = np.where(size > 0, size, np.inf)  # no variance where the data show nothing
-        inverse = np.linalg.pinv(joint.covariance[np.ix_(index, index)] / np.outer(seen, seen), hermitian=True)
-        sigmas = float(np.sqrt((amount / seen) @ inverse @ (amount / seen) / d.noise))
+        sigmas = float(np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise))
         needed = stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index))
         found.append((sigmas, float(np.sqrt(needed))))
     return min(found, key=lambda one: one[0] / one[1])
