@@ -18,7 +18,7 @@ def causes(rig: StereoRig, shift: Array, further: Mapping[str, Array] | None = N
     """
 
     def variance(C: Array) -> Array:
-        found: Array = np.einsum("nkp,pq,nkq->k", shift, C, shift) / len(shift)
+        found: Array = np.einsum("nkp,nkp->k", shift @ C, shift) / len(shift)
         return found
 
     parts: dict[str, Array] = {}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
@@ -23,6 +25,7 @@ from disctrack.track.least_squares import step_to_minimum
 from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
+from disctrack.track.side_by_side import side_by_side
 from disctrack.track.slips import slips_in_words
 from disctrack.track.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -78,19 +81,24 @@ class Taken:
     gravity: float  # [m/s^2]
 
 
-def assemble(followers: list[Follower], tables: Tables, settings: TrackingSettings, taken: Taken) -> Tracking:
-    """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds."""
+def assemble(
+    followers: list[Follower], tables: Tables, settings: TrackingSettings, taken: Taken, workers: int = 1
+) -> Tracking:
+    """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds.
+
+    workers : threads; the result is the same to the last bit for any number of them
+    """
     if any(settings.exposure):  # which frames to trust with the acceleration is known when all have been judged
         unmoved = replace(settings, exposure=(0.0, 0.0))
-        blurred = assemble(followers, deepcopy(tables), unmoved, taken)
+        blurred = assemble(followers, deepcopy(tables), unmoved, taken, workers)
         tables.pixels -= shift_by_exposure(blurred.trajectory, settings.exposure)
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
     _clean(tables, repeated, first.setup.rig)
-    as_built, faults, outlying = _shared(tables, first.setup, settings)
-    fits = _fit_all(tables, as_built, settings.reject_outliers)
+    as_built, faults, outlying = _shared(tables, first.setup, settings, workers)
+    fits = _fit_all(tables, as_built, settings.reject_outliers, workers)
     fits, systematic, scatter = _scattered(fits, tables, faults, outlying)
-    fits, verdicts, slips = _judged(fits, tables, as_built, repeated, outlying, taken)
+    fits, verdicts, slips = _judged(fits, tables, as_built, repeated, outlying, taken, workers)
     fits, systematic, as_built, table = _on_the_table(fits, systematic, as_built, settings.table)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
     poses = scatter_of_poses(fits)
@@ -132,32 +140,32 @@ def _clean(tables: Tables, repeated: Mask, rig: StereoRig) -> None:
 
 
 def _shared(
-    tables: Tables, setup: TrackingSetup, settings: TrackingSettings
+    tables: Tables, setup: TrackingSetup, settings: TrackingSettings, workers: int
 ) -> tuple[AsBuilt, SharedFaults | None, Mask]:
     """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
-    outlying = _outlying(tables, setup.rig, setup.disc)
-    as_built, faults = _refined(tables, setup, settings, outlying)
+    outlying = _outlying(tables, setup.rig, setup.disc, workers)
+    as_built, faults = _refined(tables, setup, settings, outlying, workers)
     if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
         centres = setup.disc.marker_centres_body + faults.marker_shift
-        more = _outlying(tables, setup.rig, replace(setup.disc, marker_centres_body=centres)) & ~outlying
+        more = _outlying(tables, setup.rig, replace(setup.disc, marker_centres_body=centres), workers) & ~outlying
         if more.any():
             outlying |= more
-            as_built, faults = _refined(tables, setup, settings, outlying)
+            as_built, faults = _refined(tables, setup, settings, outlying, workers)
     if settings.refine_markers and faults is not None:
         as_built = _without_false_shifts(as_built, setup.rig, setup.disc, faults)
     return as_built, faults, outlying
 
 
 def _refined(
-    tables: Tables, setup: TrackingSetup, settings: TrackingSettings, outlying: Mask
+    tables: Tables, setup: TrackingSetup, settings: TrackingSettings, outlying: Mask, workers: int
 ) -> tuple[AsBuilt, SharedFaults | None]:
     """Dots and rig as built, and the faults that frames share, from those that are not outlying (n,)."""
     R, t = (np.where(outlying.reshape(-1, *[1] * (part.ndim - 1)), np.nan, part) for part in (tables.R, tables.t))
     seen = tables.pixels, tables.covariance_px2, setup.rig, setup.disc, R, t
-    as_built = refine_as_built(
-        *seen, refine_markers=settings.refine_markers, refine_rig=settings.refine_rig, max_frames=SHARED_FRAMES
-    )
-    return as_built, without_shared_faults(*seen, max_frames=SHARED_FRAMES)
+    as_built = partial(refine_as_built, refine_markers=settings.refine_markers, refine_rig=settings.refine_rig)
+    refinements: tuple[Callable[..., Any], ...] = (without_shared_faults, as_built)  # the longer one first
+    faults, built = side_by_side(lambda refine: refine(*seen, max_frames=SHARED_FRAMES), refinements, workers)
+    return built, faults
 
 
 def _scattered(
@@ -177,12 +185,12 @@ def _scattered(
 
 
 def _judged(
-    fits: PoseFits, tables: Tables, as_built: AsBuilt, repeated: Mask, outlying: Mask, taken: Taken
+    fits: PoseFits, tables: Tables, as_built: AsBuilt, repeated: Mask, outlying: Mask, taken: Taken, workers: int
 ) -> tuple[PoseFits, Verdicts, tuple[str, ...]]:
     """Poses without those that are refused, what each is worth, and exchanged images in words."""
     struck = (np.isfinite(tables.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
     verdicts = judge_poses(
-        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / taken.frame_rate, as_built.disc.radius
+        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / taken.frame_rate, as_built.disc.radius, workers
     )
     contradicted = verdicts.status == FrameStatus.CONTRADICTED
     centres = as_built.disc.marker_centres_body
@@ -205,11 +213,12 @@ def _on_the_table(
     return fits, systematic, replace(as_built, rig=rig), table
 
 
-def _outlying(tables: Tables, rig: StereoRig, disc: Disc) -> Mask:
+def _outlying(tables: Tables, rig: StereoRig, disc: Disc, workers: int) -> Mask:
     """(n,) True where the dots miss the pose that was tracked, after one more step, by far more than in others."""
     n = len(tables.t)
     residuals = np.full(tables.pixels.shape, np.nan)
-    for first in range(0, n, FITTED_AT_ONCE):
+
+    def fill(first: int) -> None:
         rows = slice(first, first + FITTED_AT_ONCE)
         r, J, known = misses(
             tables.pixels[rows],
@@ -221,6 +230,8 @@ def _outlying(tables: Tables, rig: StereoRig, disc: Disc) -> Mask:
         )
         step = step_to_minimum(r.reshape(len(r), -1), J.reshape(len(J), -1, 6))
         residuals[rows] = np.where(known[..., None], r - (J @ step[:, None, None, :, None])[..., 0], np.nan)
+
+    side_by_side(fill, range(0, n, FITTED_AT_ONCE), workers)
     return outlying_frames(residuals)
 
 
@@ -234,12 +245,11 @@ def _without_false_shifts(as_built: AsBuilt, rig: StereoRig, declared: Disc, fau
     return replace(as_built, rig=rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
 
 
-def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFits:
-    """The poses of all frames, some thousands at a time: what a fit needs beside its result is five times as large."""
-    n, whole = len(tables.t), dict[str, NDArray]()
-    for first in range(0, n, FITTED_AT_ONCE):
-        rows = slice(first, first + FITTED_AT_ONCE)
-        part = fit_poses(
+def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool, workers: int = 1) -> PoseFits:
+    """The poses of all frames, some hundreds at a time: what a fit needs beside its result is five times as large."""
+
+    def fitted(rows: slice) -> PoseFits:
+        return fit_poses(
             tables.pixels[rows],
             tables.covariance_px2[rows],
             as_built.rig,
@@ -248,10 +258,16 @@ def _fit_all(tables: Tables, as_built: AsBuilt, reject_outliers: bool) -> PoseFi
             tables.t[rows],
             reject_outliers=reject_outliers,
         )
-        for name, value in vars(part).items():
-            if name not in whole:
-                whole[name] = np.empty((n, *value.shape[1:]), value.dtype)
+
+    n, one = len(tables.t), vars(fitted(slice(0, 1)))
+    whole = {name: np.empty((n, *value.shape[1:]), value.dtype) for name, value in one.items()}
+
+    def fill(first: int) -> None:
+        rows = slice(first, first + FITTED_AT_ONCE)
+        for name, value in vars(fitted(rows)).items():
             whole[name][rows] = value
+
+    side_by_side(fill, range(0, n, FITTED_AT_ONCE), workers)
     return PoseFits(**whole)
 
 

@@ -346,7 +346,7 @@ def _digests(images: Image) -> NDArray[np.uint32]:
         rows = np.ascontiguousarray(images[some, :, ::16])
         words = rows.reshape(*rows.shape[:2], -1).view(np.uint8)
         words = words[..., : words.shape[-1] // 8 * 8].view(np.uint64)
-        digests[some] = (words * _odd_numbers(words.shape[-1])).sum(axis=-1) >> np.uint64(32)
+        digests[some] = words @ _odd_numbers(words.shape[-1]) >> np.uint64(32)
     return np.maximum(digests, 1)
 
 

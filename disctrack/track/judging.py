@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from calibration.arrays import Array, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.least_squares import chance_beyond
 from disctrack.track.pose import PoseFits
+from disctrack.track.side_by_side import side_by_side
 from disctrack.trajectory import FrameStatus
 
 FEW = 4  # frames beside a cut that tell how large the misfit is there
@@ -169,12 +172,13 @@ def judge_poses(
     outlying: Mask,
     period: float,
     radius: float,
+    workers: int = 1,
 ) -> Verdicts:
     """Judge every pose by its residuals and by the motion of its neighbours.
 
     fits : with the covariances and chi-squares scaled as they will be told; repeated (n,): both images are those of a
     frame before; struck (n,): dots left out as outliers; outlying (n,): frames by which no other is to be judged;
-    period [s] of the frames; radius [m] of the disc
+    period [s] of the frames; radius [m] of the disc; workers: threads
     """
     status = np.full(len(struck), FrameStatus.MEASURED, np.uint8)
     freedom = fits.degrees_of_freedom
@@ -191,8 +195,9 @@ def judge_poses(
     rest = _at_rest(fits)
     lost = repeated & ~_still_over_the_repeats(repeated, rest)
     good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
-    one_sided = [departure(good, weights) for weights in (FROM_BEFORE, FROM_AFTER)]
-    both = departure(good, FROM_BOTH)
+    ways = (partial(departure, weights=weights) for weights in (FROM_BEFORE, FROM_AFTER, FROM_BOTH))
+    asked: tuple[Callable[[PoseFits], Any], ...] = (*ways, partial(torn_off, period=period, radius=radius))
+    *one_sided, both, torn = side_by_side(lambda judge: judge(good), asked, workers)
     nearest = np.fmin(*one_sided)
     moved = nearest / _quiet(nearest, rest)
     # next to an end or a gap, a quadratic is all there is, and it follows a slow camera's frames far worse
@@ -200,7 +205,7 @@ def judge_poses(
     moved = np.where(np.isnan(both), moved, inner / _quiet(inner, rest))
     with np.errstate(invalid="ignore"):
         jumped = moved > _OF_SIX[CHANCE] * 2.0  # the smallest of three, in motion that is not quite steady
-    status[jumped | torn_off(good, period, radius)] = FrameStatus.JUMPED
+    status[jumped | torn] = FrameStatus.JUMPED
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
     status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge

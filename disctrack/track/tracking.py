@@ -130,14 +130,14 @@ def track(
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     taken = Taken(pairs, np.asarray(timestamps, float), frame_rate, gravity)
-    tracking = assemble(followers, tables, settings, taken)
+    tracking = assemble(followers, tables, settings, taken, workers)
     found = tracking.trajectory.disc
     if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not tracking.doubts:
         again = replace(setup, disc=found)
         followers, tables = _followed(read_blocks, edges, again, settings, workers, lambda n: None)
         for follower in followers:
             follower.setup = setup
-        tracking = assemble(followers, tables, settings, taken)
+        tracking = assemble(followers, tables, settings, taken, workers)
     tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
     status = tracking.trajectory.frame_status
     one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)

@@ -264,7 +264,7 @@ def two_cores(table: Table, action: Callable[[], object], n: int, processor: flo
     serial, shared = min(alone), min(all_threads)
     rate = 1 / (serial + shared / 2)
     print(f"  two threads: {1e6 * serial:.0f} us by one of them alone, {1e6 * shared:.0f} us shared; on two free cores")
-    print(f"  {rate:.0f} pairs/s, by two processes that know nothing of each other {2 / processor:.0f}")
+    print(f"  at most {rate:.0f} pairs/s, by two processes that know nothing of each other {2 / processor:.0f}")
     table.figures |= {"two cores, by one thread alone: us": 1e6 * serial, "two cores, shared: us": 1e6 * shared}
 
 

@@ -1,6 +1,7 @@
 """What must not grow with the length of a recording, and where a long one is cut."""
 
 import tracemalloc
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,12 @@ from numpy.testing import assert_array_equal
 from disctrack import frames
 from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.track.as_printed import AsBuilt
-from disctrack.track.assembly import _fit_all
-from disctrack.track.following import empty_tables
+from disctrack.track.assembly import Taken, TrackingSettings, _fit_all, assemble
+from disctrack.track.dots import NoiseModel, TemplateLimits
+from disctrack.track.following import Follower, Law, TrackingSetup, empty_tables
+from disctrack.track.pose import marker_pixels
 from disctrack.track.tracking import MOST_STRETCHES, stretch_edges
+from disctrack.trajectory import FrameStatus
 
 
 @pytest.mark.parametrize(
@@ -84,3 +88,42 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
         beside.append(peak - sum(value.nbytes for value in vars(fits).values()))
     # three times the frames; before they were fitted in parts it was three times the memory
     assert beside[1] < 1.2 * beside[0]
+
+
+def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_pairs, rng, monkeypatch):
+    monkeypatch.setattr("disctrack.track.assembly.FITTED_AT_ONCE", 50)
+    rig, disc, m, n = rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.disc.n_markers, 230
+    times = np.arange(n) / 1000.0
+    angles = np.stack([0.1 + 9.0 * times, np.full(n, 0.35), 0.2 - 8.0 * times])
+    R = frames.rotation_from_euler(*angles)
+    t = rendered_pairs.q[0, :3] + 1e-3 * np.stack([np.cos(angles[0]), np.sin(angles[0]), 0.0 * times], axis=1)
+    sigma, printed = 0.004, disc.marker_centres_body + 20e-6 * rng.standard_normal((m, 3)) * [1, 1, 0]
+    pixels = marker_pixels(R, t, rig, printed)[0]
+    pixels += sigma * rng.standard_normal(pixels.shape)
+    pixels[100, 1, 2] += 3.0  # a dot to be struck
+    pixels[160:163, 0] += 0.1  # frames to be refused
+    made = replace(
+        empty_tables(n, m),
+        covariance_px2=np.tile(sigma**2 * np.eye(2), (n, 2, m, 1, 1)),
+        misfit=np.ones((n, 2, m), np.float32),
+        n_pixels=np.full((n, 2, m), 300.0, np.float32),
+        status=np.zeros((n, 2, m), np.uint8),
+        frame_status=np.full(n, FrameStatus.MEASURED, np.uint8),
+    )
+    setup = TrackingSetup(rig, disc, TemplateLimits(), *np.zeros((2, 2, 1, 1)))
+    taken = Taken(range(n), times, 1000.0, 9.81)
+
+    def by(workers, pixels=pixels):
+        follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
+        tables = replace(deepcopy(made), pixels=pixels.copy(), R=R.copy(), t=t.copy())
+        return assemble([follower], tables, TrackingSettings(exposure=(1e-4, 1e-4)), taken, workers)
+
+    one, three = by(1), by(3)
+    assert (one.trajectory.frame_status != FrameStatus.MEASURED).any()
+    assert np.abs(one.as_built.marker_shift).max() > 5e-6
+    for name, value in vars(one.trajectory).items():
+        if isinstance(value, np.ndarray):
+            assert value.tobytes() == getattr(three.trajectory, name).tobytes(), name
+    assert (one.warnings, one.doubts, one.shared_sigma) == (three.warnings, three.doubts, three.shared_sigma)
+    other = by(3, np.nextafter(pixels, np.inf))  # what one unit in the last place does is seen
+    assert other.trajectory.q.tobytes() != one.trajectory.q.tobytes()
