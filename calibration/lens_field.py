@@ -57,7 +57,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
         whole = [A.T @ A for A, _ in parts]
         rhs = [A.T @ r for A, r in parts]
         n_other = len(rhs[0]) - n_field
-        gains = [_held_out_gain(parts, whole, rhs, n_other, sigma) for sigma in PRIORS_PX]
+        gains = _held_out_gains(parts, whole, rhs, n_other, PRIORS_PX)
         gain, error = max(gains)
         sigma = PRIORS_PX[gains.index((gain, error))]
         solution = _solved(np.sum(whole, axis=0), np.sum(rhs, axis=0), n_other, sigma)
@@ -120,20 +120,21 @@ def _solved(matrix: Array, rhs: Array, n_other: int, sigma: float) -> Array:
     return solution
 
 
-def _held_out_gain(
-    parts: list[tuple[Array, Array]], whole: list[Array], rhs: list[Array], n_other: int, sigma: float
-) -> tuple[float, float]:
-    """Part of the chi-square of views left out that the field takes away, and its standard error."""
+def _held_out_gains(
+    parts: list[tuple[Array, Array]], whole: list[Array], rhs: list[Array], n_other: int, priors: tuple[float, ...]
+) -> list[tuple[float, float]]:
+    """Part of the chi-square of views left out that the field takes away, and its standard error, for each prior."""
     views = np.arange(len(parts))
-    without, gained = np.zeros(len(parts)), np.zeros(len(parts))
+    without, gained = np.zeros(len(parts)), np.zeros((len(priors), len(parts)))
     for fold in range(FOLDS):
         test = views[fold::FOLDS]
         train = np.setdiff1d(views, test)
         matrix, vector = np.sum([whole[v] for v in train], axis=0), np.sum([rhs[v] for v in train], axis=0)
-        plain, splined = (_solved(matrix, vector, n_other, s) for s in (0.0, sigma))
+        plain, *splined = (_solved(matrix, vector, n_other, sigma) for sigma in (0.0, *priors))
         for v in test:
             A, r = parts[v]
             without[v] = np.sum((r - A @ plain) ** 2)
-            gained[v] = without[v] - np.sum((r - A @ splined) ** 2)
+            for k, solution in enumerate(splined):
+                gained[k, v] = without[v] - np.sum((r - A @ solution) ** 2)
     mean = without.mean()
-    return float(gained.mean() / mean), float(gained.std() / np.sqrt(len(views) - 1) / mean)
+    return [(float(one.mean() / mean), float(one.std() / np.sqrt(len(views) - 1) / mean)) for one in gained]

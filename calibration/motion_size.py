@@ -14,16 +14,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from calibration.arrays import Array
 from calibration.board_motion import BoardMotion, motions, split
 from calibration.normal_equations import Normal
 from calibration.refinement import Refinement
+from calibration.simplex import lowest
 from calibration.stereo_model import predict
 
 FREE = BoardMotion(1e3, 1e3)  # as good as nothing known beforehand
 NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
+ROUGH = 0.02  # in the sizes' logarithms, and in the logarithm of the likelihood
 START = ((1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5))  # [rad], and of the distance
 
 
@@ -63,10 +64,8 @@ def likely_motion(refinement: Refinement) -> LikelyMotion | None:
     def unlikely(sizes: Array) -> float:
         return _minus_twice_log_likelihood(normal, by_poses[pairs], pairs, noise, weights(sizes))
 
-    rough = {"xatol": 0.02, "fatol": 0.02}
-    tried = [minimize(unlikely, np.log(start), method="Nelder-Mead", options=rough) for start in START]
-    best = min(tried, key=lambda one: one.fun)
-    w = weights(best.x)
+    tried = [lowest(unlikely, np.log(start), near=ROUGH, alike=ROUGH) for start in START]
+    w = weights(min(tried, key=lambda one: one[1])[0])
     right = normal.pose[:n, 6:, 6:]
     both = normal.pose[:n, :6, :6] + right
     cross = normal.cross[:n, :, :6] + normal.cross[:n, :, 6:]

@@ -145,7 +145,8 @@ def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array
     seen = np.isfinite(noise_ratio)
     mask = seen.astype(float)
     cross = _cross_covariance(lag, length) * mask[:, None, :]
-    K = kernel(lag[:, :, None] - lag[:, None, :], length) * mask[:, :, None] * mask[:, None, :]
+    alike = lag[:1] if (lag == lag[0]).all() else lag  # of frames at one interval all windows are
+    K = kernel(alike[:, :, None] - alike[:, None, :], length) * mask[:, :, None] * mask[:, None, :]
     diagonal = np.arange(lag.shape[1])
     sigma = K.copy()
     sigma[:, diagonal, diagonal] += np.where(seen, noise_ratio, 1.0)

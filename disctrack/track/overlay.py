@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
+from calibration.arrays import Array, Mask
 from calibration.grey_levels import full_scale
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
@@ -23,7 +23,7 @@ ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
 
 PLAYBACK_HZ = 25.0
 MOST_FRAMES = 1500  # a minute of video; of longer recordings every second, third, ... pair is shown
-OUTLINE_POINTS = 120
+RIM_POINTS, DOT_POINTS = 120, 40  # of an outline: a dot's polygon lies within a tenth of a pixel of it
 CAPTION_LINE = 18  # height of a line [px]
 CAPTION_WIDTH = 950  # of the whole caption on one line [px]
 _SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
@@ -51,8 +51,9 @@ def write_overlay(
     first = next(stream, None)
     if first is None:
         raise OutputError(f"{path}: no frame to draw")
-    with whole_file(path, suffix=".mp4") as part, _encoder(part, _drawn(*first, trajectory).shape[:2]) as write:
-        write(_drawn(*first, trajectory))
+    picture = _drawn(*first, trajectory)
+    with whole_file(path, suffix=".mp4") as part, _encoder(part, picture.shape[:2]) as write:
+        write(picture)
         progress(1)
         for row, images in stream:
             write(_drawn(row, images, trajectory))
@@ -74,28 +75,30 @@ def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
 
 
 def _drawn(row: int, images: NDArray, trajectory: Trajectory) -> ColourImage:
-    pictures = [cv2.cvtColor(_to_8_bit(image), cv2.COLOR_GRAY2BGR) for image in images]
+    height, width = images.shape[1:]
+    captions = _caption_lines(trajectory, row, 2 * width)
+    whole = np.zeros((height + CAPTION_LINE * len(captions) + 6, 2 * width, 3), np.uint8)
+    pictures = [whole[:height, :width], whole[:height, width:]]
+    for image, picture in zip(images, pictures, strict=True):
+        cv2.cvtColor(_to_8_bit(image), cv2.COLOR_GRAY2BGR, dst=picture)
     if trajectory.measured[row]:
         _draw_disc(pictures, trajectory, row)
     for camera, picture in enumerate(pictures):
         _draw_centres(picture, trajectory.markers_px[row, camera], trajectory.marker_status[row, camera])
         cv2.putText(picture, CAMERAS[camera], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
-    picture = np.vstack([np.hstack(pictures), _caption_strip(trajectory, row, 2 * images.shape[2])])
-    return picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]  # video codecs want even sizes
+    colour = _TEXT if trajectory.measured[row] else _REFUSED
+    for line, text in enumerate(captions):
+        place = (8, CAPTION_LINE * (line + 1) - 3)
+        cv2.putText(whole[height:], text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return whole[: whole.shape[0] // 2 * 2, : whole.shape[1] // 2 * 2]  # video codecs want even sizes
 
 
-def _caption_strip(trajectory: Trajectory, row: int, width: int) -> ColourImage:
-    """Caption below the images, (height, width, 3), on as many lines as the width asks for."""
+def _caption_lines(trajectory: Trajectory, row: int, width: int) -> list[str]:
+    """Caption below the images, on as many lines as the width [px] asks for."""
     parts = _caption(trajectory, row)
     n_lines = min(-(-CAPTION_WIDTH // width), 4)
-    strip = np.zeros((CAPTION_LINE * n_lines + 6, width, 3), np.uint8)
-    colour = _TEXT if trajectory.measured[row] else _REFUSED
     per_line = -(-len(parts) // n_lines)
-    for line in range(n_lines):
-        text = "   ".join(parts[line * per_line : (line + 1) * per_line])
-        place = (8, CAPTION_LINE * (line + 1) - 3)
-        cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
-    return strip
+    return ["   ".join(parts[line * per_line : (line + 1) * per_line]) for line in range(n_lines)]
 
 
 def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
@@ -125,43 +128,45 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     disc, rig = trajectory.disc, trajectory.rig
     R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
     h = disc.half_thickness
-    outlines = _outlines(disc) @ R.T + t
-    lower = outlines[0]
+    rims, dots = (outline @ R.T + t for outline in _outlines(disc))
+    lower = rims[0]
     psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
     e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
     contact = t - disc.radius * e2 - h * R[:, 2]
-    for picture, seen, (R_cw, t_cw) in zip(
-        pictures, rig.project(np.vstack([outlines.reshape(-1, 3), contact])), rig.camera_poses(), strict=True
-    ):
-        pixels = seen[:-1].reshape(len(outlines), OUTLINE_POINTS, 2)
+    points = np.concatenate([rims.reshape(-1, 3), dots.reshape(-1, 3), contact[None]])
+    for picture, seen, (R_cw, t_cw) in zip(pictures, rig.project(points), rig.camera_poses(), strict=True):
+        lower_px, upper_px = seen[: 2 * RIM_POINTS].reshape(2, RIM_POINTS, 2)
+        dots_px = seen[2 * RIM_POINTS : -1].reshape(len(dots), DOT_POINTS, 2)
         # the wall is seen where its outward normal faces the camera; the other half lies behind the disc
         facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
         start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
         visible = np.roll(facing, -start)
-        _polylines(picture, [np.roll(pixels[0], -start, axis=0)[visible]], _LOWER, closed=bool(facing.all()))
-        _polylines(picture, pixels[1:2], _RIM)
-        _polylines(picture, pixels[2:], _DOT)
+        _polylines(picture, [np.roll(lower_px, -start, axis=0)[visible]], _LOWER, closed=bool(facing.all()))
+        _polylines(picture, [upper_px], _RIM)
+        _polylines(picture, dots_px, _DOT)
         if np.isfinite(seen[-1]).all():
             _cross(picture, seen[-1], _CONTACT, cv2.MARKER_DIAMOND, 9)
 
 
-def _outlines(disc: Disc) -> Array:
-    """(2 + n, points, 3) in body axes: lower rim, upper rim, dots."""
-    h, centres = disc.half_thickness, disc.marker_centres_body
-    angle = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
-    middle = np.concatenate([[[0.0, 0.0, -h], [0.0, 0.0, h]], centres])
-    radius = np.r_[disc.radius, disc.radius, np.full(len(centres), disc.marker_diameter / 2)]
-    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(OUTLINE_POINTS)], axis=-1)
-    return np.asarray(middle[:, None] + radius[:, None, None] * circle, np.float64)
+def _outlines(disc: Disc) -> tuple[Array, Array]:
+    """Lower and upper rim (2, RIM_POINTS, 3), and the dots (n, DOT_POINTS, 3), in body axes."""
+    h = disc.half_thickness
+    rims = np.array([[[0.0, 0.0, -h]], [[0.0, 0.0, h]]]) + disc.radius * _circle(RIM_POINTS)
+    return rims, disc.marker_centres_body[:, None] + 0.5 * disc.marker_diameter * _circle(DOT_POINTS)
+
+
+def _circle(n: int) -> Array:
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=-1)
 
 
 def _polylines(
     picture: ColourImage, lines: Sequence[Array] | Array, colour: tuple[int, int, int], closed: bool = True
 ) -> None:
-    if not np.isfinite(lines).all():  # behind a camera, or out of the lens's reach
-        lines = [line[np.isfinite(line).all(axis=1)] for line in lines]
-    fixed = [np.clip(np.rint(np.multiply(line, _SUBPIXEL)), -(2**24), 2**24).astype(np.int32) for line in lines]
-    fixed = [line[:, None] for line in fixed if len(line) > 1]
+    exact = np.asarray(lines)
+    finite: Mask = np.asarray(np.isfinite(exact).all(axis=2))  # not behind a camera, nor out of the lens's reach
+    whole = np.clip(np.rint(np.where(finite[..., None], _SUBPIXEL * exact, 0.0)), -(2**24), 2**24).astype(np.int32)
+    fixed = [line[seen, None] for line, seen in zip(whole, finite, strict=True) if seen.sum() > 1]
     if fixed:
         cv2.polylines(picture, fixed, closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
