@@ -30,7 +30,8 @@ _HOME = {
     "disctrack.recording.declaration": ("read_recording", "Recording"),
     "disctrack.readers": ("open_frames", "FrameReader"),
     "disctrack.readers.blocks": ("iter_pair_blocks",),
-    "disctrack.calibrate.views": ("find_views", "calibrate_views", "calibrate_recording"),
+    "disctrack.calibrate.views": ("find_views", "calibrate_views"),
+    "disctrack.calibrate.stage": ("calibrate_recording",),
     "calibration.rig_file": ("read_rig", "write_rig"),
     "disctrack.disc": ("Disc",),
     "disctrack.track.stage": ("open_pairs", "measure", "Measurement", "trajectory_provenance"),
@@ -71,7 +72,7 @@ if TYPE_CHECKING:
     from disctrack.analyse.derivatives import differentiate as differentiate
     from disctrack.analyse.stage import run_analyse as run_analyse
     from disctrack.batch import run_batch as run_batch
-    from disctrack.calibrate.views import calibrate_recording as calibrate_recording
+    from disctrack.calibrate.stage import calibrate_recording as calibrate_recording
     from disctrack.calibrate.views import calibrate_views as calibrate_views
     from disctrack.calibrate.views import find_views as find_views
     from disctrack.diagnosis.stage import diagnose_trajectory as diagnose  # noqa: F401

@@ -62,7 +62,7 @@ def locate_circles(image: Image, plane: Array, rough: Array) -> Circles:
         noise = NoiseModel(max(factor, 1.0) * noise.read, max(factor, 1.0) * noise.gain)
     centres = locate_on_plane(image, maps, plane, radius, noise=noise, limits=LIMITS)
     corrected = replace(centres, pixels=centres.pixels - _shift_by_bend(bend, J, radius))
-    return Circles(corrected, radius, noise, float(np.median(_nearest(rough))))
+    return Circles(corrected, radius, noise, float(np.median(_distances(rough).min(axis=1))))
 
 
 def find_circles(image: NDArray, grid: CircleGrid, thorough: bool = True) -> CornerView | BoardNotFound:
@@ -189,7 +189,7 @@ def _derivative(maps: Array, plane: Array) -> Array:
 
 def _radius(grey: NDArray[np.float32], maps: Array, plane: Array) -> float:
     """Radius in units of the plane: where the mean grey value over rings passes half of a circle's contrast."""
-    gap = float(np.median(_nearest(plane)))
+    gap = float(np.median(_distances(plane).min(axis=1)))
     rings = np.linspace(0.0, 0.5 * gap, 41)
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = rings[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -206,10 +206,9 @@ def _radius(grey: NDArray[np.float32], maps: Array, plane: Array) -> float:
     return 0.25 * gap
 
 
-def _nearest(points: Array) -> Array:
-    """Distance of every point (n, 2) to its nearest neighbour (n,)."""
-    distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    return (distance + np.where(np.eye(len(points)), np.inf, 0.0)).min(axis=1)
+def _distances(points: Array) -> Array:
+    """Of every point (n, 2) to every other (n, n); infinite to itself."""
+    return np.linalg.norm(points[:, None] - points, axis=-1) + np.where(np.eye(len(points)), np.inf, 0.0)
 
 
 def flat_noise(image: Image, centres: Array, radius_px: float) -> NoiseModel:
@@ -217,7 +216,7 @@ def flat_noise(image: Image, centres: Array, radius_px: float) -> NoiseModel:
 
     Differences are free of the light's gradient. Ink that is clipped to black has no noise: the paper tells.
     """
-    distance = np.linalg.norm(centres[:, None] - centres, axis=-1) + np.where(np.eye(len(centres)), np.inf, 0.0)
+    distance = _distances(centres)
     between = 0.5 * (centres + centres[distance.argmin(axis=1)])
     clear = 0.5 * float(np.median(distance.min(axis=1))) - radius_px
     # squares within the round clearing, foreshortened, less the blur of the edge

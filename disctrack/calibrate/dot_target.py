@@ -17,7 +17,7 @@ from calibration.arrays import Array, Image
 from calibration.board import DotTarget
 from calibration.chessboard import BoardNotFound, grey_values
 from calibration.corner_fit import CornerView
-from disctrack.calibrate.circles import Circles, locate_circles
+from disctrack.calibrate.circles import Circles, locate_circles, whole_grey_values
 
 MAX_OFF_LATTICE = 0.2  # pitches: a blob further from the lattice is not one of its dots
 MIN_SHARE = 0.5  # of all images: a dot seen in fewer does not determine its own place
@@ -37,9 +37,7 @@ class DotView:
 def find_dots(image: NDArray, target: DotTarget) -> DotView | BoardNotFound:
     """Locate and number the dots of the target in one image; without it, what is missing."""
     grey, notes = grey_values(image)
-    pixels: Image = np.ascontiguousarray(
-        grey if grey.dtype in (np.uint8, np.uint16) else np.rint(grey).astype(np.uint16)
-    )
+    pixels = whole_grey_values(grey)
     blobs, marked = _blobs(pixels)
     if len(marked) != 3:
         return BoardNotFound(f"{len(marked)} dots with a hole found, expected the 3 that mark origin, x and y axis")

@@ -14,6 +14,7 @@ import h5py
 from calibration import CalibrationSettings, StereoCalibration, StereoRig, corner_fit, normal_equations
 from calibration.board import Board, Target
 from calibration.rig_file import read_rig, write_rig
+from calibration.stereo import Progress
 from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
@@ -85,6 +86,17 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
         table.board_thickness,
         dataclasses.replace(settings, tolerances=recording.board_tolerances),
     )
+
+
+def calibrate_recording(
+    recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
+) -> tuple[StereoCalibration, tuple[str, ...]]:
+    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
+    return _calibrated(source_of(recording, settings or CalibrationSettings()), progress)
+
+
+def _calibrated(s: CalibrationSource, progress: Progress | None) -> tuple[StereoCalibration, tuple[str, ...]]:
+    return calibrate_views(s.views, s.board, s.table_view, s.board_thickness, s.settings, progress)
 
 
 def given_rig(file: Path) -> CalibrationResult:
@@ -167,11 +179,4 @@ def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str,
                 advance(now - done)
                 done = now
 
-        return calibrate_views(
-            source.views,
-            source.board,
-            source.table_view,
-            source.board_thickness,
-            source.settings,
-            report,
-        )
+        return _calibrated(source, report)

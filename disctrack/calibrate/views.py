@@ -21,8 +21,7 @@ from disctrack.readers import open_frames
 from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
 from disctrack.readers.decoding import decode
 from disctrack.readers.files import file_number, match_files
-from disctrack.readers.flat_field import FlatField, FlatFields, flat_fields
-from disctrack.recording.declaration import Recording
+from disctrack.readers.flat_field import FlatField, FlatFields
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
 
@@ -123,23 +122,6 @@ def _refuse_unpaired(views: TargetImages, numbers: Sequence[Sequence[int | None]
         + (f": without a partner are {' and '.join(odd)}" if odd else "")
         + ". Views are pairs, one image of each camera: add the missing ones, or move these away."
     )
-
-
-def calibrate_recording(
-    recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
-) -> tuple[StereoCalibration, tuple[str, ...]]:
-    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
-    declared, table = recording.views, recording.table
-    if declared is None or table is None:
-        raise RecordingError(
-            f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
-            "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
-        )
-    views = find_views(
-        declared.left, declared.right, recording.folder, flat_fields(recording.folder, recording.sensors)
-    )
-    settings = replace(settings or CalibrationSettings(), tolerances=recording.board_tolerances)
-    return calibrate_views(views, declared.target, table.view, table.board_thickness, settings, progress)
 
 
 def calibrate_views(

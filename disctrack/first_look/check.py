@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
-from calibration.arrays import Mask
 from calibration.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
@@ -24,7 +23,7 @@ from disctrack.calibrate.targets import evenly
 from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.frames import CAMERAS, rotation_from_quaternion
-from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.blocks import PairBlock, iter_pair_blocks
 from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.dots import locate_on_disc
@@ -32,7 +31,7 @@ from disctrack.track.doubts import LOWEST_POINT, MISFIT
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
 from disctrack.track.summary import left_out
-from disctrack.track.tracking import BlockOfPairs, Tracking, TrackingSettings, track
+from disctrack.track.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
@@ -249,23 +248,16 @@ def _without_numbers(text: str) -> str:
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:
     """Track a stretch; slip: frames by which the right camera's are taken later than the left one's."""
 
-    def read_blocks(start: int, stop: int) -> Iterator[BlockOfPairs]:
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         if slip == 0:
             yield from iter_pair_blocks(pairs.left, pairs.right, start, stop)
             return
         images = _pairs_at(pairs, list(range(start, stop)), slip)
-        yield _Block(np.arange(start, start + len(images)), images, np.ones(images.shape[:2], bool))
+        yield PairBlock(np.arange(start, start + len(images)), images)
 
     settings = TrackingSettings(refine_markers=False, first_pass=False)
     return track(read_blocks, frames, rig, recording.disc, recording.frame_rate, gravity=recording.gravity,
                  settings=settings)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Block:
-    frames: NDArray[np.int64]
-    images: NDArray
-    readable: Mask
 
 
 def _together(stretches: list[Trajectory]) -> Trajectory:

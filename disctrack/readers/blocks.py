@@ -32,12 +32,12 @@ class Unreadable:
 class PairBlock:
     """Consecutive image pairs.
 
-    `images` is a buffer that is filled anew: it is valid until the next block is asked for; copy what must stay.
+    `images` may be a buffer that is filled anew: it is valid until the next block is asked for; copy what must stay.
     """
 
     frames: NDArray[np.int64]  # (n,)
     images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 where not readable
-    unreadable: tuple[Unreadable, ...]
+    unreadable: tuple[Unreadable, ...] = ()
 
     @property
     def readable(self) -> Mask:

@@ -4,30 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.arrays import Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
+from disctrack.readers.blocks import PairBlock
 from disctrack.track.stage import Measurement, Progress, findings_of
-from disctrack.track.tracking import BlockOfPairs, TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.tracking import TrackingSettings, prepare, stretch_edges, track
 
 Images = NDArray[Any]  # uint8 or uint16
 
 BLOCK, COPIED_BLOCK = 256, 16  # pairs
-
-
-@dataclass(frozen=True)
-class _Block:
-    frames: NDArray[np.int64]
-    images: Images
-    readable: Mask
 
 
 def measure_pairs(
@@ -62,13 +54,13 @@ def measure_pairs(
     edges = stretch_edges(range(n), disc)
     prepare(left.dtype)
 
-    def read_blocks(start: int, stop: int) -> Iterator[BlockOfPairs]:
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         cuts = sorted({start, stop, *(edge for edge in edges if start < edge < stop)})
         for a, b in pairwise(cuts):
             for first in range(a, b, block):
                 rows = slice(first, min(first + block, b))
                 pair = whole[rows] if whole is not None else np.stack([left[rows], right[rows]], axis=1)
-                yield _Block(np.arange(rows.start, rows.stop), pair, np.ones(pair.shape[:2], bool))
+                yield PairBlock(np.arange(rows.start, rows.stop), pair)
 
     began = time.perf_counter()
     tracking = track(

@@ -7,22 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from threading import Event, Lock
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.arrays import Array, Mask
+from calibration.arrays import Array
 from calibration.camera import StereoRig, normalised_maps
 from calibration.grey_levels import mosaic_gains
 from calibration.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
+from disctrack.readers.blocks import PairBlock
 from disctrack.track import following, pose
 from disctrack.track.arrangement import arrangement_found
 from disctrack.track.assembly import Taken, Tracking, TrackingSettings, assemble
@@ -54,27 +54,7 @@ STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
 
-class BlockOfPairs(Protocol):
-    """Consecutive pairs as `readers.blocks.iter_pair_blocks` gives them; the images are not kept."""
-
-    @property
-    def frames(self) -> NDArray[np.int64]:
-        """(n,) numbers of the pairs."""
-
-    @property
-    def images(self) -> Image:
-        """(n, 2, height, width)."""
-
-    @property
-    def readable(self) -> Mask:
-        """(n, 2)."""
-
-
-@dataclass(frozen=True)
-class _Repaired:
-    frames: NDArray[np.int64]
-    images: Image
-    readable: Mask
+ReadBlocks = Callable[[int, int], Iterable[PairBlock]]  # pairs start ... stop-1, in order
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
@@ -84,7 +64,7 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
 
 
 def track(
-    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]],
+    read_blocks: ReadBlocks,
     pairs: range,
     rig: StereoRig,
     disc: Disc,
@@ -151,7 +131,7 @@ def track(
 
 
 def _followed(
-    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]],
+    read_blocks: ReadBlocks,
     edges: list[int],
     setup: TrackingSetup,
     settings: TrackingSettings,
@@ -215,9 +195,7 @@ def _followed(
     return followers, tables
 
 
-def _arrangement(
-    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], rig: StereoRig, disc: Disc, pairs: range
-) -> str:
+def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: range) -> str:
     """Why the disc is not seen as declared, in words, by some of the pairs; "" if nothing explains it.
 
     Images are mirrored or exchanged, a camera was moved, or the dots are others.
@@ -247,9 +225,7 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     return [pairs.start + k * n // count for k in range(count + 1)]
 
 
-def _as_one_sensor(
-    read_blocks: Callable[[int, int], Iterable[BlockOfPairs]], pairs: range
-) -> tuple[Callable[[int, int], Iterable[BlockOfPairs]], list[str]]:
+def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[str]]:
     """Blocks without a colour filter's pattern and pixels that do not see, and what is to be said of both."""
     # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
     chosen = np.unique(np.linspace(pairs.start, pairs.stop - 1, STUCK_FRAMES).astype(int)) if len(pairs) else ()
@@ -275,7 +251,7 @@ def _as_one_sensor(
     if not told:
         return read_blocks, []
 
-    def repaired(start: int, stop: int) -> Iterator[BlockOfPairs]:
+    def repaired(start: int, stop: int) -> Iterator[PairBlock]:
         for block in read_blocks(start, stop):
             images = block.images.copy()  # they may be the caller's own
             for camera, (pattern, mask) in enumerate(zip(gains, stuck, strict=True)):
@@ -284,7 +260,7 @@ def _as_one_sensor(
                 if mask is not None:
                     for image in images[:, camera]:
                         repair(image, mask)
-            yield _Repaired(block.frames, images, block.readable)
+            yield replace(block, images=images)
 
     return repaired, told
 
@@ -296,7 +272,7 @@ def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:
     return np.clip(np.rint(images / pattern), 0, np.iinfo(images.dtype).max).astype(images.dtype)
 
 
-def _cut(block: BlockOfPairs, edges: Sequence[int]) -> list[range]:
+def _cut(block: PairBlock, edges: Sequence[int]) -> list[range]:
     """The block's frames without any edge inside."""
     first, stop = int(block.frames[0]), int(block.frames[-1]) + 1
     inside = [first, *(edge for edge in edges if first < edge < stop), stop]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.arrays import Array
-from disctrack.calibrate.views import calibrate_recording
+from disctrack.calibrate.stage import calibrate_recording
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.recording.declaration import read_recording
 from disctrack.render import write_recording

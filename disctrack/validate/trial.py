@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import StereoCalibration
-from calibration.arrays import Array, Image, Mask
+from calibration.arrays import Array, Image
 from calibration.camera import StereoRig
-from disctrack.calibrate.views import calibrate_recording
+from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
 from disctrack.readers import open_frames
-from disctrack.readers.blocks import iter_pair_blocks
+from disctrack.readers.blocks import PairBlock, Unreadable, iter_pair_blocks
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.render import Truth, rig_of, write_recording
 from disctrack.scene.description import MotionSettings, RollingMotion, Scene
@@ -59,15 +59,6 @@ class TrialRecording:
     calibration: StereoCalibration
     static: MeasuredTwice
     rolling: dict[str, MeasuredTwice]  # by the name of the stretch
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Pairs of images in memory, as `track` reads them."""
-
-    frames: NDArray[np.int64]
-    images: Image  # (n, 2, height, width)
-    readable: Mask  # (n, 2)
 
 
 def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
@@ -200,14 +191,15 @@ def locate(images: Image, rig: StereoRig, disc: Disc, frame_rate: float, *, apar
     """Track pairs in memory. apart: an unreadable pair follows each one, so that each is found without a prior."""
     step = 2 if apart else 1
 
-    def read_blocks(start: int, stop: int) -> Iterator[Pairs]:
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         block = 32
         for first in range(start, stop, block):
             frames = np.arange(first, min(first + block, stop))
             real = frames % step == 0
             pairs = np.zeros((len(frames), *images.shape[1:]), images.dtype)
             pairs[real] = images[frames[real] // step]
-            yield Pairs(frames, pairs, np.repeat(real[:, None], 2, axis=1))
+            none = tuple(Unreadable(int(i), camera, "") for i in frames[~real] for camera in (0, 1))
+            yield PairBlock(frames, pairs, none)
 
     settings = TrackingSettings(search_always=apart)
     return track(read_blocks, range(step * len(images)), rig, disc, frame_rate, settings=settings)

@@ -18,8 +18,8 @@ from calibration.camera import Camera
 from calibration.charuco import find_charuco
 from disctrack.calibrate import targets
 from disctrack.calibrate.circles import find_circles
+from disctrack.calibrate.stage import calibrate_recording
 from disctrack.calibrate.targets import other_board
-from disctrack.calibrate.views import calibrate_recording
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
 
