@@ -235,14 +235,17 @@ def add_warm_up(parser: argparse.ArgumentParser) -> None:
 def add_validate(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack validate`."""
     parser.add_argument(
-        "--recordings", type=int, metavar="N", help="recordings, each with its own cameras and chessboards (default: 3)"
+        "--recordings",
+        type=_positive,
+        metavar="N",
+        help="recordings, each with its own cameras and chessboards (default: 3)",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("validation"), help="folder for tables and pictures (%(default)s)"
     )
     parser.add_argument("--quick", action="store_true", help="small images and few of everything: about a minute")
     parser.add_argument(
-        "--imperfect", type=int, metavar="N", default=0, help="instead: N recordings of an imperfect laboratory"
+        "--imperfect", type=_positive, metavar="N", default=0, help="instead: N recordings of an imperfect laboratory"
     )
     parser.add_argument("--seed", type=int, help="of the first recording; the others count up from it")
     parser.add_argument("--quiet", action="store_true", help="do not tell of every step")

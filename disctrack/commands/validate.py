@@ -7,7 +7,6 @@ import sys
 import time
 
 from disctrack.commands import DONE, FAILED
-from disctrack.errors import SceneError
 from disctrack.files.whole import make_folder, write_whole
 from disctrack.validate import complaints, run_validate, verdict
 from disctrack.validate.imperfect import imperfect_table, imperfect_trials
@@ -16,8 +15,6 @@ from disctrack.validate.run import FIRST_SEED, scene_of
 
 def run(arguments: argparse.Namespace) -> int:
     """Validate, write, print the verdict; exit code 1 if a check failed."""
-    if arguments.recordings is not None and arguments.recordings < 1:
-        raise SceneError(f"--recordings {arguments.recordings}: expected 1 or more")
     began = time.perf_counter()
 
     def say(step: str) -> None:

@@ -6,7 +6,6 @@ guess of ours becomes a measurement.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from calibration.rig_file import read_rig
 from disctrack.calibrate.targets import VIEWS_TRIED, board_size, evenly
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
+from disctrack.files.toml_tree import read_toml, toml_value
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
 from disctrack.readers import open_frames
@@ -26,8 +26,6 @@ from disctrack.readers.camera_header import header_of
 from disctrack.readers.decoding import decode
 from disctrack.readers.files import match_files
 from disctrack.recording.declaration import FILE_NAME, OPTIONAL
-
-OPTIONS = ("frame_rate_hz", "square_mm", "board_thickness_mm", "radius_mm", "thickness_mm", "mass_g", "diameter_mm")
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class WrittenDeclaration:
 def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None) -> WrittenDeclaration:
     """Write recording.toml into a folder of frames.
 
-    known : values of `OPTIONS` that the user gave; like : another recording.toml, or its folder, of the same disc,
+    known : values by key that the user gave; like : another recording.toml, or its folder, of the same disc,
     board and table, from which everything is taken that the files do not tell
     Raises RecordingError if no two cameras are found, OutputError if there is a recording.toml already.
     """
@@ -67,7 +65,7 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     file = folder / FILE_NAME
     if file.exists():
         raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` tells what it lacks.")
-    example = {} if like is None else _example(like)
+    example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
     found = look_into(folder)
     text, missing = declaration(found, known or {}, example)
     write_whole(file, text.encode())
@@ -133,13 +131,13 @@ def _views_among(folder: Path, pairs: list[CameraPair]) -> tuple[CameraPair | No
     return None, None, ""
 
 
-def some_images(pattern: str, folder: Path, camera: str = "left") -> list[NDArray]:
+def some_images(pattern: str, folder: Path) -> list[NDArray]:
     """A few of one camera's views; they may be in colour. Raises RecordingError."""
-    files = match_files(split_member(pattern)[0], folder, camera)
+    files = match_files(split_member(pattern)[0], folder, "left")
     if len(files) > 1:
         chosen = [files[i] for i in evenly(len(files), VIEWS_TRIED)]
         return [decode(file.read_bytes(), str(file)) for file in chosen]
-    reader = open_frames(pattern, folder, camera)
+    reader = open_frames(pattern, folder, "left")
     return [np.array(reader.read(i)) for i in evenly(len(reader), VIEWS_TRIED)]
 
 
@@ -173,14 +171,6 @@ def _rig_beside(folder: Path) -> str | None:
     return None
 
 
-def _example(like: Path) -> Mapping[str, Any]:
-    file = like / FILE_NAME if like.is_dir() else like
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{file}: cannot be taken as an example: {error}.") from error
-
-
 def declaration(
     found: FolderContent, known: Mapping[str, float], example: Mapping[str, Any]
 ) -> tuple[str, tuple[str, ...]]:
@@ -194,19 +184,19 @@ def declaration(
         if value is None:
             missing.append(f"[{section}] {key}")
             return _aligned(f"# {key} = {example_text}", f"FILL IN: {remark}")
-        return _aligned(f"{key} = {_toml(value)}", remark)
+        return _aligned(f"{key} = {toml_value(value)}", remark)
 
     f = found.frames
     rate_remark = f"frames per second, {found.rate_source}" if found.rate_source else "frames per second of the cameras"
     lines = [
         "# Lengths in mm, masses in g, times in s. Every key: disctrack/docs/recording-toml.md",
-        f"name = {_toml(found.folder.resolve().name)}",
+        f"name = {toml_value(found.folder.resolve().name)}",
         "",
         "[cameras]                       # frame i of the left and of the right must show the same instant",
         line("cameras", "frame_rate_hz", found.frame_rate, "1000.0", rate_remark),
         _exposure(example),
-        _aligned(f"left = {_toml(f.left.pattern)}", found.described),
-        f"right = {_toml(f.right.pattern)}",
+        _aligned(f"left = {toml_value(f.left.pattern)}", found.described),
+        f"right = {toml_value(f.right.pattern)}",
         "",
         "[disc]",
         line("disc", "radius_mm", None, "37.5", "caliper"),
@@ -231,12 +221,13 @@ def declaration(
 def _exposure(example: Mapping[str, Any]) -> str:
     remark = "with it, poses are those of mid exposure; else it is taken as short"
     given = example.get("cameras", {}).get("exposure_us")
-    return _aligned("# exposure_us = 200.0" if given is None else f"exposure_us = {_toml(given)}", remark)
+    return _aligned("# exposure_us = 200.0" if given is None else f"exposure_us = {toml_value(given)}", remark)
 
 
 def _calibration_lines(found: FolderContent, line: Any, example: Mapping[str, Any]) -> list[str]:
     if found.views is None and found.rig_file is not None:
-        return ["[calibration]", _aligned(f"rig = {_toml(found.rig_file)}", "a rig that was calibrated before"), ""]
+        rig = _aligned(f"rig = {toml_value(found.rig_file)}", "a rig that was calibrated before")
+        return ["[calibration]", rig, ""]
     left, right = (None, None) if found.views is None else (found.views.left.pattern, found.views.right.pattern)
     corners = None if found.inner_corners is None else list(found.inner_corners)
     count = f"{found.views_count} views" if found.views is not None else "views of a chessboard, 15 to 40 of them"
@@ -260,7 +251,7 @@ def _optional(section: str, example: Mapping[str, Any]) -> list[str]:
     """Keys with a default, where the example gives them."""
     given = example.get(section, {})
     return [
-        f"{key} = {_toml(given[key])}"
+        f"{key} = {toml_value(given[key])}"
         for home, key in sorted(OPTIONAL)
         if home == section and key in given and key != "rig"
     ]
@@ -268,11 +259,3 @@ def _optional(section: str, example: Mapping[str, Any]) -> list[str]:
 
 def _aligned(text: str, remark: str) -> str:
     return f"{text:<32}# {remark}" if len(text) < 32 else f"{text}  # {remark}"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -16,6 +16,7 @@ from calibration.arrays import Array, Array32, Image
 from calibration.camera import StereoRig
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
+from disctrack.files.toml_tree import toml_value
 from disctrack.frames import CAMERAS
 from disctrack.render.images import Stage, TrueDisc, expected_board_image, expected_disc_image, stages
 from disctrack.render.sensor import digitise
@@ -188,17 +189,23 @@ def _write_all(images: list[_Image], scene: Scene, progress: Progress | None) ->
                 progress(done, len(images))
 
 
+def _exact(length_mm: float) -> str:
+    """With four decimals where these are all; as declared, the disc is exact."""
+    short = f"{length_mm:.4f}"
+    return short if float(short) == length_mm else toml_value(length_mm)
+
+
 def recording_toml(scene: Scene) -> str:
     """What the experimenter declares: nothing of the scene's faults.
 
     A scene without imperfections is exact, and says so; with them, the tolerances are the usual ones.
     """
     disc: Disc = scene.declared_disc
-    centres = ", ".join(f"[{x:.4f}, {y:.4f}]" for x, y in scene.markers.centres_mm)
+    centres = ", ".join(f"[{_exact(x)}, {_exact(y)}]" for x, y in scene.markers.centres_mm)
     board, cameras = scene.board, scene.cameras
     text = f"""\
 # A recording of a disc rolling on a table. Lengths in mm, masses in g, times in s.
-name = "{scene.name}"
+name = {toml_value(scene.name)}
 
 [cameras]                       # two synchronised cameras; frame i of the left and of the right belong together
 frame_rate_hz = {cameras.frame_rate_hz!r}

@@ -30,8 +30,10 @@ def struck_disc(
     friction : coefficient for the impulse of the table; the table's normal impulse keeps the lower rim from going down.
 
     Returns a state with the velocity of O, slipping in general. Raises ModelError where the impulse would not tip the
-    disc over or the point lies outside the face.
+    disc over, the point lies outside the face or the friction is below 0.
     """
+    if not friction >= 0:
+        raise ModelError(f"a coefficient of friction of {friction:.4g}; it is 0 or above")
     if np.hypot(lateral, vertical) > disc.radius:
         raise ModelError(
             f"the point ({lateral * 1e3:.4g}, {vertical * 1e3:.4g}) mm lies outside the face of radius "

@@ -335,6 +335,9 @@ _POSITIVE = {
     "faults.pattern_scale",
     "faults.left.focal_scale",
     "faults.right.focal_scale",
+    "light.glare.sigma_px",
+    "faults.occluders.width_px",
+    "faults.occluders.length_px",
 }
 
 
@@ -390,6 +393,9 @@ def _of_the_images(scene: Scene) -> Iterator[_Complaint]:
     yield max(size) > MOST_PIXELS, "cameras.image_size", size, f"at most {MOST_PIXELS} pixels a side"
     hot = scene.sensor.hot_pixels
     yield hot > math.prod(size), "sensor.hot_pixels", hot, f"no more than the {math.prod(size)} pixels of an image"
+    light = scene.light
+    yield not light.direction[2] > 0, "light.direction", light.direction, "a lamp above the table: the third above 0"
+    yield not 0 <= light.directed <= 1, "light.directed", light.directed, "a share, 0 to 1"
     yield min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"
     yield render.png_compression > 9, "render.png_compression", render.png_compression, "0 to 9"
     yield render.threads < 1, "render.threads", render.threads, "1 or more"

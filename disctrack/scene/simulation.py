@@ -17,7 +17,7 @@ from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
 from disctrack.files.software import __version__
 from disctrack.files.whole import refuse_existing, write_whole
-from disctrack.frames import quaternion_from_rotation, rotation_from_euler
+from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion, Regime
 from disctrack.rolling.simulate import simulate
 from disctrack.scene.description import load_scene
@@ -81,13 +81,13 @@ def run_simulate(
 def summary(motion: Motion) -> str:
     """The motion in some lines, for people."""
     theta, psidot, energy = np.degrees(motion.q[:, 4]), motion.qdot[:, 3], motion.energy * 1e3
-    with np.errstate(invalid="ignore"):
-        needed = np.nanmax(np.where(motion.regime == Regime.FLYING, np.nan, motion.friction_needed))
+    needed = motion.friction_needed[(motion.regime != Regime.FLYING) & ~np.isnan(motion.friction_needed)]
+    hold = f"rolling needs a friction coefficient of {needed.max():.3g}" if needed.size else "never held by the table"
     lines = [
         f"{len(motion)} instants, {motion.time[0]:.4g} to {motion.time[-1]:.4g} s",
         f"end at {motion.end_time:.6g} s: {motion.end.value}",
         f"nutation {theta[0]:.4g} -> {theta[-1]:.4g} deg, precession {psidot[0]:.5g} -> {psidot[-1]:.5g} rad/s",
-        f"energy {energy[0]:.5g} -> {energy[-1]:.5g} mJ; rolling needs a friction coefficient of {needed:.3g}",
+        f"energy {energy[0]:.5g} -> {energy[-1]:.5g} mJ; {hold}",
     ]
     lines += [f"{s.time:.5g} s: {s.before.name.lower()} -> {s.after.name.lower()}" for s in motion.switches[:6]]
     if len(motion.switches) > 6:
@@ -138,13 +138,9 @@ def _root(motion: Motion) -> dict[str, Variable]:
             "phi": (q[5], "rad", "spin angle, not wrapped"),
         }
     )
-    quaternion = quaternion_from_rotation(rotation_from_euler(*q[3:]))
-    signs = np.cumprod(
-        np.concatenate([[1.0], np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0, -1.0, 1.0)])
-    )
-    variables["quaternion"] = Variable(
-        quaternion * signs[:, None], ("time", "quaternion_component"), "1", "orientation, body to world, continuous"
-    )
+    quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*q[3:])))
+    dims = ("time", "quaternion_component")
+    variables["quaternion"] = Variable(quaternion, dims, "1", "orientation, body to world, continuous")
     return variables
 
 

@@ -129,14 +129,13 @@ def run_validate(
     recordings: int | None = None,
     quick: bool = False,
     seed: int = FIRST_SEED,
-    plan: ValidationPlan | None = None,
     say: Callable[[str], object] = lambda text: None,
 ) -> tuple[Summary, list[Path]]:
     """Validate and write the results into `folder`; returns the summary and the files.
 
-    recordings : None leaves it to the plan   quick : small images and few of everything   plan : in place of both
+    recordings : None leaves it to the plan   quick : small images and few of everything
     """
-    plan = plan or (QUICK if quick else ValidationPlan())
+    plan = QUICK if quick else ValidationPlan()
     if recordings is not None:
         plan = replace(plan, recordings=recordings)
     make_folder(folder)  # a place that cannot be written to should be known before the work

@@ -25,7 +25,7 @@ def short():
 
 def saved(system, values, folder):
     path = folder / "model.toml"
-    path.write_text(model_toml(system, values, "test"))
+    path.write_text(model_toml(system, values, "of any\n= name"))
     return path
 
 

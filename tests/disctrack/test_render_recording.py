@@ -20,6 +20,7 @@ from disctrack.scene.description import (
     Faults,
     GlareSettings,
     LightSettings,
+    MarkerSettings,
     MotionSettings,
     Occluder,
     RigSettings,
@@ -122,6 +123,15 @@ def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
         image = cv2.imread(str(tmp_path / "r/calibration" / name / "00.png"), cv2.IMREAD_GRAYSCALE)
         u, v = np.rint(truth.rig.project(points)[camera]).astype(int).T
         assert_array_equal(image[v, u] < 110, [True, True, False, False])
+
+
+def test_a_recording_declares_the_disc_of_any_scene_as_it_is(tmp_path):
+    places = tuple((12.3456789 * np.cos(a), 12.3456789 * np.sin(a)) for a in (0.1, 1.3, 3.1, 4.4))
+    scene = replace(SMALL, name='the "third"\\\n run', markers=MarkerSettings(diameter_mm=5.123456, centres_mm=places))
+    (tmp_path / "recording.toml").write_text(render.recording_toml(scene))
+    recording = read_recording(tmp_path)
+    assert recording.name == scene.name
+    assert_array_equal(recording.disc.marker_centres_body, scene.declared_disc.marker_centres_body)
 
 
 def test_faults_never_show_in_recording_toml(scene):
@@ -317,6 +327,10 @@ def test_truth_of_another_file_is_refused(tmp_path):
         ("[rig]\nmm_per_px = 0.0", "rig.mm_per_px = 0.0; expected a positive number"),
         ("[markers]\ncentres_mm = [[36, 0], [0, 9], [9, 0]]", "a dot over the disc's rim"),
         ("[motion]\nposes = [[1, 2, 3]]", "motion.poses"),
+        ("[light]\ndirection = [1, 0, 0]", "light.direction = .*; expected a lamp above the table"),
+        ("[light]\ndirected = 1.5", "light.directed = 1.5; expected a share, 0 to 1"),
+        ("[[light.glare]]\nsigma_px = 0.0", "light.glare.sigma_px = 0.0; expected a positive number"),
+        ("[[faults.occluders]]\nwidth_px = -5.0", "faults.occluders.width_px = -5.0; expected a positive number"),
     ],
 )
 def test_mistakes_in_a_scene_are_named(text, message, tmp_path):

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from disctrack.cli import main
 from disctrack.errors import OutputError, SceneError
 from disctrack.files.toml_tree import toml_value
-from disctrack.rolling import CATALOGUE, ModelError, effects_from_tables
+from disctrack.rolling import CATALOGUE, ModelError, Regime, effects_from_tables
 from disctrack.scene.simulation import run_simulate
 
 SCENE = """
@@ -83,6 +83,14 @@ def test_a_struck_disc_is_a_scene_too(scene, tmp_path):
     scene.write_text(text.replace("impulse_N_s", "impulse"))
     with pytest.raises(SceneError, match="expected impulse_N_s, lateral_mm, vertical_mm"):
         run_simulate(scene, tmp_path / "other.h5")
+
+
+def test_a_disc_that_never_touches_the_table_is_summed_up_too(scene, tmp_path):
+    scene.write_text(SCENE.replace("theta_deg = 8", "state = { z = 1.0, v_x = 0.0, v_y = 0.0, v_z = 0.0 }"))
+    run = run_simulate(scene, tmp_path / "motion.h5", duration=0.02)
+    assert (run.motion.regime == Regime.FLYING).all()
+    assert "never held by the table" in run.summary
+    assert "nan" not in run.summary
 
 
 def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):

@@ -55,3 +55,5 @@ def test_an_impulse_that_does_not_tip_the_disc_is_refused():
         struck_disc(MA_2014, 0.0, -0.02, 0.05)
     with pytest.raises(ModelError, match="outside the face"):
         struck_disc(MA_2014, 0.03, 0.03, 0.05)
+    with pytest.raises(ModelError, match=r"friction of -0\.2"):
+        struck_disc(MA_2014, 0.0, 0.02, 0.05, friction=-0.2)

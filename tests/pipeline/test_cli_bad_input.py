@@ -155,6 +155,7 @@ def test_a_range_without_frames(recording, capsys, range_):
         ["track", "x", "--frames", "abc"],
         ["calibrate", "--corners", "9"],
         ["calibrate", "--square-mm", "-3"],
+        ["validate", "--imperfect", "-1"],
     ],
 )
 def test_wrong_usage_is_explained_with_exit_code_2(words, capsys):

@@ -58,6 +58,17 @@ def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(s
     assert "square_mm is missing" in capsys.readouterr().err
 
 
+def test_a_folder_of_any_name_gets_a_declaration_that_can_be_read(tmp_path):
+    folder = tmp_path / 'two\nlines, "quoted" \\ and \x7f'
+    for camera in ("left", "right"):
+        (folder / camera).mkdir(parents=True)
+        for i in range(3):
+            cv2.imwrite(str(tmp_path / "frame.png"), np.full((32, 32), 90, np.uint8))
+            shutil.move(tmp_path / "frame.png", folder / camera / f"{i}.png")
+    assert main(["init", str(folder)]) == 0
+    assert tomllib.loads((folder / "recording.toml").read_text())["name"] == folder.name
+
+
 def test_init_takes_the_rest_from_an_earlier_recording_of_the_same_disc(sample_clip, tmp_path):
     folder = linked(sample_clip, tmp_path / "clip")
     (folder / "recording.toml").unlink()

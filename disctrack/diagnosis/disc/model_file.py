@@ -95,6 +95,7 @@ def _rounded(number: float) -> float:
 def _header(name: str, system: DiscSystem) -> list[str]:
     first, last = (int(system.trajectory.frame[i]) for i in (system.rows.start, system.rows.stop - 1))
     return [
-        f"# Fitted to frames {first} to {last} of {name}. Read by disctrack simulate, render, and diagnose --model.",
+        f"# Fitted to frames {first} to {last} of {' '.join(name.split())}. "
+        "Read by disctrack simulate, render, and diagnose --model.",
         "# motion.rolling: the motion and its effects. faults: what is wrong with cameras, dots and table.",
     ]

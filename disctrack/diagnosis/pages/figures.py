@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import periodogram
+from scipy.stats import chi2
 
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
@@ -152,8 +153,9 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     axes.set_yticks(range(len(tried)), [t.candidate.name for t in tried])
     axes.invert_yaxis()
     axes.set_xscale("log")
-    axes.axvline(15.0, color=RED, lw=1)
-    axes.set_xlabel("decrease of chi-square when it is added to the model (red: what noise can do)")
+    level = diagnosis.settings.false_alarm / max(len(result.system.candidates), 1)
+    axes.axvline(float(chi2.isf(level, 1)), color=RED, lw=1)
+    axes.set_xlabel("decrease of chi-square when it is added to the model (red: what noise can do with one number)")
     caption = "The candidates that gain most. Blue: chosen; amber: cannot be told from it."
     return Drawn("candidates", "What was tried", caption, figure)
 
