@@ -20,6 +20,7 @@ from calibration import (
     refine_stereo,
 )
 from calibration.camera import rotation_from_vector, triangulate
+from calibration.chessboard import find_corners
 from calibration.pairs import judge_pairs, pairs_that_agree
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.start import start_stereo
@@ -363,5 +364,9 @@ def test_progress_is_told_view_by_view(drawn):
     assert ("corners", 16, 16) in stages
 
 
-def test_board_not_found_is_told_from_a_view():
-    assert BoardNotFound("why").reason == "why"
+def test_an_image_without_the_board_says_so_in_place_of_a_view(drawn):
+    _, (left, _) = drawn
+    assert isinstance(find_corners(left[0], BOARD.inner_corners), CornerView)
+    without = find_corners(np.full_like(left[0], 128), BOARD.inner_corners)
+    assert isinstance(without, BoardNotFound)
+    assert "no board of 7 x 4 inner corners" in without.reason

@@ -58,6 +58,7 @@ def test_what_is_there_is_improbable(rng):
     system = Waves(np.zeros(120))
     assert of(rng.standard_normal(120) + 2.0 * system.columns["c9"]).p_value < 1e-10
     # a wave that may only be positive does not gain from its opposite, but its neighbours do
+    assert of(rng.standard_normal(120) - 2.0 * system.columns["c10"]).p_value < 1e-10
     assert of(rng.standard_normal(120)).p_value > 1e-3
 
 

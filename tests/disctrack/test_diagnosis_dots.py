@@ -36,7 +36,10 @@ def test_a_shift_within_its_sigma_is_no_misprint():
 
 def test_findings_of_an_older_file_change_nothing():
     trajectory = measured(n=5)
-    assert with_declared_dots(trajectory, {"marker_shift_um": [[0.0, 50.0]] * 6}) is trajectory
+    one = {"marker_shift_um": [[0.0, 50.0], *[[0.0, 0.0]] * 5]}
+    assert with_declared_dots(trajectory, one) is trajectory
+    told = one | {"marker_shift_sigma_um": [[1.0, 1.0]] * 6}
+    assert with_declared_dots(trajectory, told) is not trajectory
 
 
 def test_declared_places_come_back():

@@ -132,7 +132,7 @@ def test_a_pause_in_the_middle_stays():
         return 50.0 + 0.2 * (np.clip(i, 20, 60) - 20) + 0.2 * (np.clip(i, 640, 680) - 640), 64.0, 0.0
 
     span = found_in(700, place)
-    assert (span.start, span.stop) == (0, 700)
+    assert (span.start, span.stop, span.moves) == (0, 700, True)
 
 
 def test_nothing_that_moves_means_nothing_is_left_out():
