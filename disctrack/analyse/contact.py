@@ -51,7 +51,6 @@ class RollingOnset:
     probability: float  # that there is pure rolling at the end of the recording
     slip_distance: float  # [m] path of slip before the onset (of the whole recording when it never rolls)
     slip_distance_sigma: float  # [m]
-    chi_square_rolling: float  # mean squared slip over its variance from the onset on; 1 when the model holds
     n_late_slips: int  # frames after the onset whose slip exceeds 5 sigma
     verdict: str
 
@@ -131,19 +130,17 @@ def analyse_contact(motion: MeasuredMotion, circle_duration: float = 0.6, until:
     found = propagate(motion, lambda state: contact_quantities(state, motion.disc, motion.gravity))
     return Contact(
         series=found.series(CONTACT),
-        onset=rolling_onset(motion, found, until=until),
+        onset=rolling_onset(motion, found, until),
         circle=locus_circle(motion, found, circle_duration, until),
         propagated=found,
     )
 
 
-def rolling_onset(
-    motion: MeasuredMotion, found: Propagated, tolerance: float = SLIP_TOLERANCE, until: float = np.inf
-) -> RollingOnset:
+def rolling_onset(motion: MeasuredMotion, found: Propagated, until: float = np.inf) -> RollingOnset:
     """Change from slip to rolling: posterior over the first rolling frame, flat prior, slip of unknown size before it.
 
-    Before the onset each slip component has variance s^2 + noise, s unknown between 4 `tolerance` and 10 m/s, after
-    it tolerance^2 + noise. Neighbouring frames share noise: their likelihoods are weighed by the independent share.
+    Before the onset each slip component has variance s^2 + noise, s unknown between 4 SLIP_TOLERANCE and 10 m/s; after
+    it, SLIP_TOLERANCE^2 + noise. Neighbouring frames share noise: their likelihoods count by the independent share.
     """
     frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1) & (motion.time <= until))
     if frames.size < 2:
@@ -152,16 +149,16 @@ def rolling_onset(
     C = found.covariance_at(frames, SLIP) + found.calibration_covariance_at(frames, SLIP)
     interval = float(np.median(np.diff(motion.time)))
     share = np.minimum(1.0, interval / (INDEPENDENT_AFTER_LENGTHS * motion.length.min(axis=1)[frames]))
-    sizes = np.geomspace(max(4 * tolerance, 1e-5), 10.0, 60)
+    sizes = np.geomspace(4 * SLIP_TOLERANCE, 10.0, 60)
     slipping = np.stack([_log_normal(v, C, s) * share for s in sizes])
-    rolling = _log_normal(v, C, tolerance) * share
+    rolling = _log_normal(v, C, SLIP_TOLERANCE) * share
     before = np.concatenate([np.zeros((len(sizes), 1)), np.cumsum(slipping, axis=1)], axis=1)
     after = np.concatenate([np.cumsum(rolling[::-1])[::-1], [0.0]])
     log_joint = before + after  # (sizes, frames + 1): rolling from frame k on; the last entry is "never"
     peak = log_joint.max()
     posterior = np.exp(log_joint - peak).mean(axis=0)
     posterior /= posterior.sum()
-    return _describe_onset(motion, frames, v, C, posterior, share, tolerance)
+    return _describe_onset(motion, frames, v, C, posterior, share)
 
 
 def _log_normal(v: Array, C: Array, extra: float) -> Array:
@@ -179,7 +176,6 @@ def _describe_onset(
     C: Array,
     posterior: Array,
     share: Array,
-    tolerance: float,
 ) -> RollingOnset:
     probability = float(1.0 - posterior[-1])
     index = np.searchsorted(np.cumsum(posterior), [0.025, 0.5, 0.975])
@@ -187,7 +183,7 @@ def _describe_onset(
     low, median, high = (float(times[min(i, len(frames))]) for i in index)
     first = 0 if index[0] == 0 else int(min(index[1], len(frames)))
     distance, distance_sigma = _slip_distance(motion.time[frames[:first]], v[:first], C[:first], share[:first])
-    total = C + tolerance**2 * np.eye(2)
+    total = C + SLIP_TOLERANCE**2 * np.eye(2)
     squared = np.einsum("ni,nij,nj->n", v, np.linalg.inv(total), v)
     late = squared[first:]
     if probability < 0.5:
@@ -205,7 +201,6 @@ def _describe_onset(
         probability=probability,
         slip_distance=distance,
         slip_distance_sigma=distance_sigma,
-        chi_square_rolling=float(late.mean() / 2) if late.size else float("nan"),
         n_late_slips=int(np.sum(late > 25.0)),
         verdict=verdict,
     )
@@ -225,7 +220,7 @@ def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float
 
 def _no_onset(reason: str) -> RollingOnset:
     nan = float("nan")
-    return RollingOnset(nan, nan, nan, nan, nan, nan, nan, 0, f"not determined: {reason}")
+    return RollingOnset(nan, nan, nan, nan, nan, nan, 0, f"not determined: {reason}")
 
 
 def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, until: float = np.inf) -> Circle:

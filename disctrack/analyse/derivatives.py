@@ -98,11 +98,6 @@ class MeasuredMotion:
         _rates_of_turned_frame(turned, self.omega_world[frames], self.alpha_world[frames])
         return np.asarray(turned @ C @ turned.swapaxes(1, 2))
 
-    @property
-    def state(self) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Position, rotation, velocity, omega, acceleration, alpha."""
-        return self.position, self.R_world_body, self.velocity, self.omega_world, self.acceleration, self.alpha_world
-
 
 def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> MeasuredMotion:
     """Velocities and accelerations of a measured trajectory.

@@ -30,6 +30,8 @@ ENERGY = (
     ("precession_level", "s-2", "psidot^2 sin theta; 4 g / r in slow steady precession of a thin disc"),
 )
 
+TOTAL = 5  # column of the mechanical energy
+
 
 @dataclass(frozen=True)
 class Energy:
@@ -69,7 +71,7 @@ def energy_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
 def analyse_energy(motion: MeasuredMotion) -> Energy:
     """Energies with both uncertainties, loss over the recording, and the adiabatic level."""
     found = propagate(motion, lambda state: energy_quantities(state, motion.disc, motion.gravity))
-    loss, noise, common = _loss(found)
+    loss, noise, common = _loss(found, TOTAL)
     ratio, ratio_sigma = _level_ratio(motion, found.value[:, 8])
     theta = motion.euler[np.isfinite(found.value[:, 8]), 1]
     steady = float("nan")
@@ -83,7 +85,7 @@ def analyse_energy(motion: MeasuredMotion) -> Energy:
     return Energy(found.series(ENERGY), found, loss, noise, common, ratio, ratio_sigma, steady)
 
 
-def _loss(found: Propagated, column: int = 5) -> tuple[float, float, float]:
+def _loss(found: Propagated, column: int) -> tuple[float, float, float]:
     known = np.flatnonzero(np.isfinite(found.value[:, column]))
     if known.size < 2:
         return (float("nan"),) * 3

@@ -1,7 +1,7 @@
 """Quantities derived from a motion, with two uncertainties that must not be mixed.
 
 Noise differs from frame to frame; the calibration's error is one and the same in all frames, and what else repeats
-(`Motion.systematic_at`) changes with the motion only. The first averages out, the others do not, so every derived
+(`MeasuredMotion.systematic_at`) changes with the motion only. The first averages out, the others do not: every derived
 quantity carries the two apart.
 """
 
@@ -78,16 +78,6 @@ class Propagated:
         return self.covariance_at(np.arange(len(self.value)), slice(None))
 
     @property
-    def calibration_sensitivity(self) -> Array:
-        """(n, k, 30) d value / d RIG_PARAMETERS."""
-        return self.sensitivity_at(np.arange(len(self.value)), slice(None))
-
-    @property
-    def calibration_covariance(self) -> Array:
-        """(n, k, k) at one instant: the rig's, common to all instants, and that of what else repeats."""
-        return self.calibration_covariance_at(np.arange(len(self.value)), slice(None))
-
-    @property
     def rig_covariance(self) -> Array:
         """(30, 30) of RIG_PARAMETERS."""
         return self.motion.rig_covariance
@@ -126,7 +116,7 @@ class Propagated:
         return _by_parts(some, frames)
 
     def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
-        """The columns as Series; names are (name, unit, long_name)."""
+        """The columns one by one; names are (name, unit, long_name)."""
         frames, all_columns = np.arange(len(self.value)), slice(None)
 
         def sigmas(rows: NDArray[np.int64]) -> Array:

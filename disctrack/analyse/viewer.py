@@ -18,7 +18,7 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
-from disctrack.frames import quaternion_from_rotation
+from disctrack.frames import CAMERAS, quaternion_from_rotation
 
 TIMELINE = "recording"
 _RIM_POINTS = 96
@@ -77,10 +77,7 @@ def _log_scene(rr: Any, stream: Any, analysis: Analysis) -> None:
 
 
 def _log_cameras(rr: Any, stream: Any, rig: StereoRig) -> None:
-    R_right_world = rig.R_right_left @ rig.R_left_world
-    t_right_world = rig.R_right_left @ rig.t_left_world + rig.t_right_left
-    poses = {"left": (rig.R_left_world, rig.t_left_world), "right": (R_right_world, t_right_world)}
-    for (name, (R, t)), camera in zip(poses.items(), rig.cameras, strict=True):
+    for name, (R, t), camera in zip(CAMERAS, rig.camera_poses(), rig.cameras, strict=True):
         stream.log(f"world/{name}", rr.Transform3D(translation=-R.T @ t, mat3x3=R.T), static=True)
         pinhole = rr.Pinhole(
             image_from_camera=camera.camera_matrix,

@@ -2,7 +2,7 @@
 
 from disctrack.frames import CAMERAS, COORDINATES
 
-_UNITS = ("m",) * 3 + ("rad",) * 3
+UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
 
 # Reduced chi-square of the rolling model with k_m alone; what thousands of dots scatter by is far below.
 LACKS_SOMETHING = 1.5
@@ -34,10 +34,10 @@ COLUMNS: dict[str, str] = {
     "energy_loss_sigma_J": "noise and calibration",
     **{f"reprojection_rms_{camera}_px": "observed - projected dots" for camera in CAMERAS},
     "reduced_chi_square": "of the poses, median of the frames",
-    **{f"{n}_sigma_{u}": "noise of one frame, median" for n, u in zip(COORDINATES, _UNITS, strict=True)},
+    **{f"{n}_sigma_{u}": "noise of one frame, median" for n, u in zip(COORDINATES, UNITS, strict=True)},
     **{
         f"{n}_sigma_calibration_{u}": "from the rig, common to all frames"
-        for n, u in zip(COORDINATES, _UNITS, strict=True)
+        for n, u in zip(COORDINATES, UNITS, strict=True)
     },
     "diagnosis": "verdict, where a diagnosis was asked for",
     "diagnosis_sentence": "",

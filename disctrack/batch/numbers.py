@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from disctrack.analyse.analysis import Analysis
+from disctrack.batch.columns import UNITS
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.engine.fit import fit
@@ -17,7 +18,6 @@ from disctrack.trajectory import FrameStatus, Trajectory
 
 Numbers = dict[str, Any]
 
-_UNITS = ("m",) * 3 + ("rad",) * 3
 _K_M = "km.k_m"
 
 
@@ -36,7 +36,7 @@ def tracked_numbers(trajectory: Trajectory) -> Numbers:
         numbers[f"reprojection_rms_{camera}_px"] = _number(np.sqrt(np.mean(seen**2))) if seen.size else None
     numbers["reduced_chi_square"] = _median(trajectory.reduced_chi_square)
     for ending, sigma in (("", trajectory.coordinate_sigma), ("_calibration", trajectory.calibration_sigma)):
-        for i, (name, unit) in enumerate(zip(COORDINATES, _UNITS, strict=True)):
+        for i, (name, unit) in enumerate(zip(COORDINATES, UNITS, strict=True)):
             numbers[f"{name}_sigma{ending}_{unit}"] = _median(sigma[:, i])
     return numbers
 

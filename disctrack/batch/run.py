@@ -31,7 +31,6 @@ class BatchOutcome:
     """What a batch did."""
 
     rows: tuple[Row, ...]  # of the recordings that were this batch's to do
-    all_rows: tuple[Row, ...]  # of all that were found
     files: tuple[Path, ...]  # summary.json, summary.csv, index.html; none where they could not be written
     problems: tuple[str, ...]  # besides those of single recordings
     interrupted: bool = False
@@ -155,7 +154,7 @@ def _summed_up(
         rows = rows_of(places, places.found.recordings, results)
     names = {places.found.name(folder) for folder in mine}
     own = tuple(row for row in rows if row["recording"] in names)
-    return BatchOutcome(own, tuple(rows), files, tuple(problems), interrupted, tuple(said))
+    return BatchOutcome(own, files, tuple(problems), interrupted, tuple(said))
 
 
 class _Bar:

@@ -14,6 +14,7 @@ import csv
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -295,9 +296,7 @@ def example(folder: Path) -> Outcome:
     return Outcome(report(answer), found, figure(answer))
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the example; returns the exit code."""
-    return command("ball_drop", "ball_drops.csv and balls.txt", example, words)
+main = partial(command, "ball_drop", "ball_drops.csv and balls.txt", example)
 
 
 if __name__ == "__main__":

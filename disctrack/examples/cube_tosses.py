@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -141,9 +142,7 @@ def example(folder: Path) -> Outcome:
     )
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the example; returns the exit code."""
-    return command("cube_tosses", "cube_tosses.npz", example, words)
+main = partial(command, "cube_tosses", "cube_tosses.npz", example)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ k1 / (m1 a1^2 + I1) of their numbers can be told from a free swing.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -108,9 +108,7 @@ def figure(time: Array, angle: Array, left: dict[str, Array]) -> Figure:
     return picture
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the example; returns the exit code."""
-    return command("pendulum", "single_free_swing.npz", example, words)
+main = partial(command, "pendulum", "single_free_swing.npz", example)
 
 
 if __name__ == "__main__":

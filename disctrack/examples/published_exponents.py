@@ -11,8 +11,8 @@ contradiction, and which of them these tables cannot tell apart.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -240,9 +240,7 @@ def example() -> Outcome:
     return Outcome(report(answer), as_document(answer), figure(system, answer))
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return command("published_exponents", None, example, words)
+main = partial(command, "published_exponents", None, example)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ class AnalysedRun:
 
 
 def read_run(path: Path, k_m_from_energy: bool = False) -> AnalysedRun:
-    """An analysed trajectory file as a Run.
+    """One analysed trajectory file.
 
     k_m_from_energy : do not take k_m from the diagnosis even where there is one
     Raises TrajectoryFileError or AnalysisError that says what is missing and which command writes it.

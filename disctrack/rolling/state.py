@@ -30,11 +30,6 @@ class State:
     z: float | None = None
     v_z: float | None = None
 
-    @classmethod
-    def from_array(cls, values: Array) -> State:
-        """From the first 8, 10 or 12 of records.STATE_COMPONENTS."""
-        return cls(*(float(v) for v in values))
-
     @property
     def array(self) -> Array:
         """Components that are given: (8,), (10,) or (12,)."""

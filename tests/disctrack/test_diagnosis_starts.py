@@ -164,7 +164,7 @@ def test_slip_that_no_coefficient_describes_is_left_out_and_said_so():
             from disctrack.rolling import State
 
             stronger = PAPER.with_values({"slip.mu": 0.35})
-            q[late] = simulate(stronger, State.from_array(slow), times=np.r_[half, times[late]]).q[1:]
+            q[late] = simulate(stronger, State(*slow.tolist()), times=np.r_[half, times[late]]).q[1:]
         return q
 
     result = diagnose_trajectory(measured(motion=falling, seed=44, n=400))

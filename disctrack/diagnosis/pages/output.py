@@ -130,7 +130,8 @@ def tried_json(tried: Tried) -> dict[str, Any]:
     }
 
 
-def _declared(fit: Fit) -> dict[str, Any]:
+def declared_json(fit: Fit) -> dict[str, Any]:
+    """Numbers of the declared laws with their standard deviations."""
     laws = [q for q in fit.quantities if not q.name.startswith("state.") and not np.isfinite(q.prior_sigma)]
     return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
 
@@ -184,9 +185,9 @@ def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> d
         "frames": [int(result.system.trajectory.frame[i]) for i in (rows.start, rows.stop - 1)],
         "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
         "before": (_errors(result.before, tuple(b for b, _ in longer)) or {})
-        | {"parameters": _declared(diagnosis.before)},
+        | {"parameters": declared_json(diagnosis.before)},
         "after": (_errors(result.after, tuple(a for _, a in longer)) or {})
-        | {"parameters": _declared(result.after_fit)},
+        | {"parameters": declared_json(result.after_fit)},
         "noise_variance_over_stated": diagnosis.noise,
         "chance": vars(diagnosis.chance) if diagnosis.chance else {},
         "holds": {

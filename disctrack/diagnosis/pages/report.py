@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
-from disctrack.diagnosis.engine.search import Found
+from disctrack.diagnosis.engine.search import Found, Tried
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.figures import all_figures
@@ -40,7 +41,7 @@ def _page(result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: st
         section("What would settle it", planned.html(result.plan)),
         section("Before and after", _before_after(result, beside)),
         section("In pictures", [figures]),
-        section("What was tried", [_tried(result)]),
+        section("What was tried", [tried_table(result.diagnosis.tried)]),
     ]
     return page(f"{recording}: what does the model lack?", parts)
 
@@ -153,12 +154,12 @@ def _energy(result: DiscDiagnosis, beside: ModelFreeEvidence) -> list[tuple[str,
     return rows
 
 
-def _tried(result: DiscDiagnosis) -> str:
+def tried_table(tried: Sequence[Tried]) -> str:
+    """What became of every candidate; empty where none was looked at."""
     number = lambda value: "" if value is None else f"{value:.4g}"  # noqa: E731
     rows = [
         (t.candidate.title, t.candidate.name, number(t.score), number(t.gain), number(t.held_out_gain), t.reason)
-        for t in result.diagnosis.tried
+        for t in tried
     ]
-    return (
-        table("", ("candidate", "name", "score", "gain, refitted", "gain, held out", "outcome"), rows) if rows else ""
-    )
+    header = ("candidate", "name", "score", "gain, refitted", "gain, held out", "outcome")
+    return table("", header, rows) if rows else ""

@@ -13,7 +13,8 @@ from disctrack.diagnosis.engine.search import Diagnosis, Found
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.pages.output import effect_json, tried_json
+from disctrack.diagnosis.pages.output import declared_json, effect_json, tried_json
+from disctrack.diagnosis.pages.report import tried_table
 from disctrack.diagnosis.pages.words import effect_text, quantity_text
 from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.diagnosis.together.sharing import EACH
@@ -104,11 +105,7 @@ def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
         key: {
             "reduced_chi_square": fit.reduced_chi_square,
             "held_out": {"ratio_to_noise_floor": None if held is None else held.ratio_to_floor},
-            "parameters": {
-                q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit}
-                for q in fit.quantities
-                if not np.isfinite(q.prior_sigma)
-            },
+            "parameters": declared_json(fit),
         }
         for key, fit, held in (("before", d.before, d.held_out_before), ("after", d.after, d.held_out_after))
     }
@@ -199,7 +196,7 @@ def whole_page(answer: TogetherDiagnosis, pictures: str) -> str:
         section("Each recording against the others", [_recordings(answer)]),
         section("What many recordings bring", [_by_number(answer)]),
         section("What would settle it", planned.html(answer.plan)),
-        section("What was tried", [_tried(answer)]),
+        section("What was tried", [details("All candidates", [tried]) if (tried := tried_table(d.tried)) else ""]),
     ]
     return page("Many recordings: what does the model lack?", parts)
 
@@ -309,16 +306,6 @@ def _of_interest(answer: TogetherDiagnosis) -> list[Bound]:
 
     usable = [b for b in answer.bounds if seen(b) and not (b.candidate.name.endswith(f"({EACH})") and rank(b)[0])]
     return sorted(usable, key=rank)[:SHOWN]
-
-
-def _tried(answer: TogetherDiagnosis) -> str:
-    number = lambda value: "" if value is None else f"{value:.4g}"  # noqa: E731
-    rows = [
-        (t.candidate.title, t.candidate.name, number(t.score), number(t.gain), number(t.held_out_gain), t.reason)
-        for t in answer.diagnosis.tried
-    ]
-    header = ("candidate", "name", "score", "gain, refitted", "gain, held out", "outcome")
-    return details("All candidates", [table("", header, rows)]) if rows else ""
 
 
 def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:

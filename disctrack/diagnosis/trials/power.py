@@ -4,7 +4,7 @@
 
 One fit per recording without any effect, and the derivatives by every effect there: what the initial state, k_m, the
 calibration and the dots' biases leave of a planted effect is its noncentrality, and with the threshold of the search
-that gives the probability of a claim. Held against trials with refits and free runs by `diagnosis_rates --factor`.
+that gives the probability of a claim. Held against trials with refits and free runs by `trials.rates --factor`.
 """
 
 from __future__ import annotations
