@@ -24,6 +24,8 @@ angle of e in the body, is touched at p e + p' e3 x e (both at once: to first or
 A table that moves by u(t) is at rest in its own axes, where gravity is g - u''. If it gives way by c F_z, then to first
 order in the compliance c the load is that of the rigid table, whose course F_z', F_z'' along the motion is had by
 differences over LOAD_STEP; slip that friction would turn within that time keeps its direction beside n0 in it.
+A contact that creeps, v_A = -c F_t / F_z, is a table that slides by as much under a rolling disc: v_A follows the force
+within c / (3 g), and is had in powers of that time over the motion's, by the same differences.
 
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
@@ -48,6 +50,7 @@ EVENTS = ("theta_end", "load", "grip", "upright")
 N_EVENTS = len(EVENTS)
 STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
 LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
+CREEP_PASSES = 3  # each adds a power of c times the motion's rate over 3 g to what is known of creep
 LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
 
 # table: integers shared by all functions: regime, number of laws, addresses of kinematics and wrench, then the address
@@ -315,12 +318,15 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
 @_part
 def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
     load = _course_of_load(t, y, table, body, kin, wrench)
+    slide = _creeping(t, y, table, body, kin, wrench)
     _kinematics(table[0], t, y, body, kin)
     _apply_laws(table, wrench)
+    wrench.table_vx, wrench.table_vy = wrench.table_vx + slide[0], wrench.table_vy + slide[1]
+    wrench.table_ax, wrench.table_ay = wrench.table_ax + slide[2], wrench.table_ay + slide[3]
     wrench.table_z -= body.compliance * load[0]
     wrench.table_vz -= body.compliance * load[1]
     wrench.table_az -= body.compliance * load[2]
-    return _accelerations(table[0], y, body, kin, wrench)
+    return _accelerations(table[0], y, body, kin, wrench), slide
 
 
 @_part
@@ -387,11 +393,47 @@ def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any
     return now, (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
 
 
+@_part
+def _pull(t: Any, y: Any, slide_x: Any, slide_y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    """F_x / N and F_y / N of a disc that rolls, its contact accelerated by `slide`; and the rates of the state."""
+    _kinematics(table[0], t, y, body, kin)
+    _apply_laws(table, wrench)
+    wrench.table_ax, wrench.table_ay = wrench.table_ax + slide_x, wrench.table_ay + slide_y
+    rate = _rates_of(y, kin, _accelerations(table[0], y, body, kin, wrench))
+    sp, cp = np.sin(kin.psi), np.cos(kin.psi)
+    # along the table: what the normal of a hollow supports is no friction
+    F_n, F_m = wrench.F_n - wrench.N * kin.normal_n, wrench.F_m - wrench.N * kin.normal_m
+    return ((F_n * cp - F_m * sp) / wrench.N, (F_n * sp + F_m * cp) / wrench.N), rate
+
+
+@_part
+def _creeping(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+    """Velocity and acceleration along i and j of a contact that creeps; zeros where it does not, or slips."""
+    nothing = 0.0 * y[0]
+    if body.creep == 0.0 or table[0] != ROLLING:
+        return nothing, nothing, nothing, nothing
+    c, h = body.creep, LOAD_STEP
+    here = (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], nothing, nothing, nothing, nothing)
+    f, a_x, a_y, j_x, j_y = (nothing, nothing), nothing, nothing, nothing, nothing
+    # the force that accelerates what creeps is part of the force by which it creeps
+    for _ in range(CREEP_PASSES):
+        f, first = _pull(t, here, a_x, a_y, table, body, kin, wrench)
+        half = (t[0] + 0.5 * h,), _moved(here, 0.5 * h, first), a_x + 0.5 * j_x, a_y + 0.5 * j_y
+        _, middle = _pull(half[0], half[1], half[2], half[3], table, body, kin, wrench)
+        after, _ = _pull((t[0] + h,), _moved(here, h, middle), a_x + j_x, a_y + j_y, table, body, kin, wrench)
+        half = (t[0] - 0.5 * h,), _moved(here, -0.5 * h, first), a_x - 0.5 * j_x, a_y - 0.5 * j_y
+        _, middle = _pull(half[0], half[1], half[2], half[3], table, body, kin, wrench)
+        before, _ = _pull((t[0] - h,), _moved(here, -h, middle), a_x - j_x, a_y - j_y, table, body, kin, wrench)
+        a_x, a_y = -c * (after[0] - before[0]) / (2.0 * h), -c * (after[1] - before[1]) / (2.0 * h)
+        j_x, j_y = -c * (after[0] - 2.0 * f[0] + before[0]) / h, -c * (after[1] - 2.0 * f[1] + before[1]) / h
+    return -c * f[0], -c * f[1], a_x, a_y
+
+
 def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
     """Time derivative of the state; fills kinematics and wrench on the way."""
-    found = _evaluate(t, y, table, body, kin, wrench)
+    found, slide = _evaluate(t, y, table, body, kin, wrench)
     rate = _rates_of(y, kin, found)
-    ydot[0], ydot[1], ydot[2], ydot[3], ydot[4] = rate[0], rate[1], rate[2], rate[3], rate[4]
+    ydot[0], ydot[1], ydot[2], ydot[3], ydot[4] = rate[0] + slide[0], rate[1] + slide[1], rate[2], rate[3], rate[4]
     ydot[5], ydot[6], ydot[7] = rate[5], rate[6], rate[7]
     if table[0] != ROLLING:
         ydot[8], ydot[9] = rate[8], rate[9]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from numpy.testing import assert_allclose
+from scipy.integrate import simpson, solve_ivp
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
@@ -379,6 +380,60 @@ def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one():
         assert (np.abs(found - expected).max(axis=0) < 1500 * c * size).all()  # second order: 9e-5 and 9e-4
     derivative = rolling.sensitivities(rigid, start, fine[::40], ["table_yielding.c"], components=[])
     assert (np.abs(derivative.dq[..., 0] * c - expected).max(axis=0) < 1500 * c * size).all()
+
+
+class _Creeping(newton_euler.Disc):
+    """A disc that slips all the time, on a film: friction in proportion to the speed of slip."""
+
+    c = 1.0
+
+    def moved(self, state):
+        self.mu = np.linalg.norm(newton_euler.Instant(self, state).v_contact) / self.c
+        return self
+
+
+@pytest.mark.parametrize(("c", "tolerance"), [(1e-3, 1e-4), (0.02, 0.025)])
+def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, tolerance):
+    """The oracle slips with its inertia, stiffly; ours follows the force within a step of its differences."""
+    effects = (CATALOGUE["km"](k_m=4e-8), CATALOGUE["centre_of_mass"](c_1=1e-3, c_2=-5e-4, c_3=3e-4))
+    rigid = Model(MA_2014, effects=effects)
+    start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)
+    options = {"laws": [newton_euler.precession_friction(4e-8)], "com_body": (1e-3, -5e-4, 3e-4)}
+    oracle = _Creeping(MA_2014.radius, MA_2014.half_thickness, MA_2014.mass, **options)
+    oracle.c = c
+    state = newton_euler.state_from_angles(oracle, *start.array)
+    force = newton_euler.accelerations(oracle, state, "rolling")[2]
+    state[7:9] -= c * force[:2] / force[2]
+    times = np.linspace(0.0, 0.3, 301)
+    slips = lambda t, s: newton_euler.rate(oracle.moved(s), s, "slipping")  # noqa: E731
+    solution = solve_ivp(slips, (0.0, times[-1]), state, "LSODA", times, rtol=1e-10, atol=1e-12)
+    expected = newton_euler.coordinates(oracle, solution.y)
+    settled = 20  # ms, after which the slip follows its force
+    now = newton_euler.Instant(oracle, solution.y[:, settled])
+    along = (now.omega @ now.n0, now.omega @ np.cross(now.d, now.n0), now.omega @ now.d)
+    begin = State(*expected[settled, [0, 1, 3, 4, 5]], *along)
+    model = rigid.with_effects(CATALOGUE["creep"](c=c))
+    found, without = (rolling.simulate(m, begin, times=times[settled:]) for m in (model, rigid))
+    size = np.abs(without.q - expected[settled:]).max(axis=0)
+    assert (size[:3] > 2e-4 * c).all()
+    assert (np.abs(found.q - expected[settled:]).max(axis=0) < tolerance * size).all()
+    assert_allclose(found.qdot[0, :3], solution.y[7:10, settled], atol=2e-3 * np.linalg.norm(now.v_contact))
+    lost = found.energy[-1] - found.energy[0]
+    assert lost < 0
+    assert_allclose(simpson(found.power, x=found.time), lost, rtol=1e-3)
+
+
+def test_creep_has_its_derivative_where_nothing_creeps():
+    model = Model(MA_2014, effects=(CATALOGUE["km"](k_m=4e-8),))
+    start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)
+    times = np.linspace(0.0, 0.3, 31)
+    c = 1e-7
+    creeping = model.with_effects(CATALOGUE["creep"](c=c))
+    moved = rolling.simulate(creeping, start, times=times).q - rolling.simulate(model, start, times=times).q
+    size = np.abs(moved).max(axis=0)
+    found = rolling.sensitivities(model, start, times, ["creep.c"], components=[]).dq[..., 0] * c
+    assert (size > 0).all()
+    assert (np.abs(found - moved).max(axis=0) < 1e-3 * size).all()
 
 
 def test_accelerations_of_the_motion_are_the_second_derivatives_of_its_poses():

@@ -165,6 +165,7 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _vector("rim_lobes", "rim with three lobes", ("rim.lobes_c", "rim.lobes_s"), 1e-5, "m"),
     HiddenEffect("rim_flat", "flat of the rim", 1e-5, "m", _flat),
     _law("table_yielding", "table gives way", "c", 1e-6, "m/N"),
+    _law("creep", "contact that creeps", "c", 2e-6, "m/s"),
     HiddenEffect("table_shaken", "table shaken under the cameras", 2e-6, "m", _shaken),
     HiddenEffect("frame_rate", "wrong frame rate", 0.012, "1", _clock),
     _law("rolling_classical", "classical rolling friction", "delta", 2e-4, "m"),

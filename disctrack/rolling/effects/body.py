@@ -140,6 +140,17 @@ def table_yielding(body: Any, p: Any) -> None:
 
 
 @effect(
+    "contact that creeps, v_A = -c F_t / F_z",
+    "a film or skin that is sheared (Newton's law); creep of rolling contacts (Johnson 1985, Contact Mechanics, ch. 8)",
+    EffectParameter("c", "m/s", 1e-5, "velocity of the contact over F_t / F_z", lower=0.0, upper=0.1),
+    belongs_to=("disc", "surface"),
+)
+def creep(body: Any, p: Any) -> None:
+    """The contact gives way to friction: it moves along the table, in proportion to the force over the load."""
+    body.creep = body.creep + p.c
+
+
+@effect(
     "J1 and J2 multiplied by 1 + e",
     "holes, rims, inhomogeneous material",
     EffectParameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),
