@@ -24,6 +24,7 @@ from calibration.errors import RigFileError
 
 MRCAL_MODELS = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5}
 MAX_BYTES = 50_000_000  # mrcal keeps the whole calibration in a camera's file
+MAX_SIDE = 1_000_000  # [px]
 
 
 def export_caliscope(path: str | os.PathLike[str], rig: StereoRig) -> None:
@@ -70,13 +71,12 @@ def import_caliscope(
         table, where = found[name], f"{path}, camera {name}"
         if table.get("fisheye"):
             raise RigFileError(f"{where}: a fisheye lens; only Brown's distortion can be read")
-        K = _array(table, "matrix", (3, 3), where)
-        D = np.asarray(table.get("distortions", []), float).ravel()
-        size = _array(table, "size", (2,), where).astype(int)
-        rotation = np.asarray(table.get("rotation", []), float)
-        if rotation.size not in (3, 9):
+        K, size = _array(table, "matrix", (3, 3), where), _array(table, "size", (2,), where)
+        D = _array(table, "distortions", (-1,), where) if "distortions" in table else np.zeros(0)
+        if not table.get("rotation"):
             raise RigFileError(f"{where}: has no rotation: its place was not calibrated")
-        parts.append((_camera(K, D, size, where), _matrix(rotation, where), _array(table, "translation", (3,), where)))
+        R = rotation_of(_array(table, "rotation", (-1,), where), where)
+        parts.append((camera_of(K, D, size, where), R, _array(table, "translation", (3,), where)))
     return _rig(parts, world_is_table)
 
 
@@ -119,10 +119,11 @@ def import_mrcal(
         values = _array(model, "intrinsics", (4 + MRCAL_MODELS[name],), str(path))
         fx, fy, cx, cy, *distortion = (float(value) for value in values)
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        size = _array(model, "imagersize", (2,), str(path)).astype(int)
+        size = _array(model, "imagersize", (2,), str(path))
         key = next((k for k in ("extrinsics", "rt_cam_ref") if k in model), "extrinsics")
         rt = _array(model, key, (6,), str(path))
-        parts.append((_camera(K, np.array(distortion), size, str(path)), _matrix(rt[:3], str(path)), rt[3:]))
+        camera = camera_of(K, np.array(distortion), size, str(path))
+        parts.append((camera, rotation_of(rt[:3], str(path)), rt[3:]))
     return _rig(parts, world_is_table)
 
 
@@ -131,13 +132,23 @@ def _rig(parts: list[tuple[Camera, Array, Array]], world_is_table: bool) -> Ster
     return StereoRig(left, right, **placed_at([(R, t) for _, R, t in parts]), world_is_table=world_is_table)
 
 
-def _camera(K: Array, D: Array, size: Array, where: str) -> Camera:
-    if not (K[0, 0] > 0 and K[1, 1] > 0) or abs(K[0, 1]) > 1e-9 or size.min() < 1:
-        raise RigFileError(f"{where}: no camera matrix without skew, or no image size")
+def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
+    """From another program's camera matrix, up to 14 lens terms of OpenCV's order, and image size (width, height).
+
+    Raises RigFileError; `where` begins what it says.
+    """
+    if K.shape != (3, 3) or not np.isfinite(K).all() or not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise RigFileError(f"{where}: {K.tolist()} is not a camera matrix")
+    if not np.abs(K - [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]]).max() < 1e-9:
+        raise RigFileError(
+            f"{where}: the camera matrix is {K.tolist()}; expected fx, 0, cx; 0, fy, cy; 0, 0, 1: without skew "
+            "(MATLAB keeps it transposed, and R, too)"
+        )
+    if not (size >= 1).all() or not (size < MAX_SIDE).all():
+        raise RigFileError(f"{where}: no image size")
     if len(D) > 14 or not np.isfinite(D).all() or np.any(D[5:] != 0):
-        raise RigFileError(f"{where}: {len(D)} lens terms; only k1 k2 p1 p2 k3 can be read")
-    terms = np.zeros(5)
-    terms[: len(D[:5])] = D[:5]
+        raise RigFileError(f"{where}: the lens terms are {D.tolist()}; k1 k2 p1 p2 k3 can be read, and no further")
+    terms = np.append(D, np.zeros(5))[:5]
     return Camera.from_parameters(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *terms]), (int(size[0]), int(size[1])))
 
 
@@ -151,10 +162,13 @@ def _array(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where: st
     return value
 
 
-def _matrix(rotation: Array, where: str) -> Array:
-    R = np.asarray(cv2.Rodrigues(rotation.reshape(3))[0], float) if rotation.size == 3 else rotation.reshape(3, 3)
+def rotation_of(rotation: Array, where: str) -> Array:
+    """(3, 3) from a matrix or a rotation vector. Raises RigFileError; `where` begins what it says."""
+    R = np.asarray(cv2.Rodrigues(rotation.reshape(3))[0] if rotation.size == 3 else rotation, float)
+    whole = R.size == 9 and np.abs(R).max() < 2  # not above: numbers may be of any size in a file
+    R = R.reshape(3, 3) if whole else np.zeros((3, 3))
     if not np.abs(R @ R.T - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
-        raise RigFileError(f"{where}: its rotation is none")
+        raise RigFileError(f"{where}: {rotation.tolist()} is not a rotation")
     return R
 
 

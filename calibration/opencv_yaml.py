@@ -11,6 +11,7 @@ import numpy as np
 from calibration.arrays import Array
 from calibration.camera import Camera, StereoRig
 from calibration.errors import RigFileError
+from calibration.foreign_rigs import camera_of, rotation_of
 
 MAX_BYTES = 10_000_000  # a rig has a few kB
 
@@ -78,14 +79,13 @@ def import_opencv(
         raise RigFileError(f"{where}: does not say in which unit T is; give it (0.025 for squares of 25 mm)")
     scale = 1.0 if unit is None else unit
     cameras = [_camera(nodes, number, image_size, where) for number in (1, 2)]
-    R = _rotation(nodes["R"], where)
     world = "R_left_world" in nodes and "t_left_world" in nodes
     return StereoRig(
         left=cameras[0],
         right=cameras[1],
-        R_right_left=R,
+        R_right_left=rotation_of(nodes["R"], f"{where}: R"),
         t_right_left=_vector(nodes["T"], where) * scale,
-        R_left_world=_rotation(nodes["R_left_world"], where) if world else np.eye(3),
+        R_left_world=rotation_of(nodes["R_left_world"], f"{where}: R_left_world") if world else np.eye(3),
         t_left_world=_vector(nodes["t_left_world"], where) * scale if world else np.zeros(3),
         world_is_table=world and is_table,
     )
@@ -106,28 +106,10 @@ def _opened(path: Path) -> cv2.FileStorage:
 
 
 def _camera(nodes: dict[str, Array], number: int, image_size: tuple[int, int] | None, where: str) -> Camera:
-    K, D = nodes[f"M{number}"], nodes[f"D{number}"].ravel()
-    size = nodes.get(f"image_size{number}")
-    if size is not None and size.size == 2:
-        image_size = (int(size.ravel()[0]), int(size.ravel()[1]))
-    if image_size is None:
+    size = nodes.get(f"image_size{number}", np.array(image_size or (), float)).ravel()
+    if size.size != 2:
         raise RigFileError(f"{where}: does not tell the image size; give width and height")
-    if K.shape != (3, 3) or not np.isfinite(K).all() or not (K[0, 0] > 0 and K[1, 1] > 0) or abs(K[0, 1]) > 1e-9:
-        raise RigFileError(f"{where}: M{number} is not a camera matrix without skew")
-    if not 4 <= len(D) <= 14 or not np.isfinite(D).all() or np.any(D[5:] != 0):
-        raise RigFileError(
-            f"{where}: D{number} = {D} is not Brown's distortion k1 k2 p1 p2 k3; rational terms cannot be read"
-        )
-    D = np.append(D, 0.0)[:5]
-    return Camera.from_parameters(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *D]), image_size)
-
-
-def _rotation(R: Array, where: str) -> Array:
-    if R.size == 3:
-        R = np.asarray(cv2.Rodrigues(R.reshape(3))[0], np.float64)
-    if R.shape != (3, 3) or not np.abs(R @ R.T - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
-        raise RigFileError(f"{where}: R is not a rotation")
-    return R
+    return camera_of(nodes[f"M{number}"], nodes[f"D{number}"].ravel(), size, f"{where}: M{number}, D{number}")
 
 
 def _vector(t: Array, where: str) -> Array:

@@ -12,6 +12,7 @@ from scipy.io import loadmat
 
 from calibration.camera import N_RIG, StereoRig, project
 from calibration.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
+from calibration.opencv_yaml import export_opencv, import_opencv
 from disctrack.cli import main
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, RigFileError
@@ -144,6 +145,51 @@ def test_a_fisheye_and_a_third_camera_are_refused_by_name(rig, tmp_path):
     with pytest.raises(RigFileError, match="0, 1, 5; name two"):
         import_caliscope(path)
     assert import_caliscope(path, ("0", "1")).baseline == pytest.approx(rig.baseline)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda K: K.T, "camera matrix is .*MATLAB"),
+        (lambda K: K + np.eye(3, k=1) * [[1], [0], [0]], "without skew"),
+        (lambda K: 2 * K, "expected fx, 0, cx; 0, fy, cy; 0, 0, 1"),
+        (lambda K: -K, "is not a camera matrix"),
+    ],
+)
+def test_what_is_not_a_camera_matrix_is_refused(rig, tmp_path, change, words):
+    export_opencv(tmp_path / "rig.yml", rig)
+    export_caliscope(tmp_path / "rig.toml", rig)
+    K, source = rig.left.camera_matrix, cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
+    target = cv2.FileStorage(str(tmp_path / "other.yml"), cv2.FILE_STORAGE_WRITE)
+    target.write("M1", change(K))
+    for name in ("D1", "M2", "D2", "R", "T", "image_size1", "image_size2"):
+        target.write(name, source.getNode(name).mat())
+    target.release()
+    with pytest.raises(RigFileError, match=f"M1.*{words}"):
+        import_opencv(tmp_path / "other.yml", unit=1.0)
+    text = (tmp_path / "rig.toml").read_text()
+    (tmp_path / "other.toml").write_text(text.replace(f"matrix = {K.tolist()}", f"matrix = {change(K).tolist()}"))
+    with pytest.raises(RigFileError, match=f"camera 0.*{words}"):
+        import_caliscope(tmp_path / "other.toml")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("distortions", '["a"]', "'distortions' is missing, or not numbers"),
+        ("rotation", '"none"', "'rotation' is missing, or not numbers"),
+        ("rotation", "[]", "has no rotation"),
+        ("rotation", "[[1e300, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]", "is not a rotation"),
+        ("size", "[1e300, 200]", "no image size"),
+    ],
+)
+def test_what_a_camera_table_cannot_hold_is_named(rig, tmp_path, key, value, words):
+    path = tmp_path / "camera_array.toml"
+    export_caliscope(path, rig)
+    lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    with pytest.raises(RigFileError, match=f"camera 0.*{words}"):
+        import_caliscope(path)
 
 
 def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):
