@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from calibration import Board
 from disctrack.calibrate.stage import CalibrationSource, calibrate_into, source_of
@@ -14,6 +15,9 @@ from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
 from disctrack.track import summary
 
+VIEWS = ("--left", "--right", "--corners", "--square-mm")
+TABLE = ("--table-view", "--board-thickness-mm")
+
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
@@ -21,6 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
         source = _source_of_patterns(arguments)
         path = arguments.output or Path("rig.h5")
     else:
+        _refuse_words_beside_a_recording(arguments)
         source = source_of(read_recording(arguments.recording), outputs.calibration_settings(arguments))
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
@@ -31,20 +36,26 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
     """Views named on the command line. Raises RecordingError."""
-    given = {
-        "--left": arguments.left,
-        "--right": arguments.right,
-        "--corners": arguments.corners,
-        "--square-mm": arguments.square_mm,
-    }
-    missing = [option for option, value in given.items() if value is None]
+    missing = [option for option in VIEWS if _given(arguments, option) is None]
     if missing:
-        raise RecordingError(f"{', '.join(missing)} missing: give a recording's folder, or all of {', '.join(given)}.")
+        raise RecordingError(f"{', '.join(missing)} missing: give a recording's folder, or all of {', '.join(VIEWS)}.")
     return CalibrationSource(
         arguments.left,
         find_views(arguments.left, arguments.right, Path()),
         Board(arguments.corners, arguments.square_mm * 1e-3),
         arguments.table_view,
-        arguments.board_thickness_mm * 1e-3,
+        (arguments.board_thickness_mm or 0.0) * 1e-3,
         outputs.calibration_settings(arguments),
     )
+
+
+def _refuse_words_beside_a_recording(arguments: argparse.Namespace) -> None:
+    given = [option for option in VIEWS + TABLE if _given(arguments, option) is not None]
+    if given:
+        raise RecordingError(
+            f"{', '.join(given)}: a recording's own recording.toml says this. Change it there, or give no folder."
+        )
+
+
+def _given(arguments: argparse.Namespace, option: str) -> Any:
+    return getattr(arguments, option[2:].replace("-", "_"))

@@ -31,8 +31,9 @@ def add_init(parser: argparse.ArgumentParser) -> None:
     )
     group = parser.add_argument_group("what no file tells", "left to fill in where it is not given")
     for option, what in UNKNOWN_TO_FILES.items():
+        number = _length_or_zero if option == "board_thickness_mm" else _positive_number
         group.add_argument(
-            f"--{option.replace('_', '-')}", type=float, metavar=option.rsplit("_", 1)[-1].upper(), help=what
+            f"--{option.replace('_', '-')}", type=number, metavar=option.rsplit("_", 1)[-1].upper(), help=what
         )
 
 
@@ -73,9 +74,9 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     without.add_argument("--left", metavar="PATTERN", help="left views, e.g. 'left*.jpg'")
     without.add_argument("--right", metavar="PATTERN", help="right views, in the same order")
     without.add_argument("--corners", type=_corners, metavar="NxM", help="inner corners, long side first, e.g. 9x6")
-    without.add_argument("--square-mm", type=_length, metavar="MM", help="side of a square")
+    without.add_argument("--square-mm", type=_positive_number, metavar="MM", help="side of a square")
     without.add_argument("--table-view", type=int, metavar="I", help="view whose board lies flat on the table, from 0")
-    without.add_argument("--board-thickness-mm", type=_length_or_zero, default=0.0, metavar="MM")
+    without.add_argument("--board-thickness-mm", type=_length_or_zero, metavar="MM", help="(default: 0)")
     parser.add_argument("--overwrite", action="store_true", help="replace a rig made from other views or settings")
     parser.add_argument("--no-figures", action="store_true", help="no pictures")
     _calibration_options(parser)
@@ -219,12 +220,14 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--image-size",
-        type=int,
+        type=_positive,
         nargs=2,
         metavar=("WIDTH", "HEIGHT"),
         help="[px] where an OpenCV file does not tell it",
     )
-    parser.add_argument("--unit-mm", type=float, help="length of an OpenCV file's unit, where it does not tell it")
+    parser.add_argument(
+        "--unit-mm", type=_positive_number, help="length of an OpenCV file's unit, where it does not tell it"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace the target")
 
 
@@ -247,7 +250,7 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--imperfect", type=_positive, metavar="N", default=0, help="instead: N recordings of an imperfect laboratory"
     )
-    parser.add_argument("--seed", type=int, help="of the first recording; the others count up from it")
+    parser.add_argument("--seed", type=_seed, help="of the first recording; the others count up from it")
     parser.add_argument("--quiet", action="store_true", help="do not tell of every step")
 
 
@@ -284,13 +287,6 @@ def _length_or_zero(text: str) -> float:
         return _number(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no length in mm") from None
-
-
-def _length(text: str) -> float:
-    length = _length_or_zero(text)
-    if length == 0:
-        raise argparse.ArgumentTypeError("the length must be above 0 mm")
-    return length
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -339,6 +335,12 @@ def _frame_range(text: str) -> tuple[int | None, int | None]:
         return (int(first) if first else None), (int(last) if last else None)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no range; give first:last, e.g. 100:200 or 100:") from None
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 on")
+    return int(text)
 
 
 def _positive(text: str) -> int:

@@ -156,6 +156,12 @@ def test_a_range_without_frames(recording, capsys, range_):
         ["calibrate", "--corners", "9"],
         ["calibrate", "--square-mm", "-3"],
         ["validate", "--imperfect", "-1"],
+        ["validate", "--seed", "-5"],
+        ["init", "x", "--radius-mm", "nan"],
+        ["init", "x", "--frame-rate-hz", "0"],
+        ["init", "x", "--board-thickness-mm", "-1"],
+        ["convert", "rig.yml", "rig.h5", "--unit-mm", "nan"],
+        ["convert", "rig.yml", "rig.h5", "--image-size", "0", "200"],
     ],
 )
 def test_wrong_usage_is_explained_with_exit_code_2(words, capsys):
@@ -170,6 +176,12 @@ def test_calibrate_without_anything_to_calibrate_from(tmp_path, monkeypatch, cap
     assert "--left, --right, --corners, --square-mm missing" in failure(capsys, "calibrate")
     words = ("calibrate", "--left", "l*.png", "--right", "r*.png", "--corners", "9x6", "--square-mm", "8")
     assert "no image matched for the left camera" in failure(capsys, *words)
+
+
+@pytest.mark.parametrize("words", [("--table-view", 2), ("--left", "l*.png", "--square-mm", 8)])
+def test_what_recording_toml_says_is_not_said_beside_it(short_recording, capsys, words):
+    assert f"{words[0]}" in (told := failure(capsys, "calibrate", short_recording, *words))
+    assert "recording.toml says this" in told
 
 
 def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsys):
