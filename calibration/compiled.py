@@ -16,10 +16,11 @@ from __future__ import annotations
 import gzip
 import hashlib
 import inspect
+import io
 import pickle
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,8 +96,13 @@ class _ShippedOrKept(FunctionCache):
         ships = _shipped(self._py_func, sig, self._impl.locator.get_source_stamp(), codegen) if self._enabled else None
         if ships is not None:
             return self._impl.rebuild(target_context, ships)
-        with self._guard_against_spurious_io_errors():
-            kept = self._load_overload(sig, target_context)
+        kept = None
+        try:
+            with self._guard_against_spurious_io_errors():
+                kept = self._load_overload(sig, target_context)
+        except Exception:  # files cut off by a full disk or a lost machine break in any way: as if there were none
+            with suppress(OSError):
+                self.flush()
         if kept is None:
             for tell in tuple(_to_be_told):
                 tell()
@@ -118,15 +124,14 @@ def made_for(stamp: str, sig: Any) -> tuple[str, ...]:
 
 
 def _shipped(function: Callable[..., Any], sig: Any, stamp: str, codegen: Any) -> Any:
-    """What numba would have kept of the function; None where what ships is for others."""
+    """What numba would have kept of the function; None where what ships is for others, or is damaged."""
     able = set(codegen._tm_features.split(","))
     level = next(level for level, needed in LEVELS.items() if needed <= able)
     try:
-        with gzip.open(shipped_file(function, sig)) as file:
-            if pickle.load(file) != made_for(stamp, sig):
-                return None
-            return pickle.loads(pickle.load(file)[level])
-    except (OSError, EOFError, pickle.UnpicklingError):
+        # the whole first: only at its end stands the sum by which damage is seen, and machine code must have none
+        file = io.BytesIO(gzip.decompress(shipped_file(function, sig).read_bytes()))
+        return pickle.loads(pickle.load(file)[level]) if pickle.load(file) == made_for(stamp, sig) else None
+    except Exception:  # no file of ours; what is no pickle breaks in any way
         return None
 
 

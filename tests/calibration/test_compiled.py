@@ -114,3 +114,68 @@ def test_code_for_other_sources_types_or_programs_is_left_alone(monkeypatch, tmp
         monkeypatch.setattr(compiled.numba, "__version__", "0.0")
         assert compiled._shipped(function, sig, stamp, codegen) is None
         monkeypatch.undo()
+
+
+def damaged(content):
+    """(name, bytes) of a file that ships and came to harm."""
+    yield "empty", b""
+    yield "head alone", content[:5]
+    yield "half", content[: len(content) // 2]
+    yield "without its sum", content[:-8]
+    yield "not packed", gzip.decompress(content)
+    yield "something else", b"<!DOCTYPE html><title>404</title>" * 20
+    yield "something else, packed", gzip.compress(b"no pickle at all")
+    yield "half of it, packed", gzip.compress(gzip.decompress(content)[:-200])
+    yield "another object", gzip.compress(pickle.dumps({"a": 1}) + pickle.dumps([2]))
+    for place in np.linspace(12, len(content) - 30, 25).astype(int):
+        yield f"a bit at {place}", content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
+
+
+def test_damaged_files_are_left_alone_and_the_function_is_compiled(monkeypatch, tmp_path):
+    function = _png._undo_filters.py_func
+    codegen = _png._undo_filters.targetctx.codegen()
+    _png.prepare()
+    sig = next(iter(_png._undo_filters.overloads))
+    content, there = compiled.shipped_file(function, sig).read_bytes(), tmp_path / "ahead"
+    made = pickle.loads(gzip.decompress(content))
+    if made[1:] != compiled.made_for(made[0], sig)[1:]:
+        pytest.skip("made for another machine, so it is compiled here")
+    there.mkdir()
+    monkeypatch.setattr(compiled, "AHEAD", there)
+    file = compiled.shipped_file(function, sig)
+    file.write_bytes(content)
+    assert compiled._shipped(function, sig, made[0], codegen) is not None
+    for name, harmed in damaged(content):
+        file.write_bytes(harmed)
+        assert compiled._shipped(function, sig, made[0], codegen) is None, name
+
+
+KEPT = """
+import sys
+from pathlib import Path
+import numpy as np
+from calibration import compiled
+compiled.AHEAD = Path("nowhere")
+told = []
+from disctrack.readers import _lzw
+with compiled.when_compiling(lambda: told.append(1)):
+    rows = np.array([[3, 4, 5]], np.uint8)
+    _lzw.undo_differences(rows)
+print(len(told), *rows[0])
+"""
+
+
+def test_kept_code_that_was_cut_off_is_made_anew_and_kept(tmp_path):
+    def run():
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+        told = subprocess.run([sys.executable, "-c", KEPT], env=environment, capture_output=True, text=True)
+        assert told.returncode == 0, told.stderr
+        return told.stdout.split()
+
+    assert run() == ["1", "3", "7", "12"]
+    assert run()[0] == "0"
+    for pattern, keep in (("*.nbi", 0), ("*.nbi", 60), ("*.nbc", 100)):
+        (file,) = tmp_path.rglob(pattern)
+        file.write_bytes(file.read_bytes()[:keep])
+        assert run() == ["1", "3", "7", "12"], (pattern, keep)
+        assert run() == ["0", "3", "7", "12"], (pattern, keep)
