@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -12,12 +13,19 @@ from numpy.typing import NDArray
 from calibration.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.readers._png import PngHeader, decode_plain_grey
-from disctrack.readers.raw import MOST_PIXELS
-from disctrack.readers.tiff_directories import Code, Tiff, TiffContent
+from disctrack.readers.raw import MOST_PIXELS, check_frame_size
+from disctrack.readers.tiff_directories import Code, Field, Tag, Tiff, TiffContent, assembled
 from disctrack.readers.tiff_pixels import plain_grey
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_WHITE_IS_ZERO = 0  # of tag 262
+# Compressions that OpenCV's libtiff decodes; of most others it delivers black images without a word.
+_BY_LIBTIFF = frozenset((1, 2, 3, 4, 5, 6, 7, 8, 32771, 32773, 32946))
+_OTHERS = {
+    34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 34933: "PNG", 34934: "JPEG XR", 22610: "JPEG XR",
+    50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL",
+}  # fmt: skip
 # A header may claim any size, and decoding must not exhaust the memory. Even a black image does not shrink by more than
 # this when compressed (deflate: 1032); small ones are let pass.
 _MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
@@ -31,18 +39,23 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     """
     try:
         header = _checked_container(content)
-        image = _plain_tiff(content) if content[:4] in _TIFF_SIGNATURES else None
+        image = _tiff(content, where) if content[:4] in _TIFF_SIGNATURES else None
     except _Damaged as fault:
         raise RecordingError(f"{where}: {fault}. Copy or export this image again.") from fault
     if header is not None and header.is_plain_grey:
         image = decode_plain_grey(content, header, out)
     elif image is None:
-        try:
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        except (cv2.error, MemoryError) as error:
-            raise RecordingError(f"{where}: not a readable image ({error.__class__.__name__}).") from error
+        image = _by_opencv(content, where)
     if image is None:
         raise RecordingError(f"{where}: not a readable image, or damaged. Copy or export this image again.")
+    return image
+
+
+def _by_opencv(content: bytes, where: str) -> NDArray | None:
+    try:
+        image: NDArray | None = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError) as error:
+        raise RecordingError(f"{where}: not a readable image ({error.__class__.__name__}).") from error
     return image
 
 
@@ -86,15 +99,81 @@ def _checked_container(content: bytes) -> PngHeader | None:
     return None
 
 
-def _plain_tiff(content: bytes) -> NDArray | None:
+def _tiff(content: bytes, where: str) -> NDArray | None:
     """Pixels of the first page; None where libtiff must say what it is."""
     try:
         tiff = Tiff(TiffContent(content))
         tags, _ = tiff.directory(tiff.first)
         _check_size(tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT), len(content))
-        return plain_grey(tiff, tags, tiff.pieces(tags, ""))
+        alone = Code.TILE_OFFSETS not in tags and tiff.value(tags, Code.PHOTOMETRIC, 1) != _WHITE_IS_ZERO
+        whole = plain_grey(tiff, tags, tiff.pieces(tags, "")) if alone else None
+        unknown = _not_decoded(tiff, tags)
+        several = not alone and tiff.value(tags, Code.BITS, 1) >= 8
     except RecordingError:
         return None
+    if unknown:
+        raise _Damaged(unknown)
+    return page_of_tiff(tiff, tiff.first, where) if several else whole
+
+
+def _not_decoded(tiff: Tiff, tags: Mapping[int, Tag]) -> str:
+    """What OpenCV would leave out of a page without a word; "" where it does not."""
+    compression = tiff.value(tags, Code.COMPRESSION, 1)
+    if compression in _BY_LIBTIFF:
+        return ""
+    name = _OTHERS.get(compression, "unknown")
+    return f"its pixels are compressed by a method ({compression}, {name}) that is not read; LZW and deflate are"
+
+
+def page_of_tiff(tiff: Tiff, offset: int, where: str) -> NDArray:
+    """Pixels of the page with its directory at `offset`, by libtiff unless they are plain grey; tiles one by one.
+
+    Upright, and light is more: orientation and a white that is zero are undone.
+    """
+    tags, _ = tiff.directory(offset)
+    pieces, fields = tiff.pieces(tags, where), tiff.fields(tags, where)
+    if unknown := _not_decoded(tiff, tags):
+        raise RecordingError(f"{where}: {unknown}. Export this image again.")
+    if Code.TILE_OFFSETS in tags:
+        pixels = _tiles(tiff, tags, pieces, fields, where)
+    else:
+        plain = plain_grey(tiff, tags, pieces)
+        pixels = decode(assembled(tiff.order, fields, pieces), where) if plain is None else plain
+    if tiff.value(tags, Code.PHOTOMETRIC, 1) == _WHITE_IS_ZERO and pixels.dtype.kind == "u":
+        pixels = ~pixels
+    return np.ascontiguousarray(_upright(pixels, tiff.value(tags, Code.ORIENTATION, 1)))
+
+
+def _tiles(
+    tiff: Tiff, tags: Mapping[int, Tag], pieces: Sequence[bytes], fields: dict[int, Field], where: str
+) -> NDArray:
+    """Pixels of a page in tiles."""
+    width, height = tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
+    tile_width, tile_height = tiff.value(tags, Code.TILE_WIDTH), tiff.value(tags, Code.TILE_HEIGHT)
+    check_frame_size(width, height, where)
+    check_frame_size(tile_width, tile_height, where)
+    columns, rows = -(-width // tile_width), -(-height // tile_height)
+    if len(pieces) != columns * rows or tile_width * tile_height * len(pieces) > 4 * MOST_PIXELS:
+        raise RecordingError(
+            f"{where}: {len(pieces)} tiles for {columns} x {rows}; the page is damaged. Copy it again."
+        )
+    fields = fields | {Code.WIDTH: fields[Code.TILE_WIDTH], Code.HEIGHT: fields[Code.TILE_HEIGHT]}
+    for tag in (Code.TILE_WIDTH, Code.TILE_HEIGHT, Code.ROWS_PER_STRIP):
+        fields.pop(tag, None)
+    tiles = [decode(assembled(tiff.order, fields, [piece]), where) for piece in pieces]
+    if any(tile.shape[:2] != (tile_height, tile_width) for tile in tiles):
+        raise RecordingError(f"{where}: tiles of other sizes than announced; the page is damaged. Copy it again.")
+    lines = [np.hstack(tiles[row * columns : (row + 1) * columns]) for row in range(rows)]
+    return np.vstack(lines)[:height, :width]
+
+
+def _upright(pixels: NDArray, orientation: int) -> NDArray:
+    """Pixels whose row 0 and column 0 lie at the sides that TIFF 6.0 numbers (section 8), or Exif."""
+    if orientation in (5, 6, 7, 8):
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return pixels[::-1] if orientation in (3, 4, 7, 8) else pixels
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:

@@ -7,24 +7,24 @@ page goes to libtiff as a file of its own, made of the page's directory and its 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.readers.base import FrameReader, Frames, first_readable
-from disctrack.readers.decoding import as_grey, decode
-from disctrack.readers.raw import MOST_PIXELS, RawFile, RawFrames, check_frame_size
+from disctrack.readers.decoding import as_grey, page_of_tiff
+from disctrack.readers.raw import RawFile, RawFrames, check_frame_size
 from disctrack.readers.tiff_directories import Code, Tag, Tiff, assembled, chain
-from disctrack.readers.tiff_pixels import plain_grey
 
 _REDUCED_IMAGE = 1  # bit of tag 254: a thumbnail of another page
 
@@ -35,7 +35,7 @@ def is_stack(file: Path) -> bool:
         tiff = Tiff(RawFile(file))
         first, following = tiff.directory(tiff.first)
         if not following:
-            return _imagej_pages(tiff.description(first)) > 1
+            return _pages_announced(tiff.description(first)) > 1
     except RecordingError:
         return False
     try:  # a thumbnail may follow, which is no frame
@@ -138,35 +138,10 @@ class TiffPages(Frames):
         page = self._pages[index]
         check_frame_size(page.width, page.height, where)
         try:
-            return as_grey(_decoded_page(self._tiffs[page.file], page.directory, where), where)
+            return as_grey(page_of_tiff(self._tiffs[page.file], page.directory, where), where)
         except RecordingError as error:
             text = str(error)
             raise RecordingError(text if text.startswith(where) else f"{where}: {text}") from error
-
-
-def _decoded_page(tiff: Tiff, offset: int, where: str) -> NDArray:
-    """Pixels of the page with its directory at `offset`, by libtiff unless they are plain grey; tiles one by one."""
-    tags, _ = tiff.directory(offset)
-    pieces, fields = tiff.pieces(tags, where), tiff.fields(tags, where)
-    if Code.TILE_OFFSETS not in tags:
-        pixels = plain_grey(tiff, tags, pieces)
-        return decode(assembled(tiff.order, fields, pieces), where) if pixels is None else pixels
-    width, height = tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
-    tile_width, tile_height = tiff.value(tags, Code.TILE_WIDTH), tiff.value(tags, Code.TILE_HEIGHT)
-    check_frame_size(width, height, where)
-    check_frame_size(tile_width, tile_height, where)
-    columns, rows = -(-width // tile_width), -(-height // tile_height)
-    if len(pieces) != columns * rows or tile_width * tile_height * len(pieces) > 4 * MOST_PIXELS:
-        raise RecordingError(
-            f"{where}: {len(pieces)} tiles for {columns} x {rows}; the page is damaged. Copy it again."
-        )
-    fields |= {Code.WIDTH: fields.pop(Code.TILE_WIDTH), Code.HEIGHT: fields.pop(Code.TILE_HEIGHT)}
-    fields.pop(Code.ROWS_PER_STRIP, None)
-    tiles = [decode(assembled(tiff.order, fields, [piece]), where) for piece in pieces]
-    if any(tile.shape[:2] != (tile_height, tile_width) for tile in tiles):
-        raise RecordingError(f"{where}: tiles of other sizes than announced; the page is damaged. Copy it again.")
-    lines = [np.hstack(tiles[row * columns : (row + 1) * columns]) for row in range(rows)]
-    return np.ascontiguousarray(np.vstack(lines)[:height, :width])
 
 
 def _pages(tiff: Tiff, number: int) -> tuple[list[_Page], str | None]:
@@ -181,7 +156,7 @@ def _pages(tiff: Tiff, number: int) -> tuple[list[_Page], str | None]:
         if not pages:
             raise
         note = f"only {len(pages)} pages are whole ({error})"
-    if len(pages) == 1 and pages[0].raw_offset >= 0:
+    if len(pages) == 1:
         pages = _without_directories(tiff, pages[0])
     return pages, note
 
@@ -196,7 +171,8 @@ def _raw_offset(tiff: Tiff, tags: Mapping[int, Tag], size: int) -> int:
     """Where the pixels lie, one after the other and as they are; -1 if they do not."""
     plain = {
         Code.COMPRESSION: (1,),
-        Code.PHOTOMETRIC: (0, 1),
+        Code.PHOTOMETRIC: (1,),
+        Code.ORIENTATION: (1,),
         Code.FILL_ORDER: (1,),
         Code.SAMPLES: (1,),
         Code.SAMPLE_FORMAT: (1,),
@@ -216,10 +192,15 @@ def _raw_offset(tiff: Tiff, tags: Mapping[int, Tag], size: int) -> int:
 def _without_directories(tiff: Tiff, first: _Page) -> list[_Page]:
     """All frames of a file with one directory, as ImageJ writes stacks: the others follow the first without a gap."""
     tags, _ = tiff.directory(first.directory)
-    n = _imagej_pages(tiff.description(tags))
+    n = _pages_announced(tiff.description(tags))
     size = first.width * first.height * first.bits // 8
     if n < 2 or size == 0:
         return [first]
+    if first.raw_offset < 0:
+        raise RecordingError(
+            f"{tiff.file.path}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
+            "from another corner, compressed, or no grey values of 8 or 16 bit). Export it again, black as zero."
+        )
     most = max(1, -(-tiff.file.size // size))  # of a file cut short the frames that begin in it; the next is the end
     return [
         _Page(
@@ -229,9 +210,16 @@ def _without_directories(tiff: Tiff, first: _Page) -> list[_Page]:
     ]
 
 
-def _imagej_pages(description: str) -> int:
-    found = re.search(r"^images=([0-9]{1,12})\s*$", description, re.MULTILINE)
-    return int(found.group(1)) if description.startswith("ImageJ=") and found else 0
+def _pages_announced(description: str) -> int:
+    """Frames behind one directory by ImageJ's note, or by that of tifffile where it left out the others."""
+    if description.startswith("ImageJ="):
+        found = re.search(r"^images=([0-9]{1,12})\s*$", description, re.MULTILINE)
+        return int(found.group(1)) if found else 0
+    if description.startswith("{") and '"truncated"' in description:
+        with suppress(ValueError, TypeError, KeyError):  # no note of that kind
+            *several, _, _ = json.loads(description)["shape"]
+            return math.prod(map(int, several))
+    return 0
 
 
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-6, "ns": 1e-9, "min": 60.0}

@@ -1,0 +1,87 @@
+"""TIFF files that other programs write: what Pillow or OpenCV sees in them is read, and nothing is made up."""
+
+import io
+import struct
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.testing import assert_array_equal
+from PIL import Image
+
+from disctrack.errors import RecordingError
+from disctrack.readers import open_frames
+
+DEEP = np.random.default_rng(2).integers(0, 4096, (4, 37, 53)).astype(np.uint16)
+FRAMES = {8: (DEEP >> 4).astype(np.uint8), 16: DEEP}
+PACKINGS = [{}, {"compression": "lzw", "predictor": 2}, {"compression": "packbits"}, {"tile": (16, 16)}]
+
+
+def read(folder):
+    reader = open_frames("*.tif", folder, "left")
+    return np.stack([reader.read(i) for i in range(len(reader))])
+
+
+def as_files(folder, frames, **options):
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        tifffile.imwrite(folder / f"{i}.tif", frame, **{"photometric": "minisblack", **options})
+    return folder
+
+
+def as_pages(folder, frames, **options):
+    folder.mkdir()
+    with tifffile.TiffWriter(folder / "stack.tif") as file:
+        for frame in frames:
+            file.write(frame, contiguous=False, **{"photometric": "minisblack", **options})
+    return folder
+
+
+@pytest.mark.parametrize("packing", PACKINGS, ids=str)
+@pytest.mark.parametrize("bits", FRAMES)
+@pytest.mark.parametrize("written", [as_files, as_pages])
+def test_where_white_is_zero_light_is_more_all_the_same(tmp_path, bits, packing, written):
+    frames = FRAMES[bits]
+    assert_array_equal(read(written(tmp_path / "white", frames, photometric="miniswhite", **packing)), ~frames)
+    assert_array_equal(read(written(tmp_path / "black", frames, **packing)), frames)
+
+
+def test_white_is_zero_as_pillow_sees_it(tmp_path):
+    folder = as_files(tmp_path / "white", FRAMES[8], photometric="miniswhite")
+    assert_array_equal(read(folder)[0], np.array(Image.open(folder / "0.tif")))
+
+
+@pytest.mark.parametrize("packing", PACKINGS, ids=str)
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orientation, packing):
+    tag = {"extratags": [(274, 3, 1, orientation, True)], **packing}
+    files, pages = as_files(tmp_path / "files", FRAMES[8], **tag), as_pages(tmp_path / "pages", FRAMES[8], **tag)
+    # from bytes: of a file of its own Pillow maps the rows before it turns them
+    upright = np.stack([np.array(Image.open(io.BytesIO((files / f"{i}.tif").read_bytes()))) for i in range(4)])
+    assert np.array_equal(upright, FRAMES[8]) == (orientation == 1)
+    assert_array_equal(read(files), upright)
+    assert_array_equal(read(pages), upright)
+
+
+@pytest.mark.parametrize("written", [as_files, as_pages])
+@pytest.mark.parametrize(
+    ("code", "name"), [(34712, "JPEG 2000"), (34933, "PNG"), (50000, "Zstandard"), (40000, "unkn")]
+)
+def test_pixels_by_an_unknown_method_are_refused_by_name_and_never_black(tmp_path, written, code, name):
+    folder = written(tmp_path / "frames", FRAMES[8], compression="packbits")
+    for file in folder.iterdir():
+        packbits, other = (struct.pack("<HHII", 259, 3, 1, number) for number in (32773, code))
+        content = file.read_bytes()
+        assert packbits in content
+        file.write_bytes(content.replace(packbits, other))
+    with pytest.raises(RecordingError, match=rf"compressed by a method \({code}, {name}"):
+        read(folder)
+
+
+def test_a_stack_behind_one_directory_is_read_whole_or_refused(tmp_path):
+    for name in ("minisblack", "miniswhite"):
+        (tmp_path / name).mkdir()
+        tifffile.imwrite(tmp_path / name / "stack.tif", DEEP, truncate=True, photometric=name)
+    assert_array_equal(read(tmp_path / "minisblack"), DEEP)
+    with pytest.raises(RecordingError, match="4 frames in one directory, whose pixels are not plain"):
+        read(tmp_path / "miniswhite")
