@@ -112,6 +112,7 @@ def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
             f"{where}: announces {n} frames, but at most {stored} were ever written. The recording was cut short: "
             "write it again, or give the data set its true length."
         )
+    _check_other_files(stack, file, where)
     rate = _attribute(stack, "frame_rate")
     bits = _attribute(stack, "bit_depth")
     common: dict[str, Any] = {
@@ -120,7 +121,7 @@ def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
         "frame_rate": rate if rate is not None and rate > 0 else None,
     }
     offset = stack.id.get_offset() if stack.chunks is None and not stack.external and not stack.is_virtual else None
-    if offset is not None:
+    if offset is not None and _fills_its_bytes(stack):
         size = height * width * stack.dtype.itemsize
         dtype = stack.dtype
         handle.close()
@@ -137,6 +138,31 @@ def _frames_stored(stack: Any) -> int:
     if stack.chunks is None:
         return int(stack.id.get_storage_size() // max(1, int(np.prod(stack.shape[1:])) * stack.dtype.itemsize))
     return int(stack.id.get_num_chunks()) * int(stack.chunks[0])
+
+
+def _fills_its_bytes(stack: Any) -> bool:
+    """False where a pixel's bits lie somewhere within its bytes: the library brings them to where they belong."""
+    kind = stack.id.get_type()
+    return bool(kind.get_precision() == 8 * kind.get_size() and kind.get_offset() == 0)
+
+
+def _check_other_files(stack: Any, file: Path, where: str) -> None:
+    """Raise RecordingError where pixels lie in other files that are not there: the library would deliver zeros."""
+    if stack.is_virtual:
+        for name in sorted({source.file_name for source in stack.virtual_sources()} - {"."}):
+            if "%" not in name and not (file.parent / name).exists() and not Path(name).exists():
+                raise RecordingError(f"{where}: takes frames from {name}, which is not there. Copy it beside {file}.")
+    needed = int(np.prod(stack.shape, dtype=np.int64)) * stack.dtype.itemsize
+    present = 0
+    for name, start, size in stack.external or ():
+        if not Path(name).exists():  # by the library's rule, from the folder that the command is given in
+            raise RecordingError(f"{where}: its pixels lie in {name}, which is not there. Write them into {file}.")
+        present += max(0, min(Path(name).stat().st_size - start, size))
+    if stack.external and present < needed:
+        raise RecordingError(
+            f"{where}: its pixels lie in {stack.external[0][0]}, which holds {present} of their {needed} bytes. "
+            "Copy it again."
+        )
 
 
 def _filters(stack: Any) -> set[int]:
@@ -193,7 +219,9 @@ class Hdf5Frames(Frames):
         self._digests: list[bytes | None] = [None] * int(stack.shape[0])
         self._shuffled = _SHUFFLE in _filters(stack)
         self.random_access = self._inflated_here = bool(
-            stack.chunks == (1, *stack.shape[1:]) and _DEFLATE in _filters(stack) <= {_SHUFFLE, _DEFLATE}
+            stack.chunks == (1, *stack.shape[1:])
+            and _DEFLATE in _filters(stack) <= {_SHUFFLE, _DEFLATE}
+            and _fills_its_bytes(stack)
         )
         frames_per_chunk = stack.chunks[0] if stack.chunks else 1
         chunk_row = frames_per_chunk * self.image_size[0] * self.image_size[1] * self.dtype.itemsize
@@ -247,12 +275,13 @@ class Hdf5Frames(Frames):
         image[...] = raw.view(self._stack.dtype).reshape(image.shape)
 
     def _stored_size(self, index: int) -> int:
-        """Bytes of the frame's first chunk; 0 where there is none: the library would deliver zeros without a word."""
+        """Bytes of the frame's chunks; 0 where one is missing: the library would deliver zeros without a word."""
         if self._stack.chunks is None:
             return 1
-        place = (index - index % self._stack.chunks[0], 0, 0)
-        info = self._stack.id.get_chunk_info_by_coord(place)
-        return 0 if info.byte_offset is None else int(info.size)
+        (frames, rows, columns), (_, height, width) = self._stack.chunks, self._stack.shape
+        corners = ((index - index % frames, y, x) for y in range(0, height, rows) for x in range(0, width, columns))
+        found = [self._stack.id.get_chunk_info_by_coord(corner) for corner in corners]
+        return 0 if any(info.byte_offset is None for info in found) else sum(int(info.size) for info in found)
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of size, type and grey values of frames start..stop-1; those already read are not read again."""

@@ -240,6 +240,63 @@ def test_hdf5_of_any_byte_order_behind_a_user_block(tmp_path, options, dtype):
         assert_array_equal(reader.read(index), frames[index])
 
 
+def test_hdf5_frames_that_lie_in_other_files_are_those_or_refused(tmp_path):
+    layout = h5py.VirtualLayout((4, 6, 8), np.uint8)
+    frames = np.arange(4 * 6 * 8, dtype=np.uint8).reshape(4, 6, 8)
+    for i, frame in enumerate(frames):
+        with h5py.File(tmp_path / f"part{i}.hdf", "w") as file:
+            file["frame"] = frame
+        layout[i] = h5py.VirtualSource(f"part{i}.hdf", "frame", shape=(6, 8))
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        file.create_virtual_dataset("frames", layout)
+    with h5py.File(tmp_path / "external.h5", "w") as file:
+        place = [(str(tmp_path / "pixels.bin"), 16, h5py.h5f.UNLIMITED)]
+        file.create_dataset("frames", frames.shape, np.uint8, external=place)[...] = frames
+    for name in ("virtual", "external"):
+        reader = open_frames(f"{name}.h5", tmp_path, "left")
+        assert_array_equal([reader.read(i) for i in range(4)], frames)
+    (tmp_path / "part2.hdf").unlink()
+    with pytest.raises(RecordingError, match=r"takes frames from part2\.hdf, which is not there"):
+        open_frames("virtual.h5", tmp_path, "left")
+    content = (tmp_path / "pixels.bin").read_bytes()
+    (tmp_path / "pixels.bin").write_bytes(content[:-1])
+    with pytest.raises(RecordingError, match="holds 191 of their 192 bytes"):
+        open_frames("external.h5", tmp_path, "left")
+    (tmp_path / "pixels.bin").unlink()
+    with pytest.raises(RecordingError, match=r"pixels\.bin, which is not there"):
+        open_frames("external.h5", tmp_path, "left")
+
+
+def test_hdf5_frames_of_which_a_part_was_never_written_are_lost(tmp_path):
+    frames = np.random.default_rng(3).integers(0, 4096, (4, 9, 14)).astype(np.uint16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        stack = file.create_dataset("frames", frames.shape, np.uint16, chunks=(1, 5, 6), compression="gzip")
+        stack[[0, 1, 3]] = frames[[0, 1, 3]]
+        stack[2, :5] = frames[2, :5]
+    reader = open_frames("a.h5", tmp_path, "left")
+    for i in (0, 1, 3):
+        assert_array_equal(reader.read(i), frames[i])
+    with pytest.raises(RecordingError, match=r"frame 2\): was never written"):
+        reader.read(2)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_hdf5_pixels_that_do_not_fill_their_bytes_are_those_that_the_library_reads(tmp_path, packed):
+    frames = np.random.default_rng(3).integers(0, 4096, (4, 9, 14)).astype(np.uint16)
+    kind, options = h5py.h5t.STD_U16LE.copy(), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    kind.set_precision(12)
+    kind.set_offset(4)
+    if packed:
+        options.set_chunk((1, 9, 14))
+        options.set_shuffle()
+        options.set_deflate(4)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        stack = h5py.h5d.create(file.id, b"frames", kind, h5py.h5s.create_simple(frames.shape), options)
+        stack.write(h5py.h5s.ALL, h5py.h5s.ALL, frames)
+    reader = open_frames("a.h5", tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(4)], frames)
+
+
 def test_luma_of_limited_range_is_not_stretched(tmp_path):
     frames = (16 + frames_of(8) % 220).astype(np.uint8)  # 16 to 235
     write_video(tmp_path / "left.mkv", frames, "yuv420p", "ffv1")
