@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.arrays import Array
-from calibration.camera import N_INTRINSIC, StereoRig
+from calibration.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN, StereoRig
 from calibration.causes import causes
 from calibration.errors import CalibrationError
 from calibration.model_choice import TermsTried
@@ -125,9 +125,9 @@ def half_set_differences(refinement: Refinement, inflation: float) -> HalfSets |
     full = basis @ difference
     t = refinement.model.t_right_left
     return HalfSets(
-        baseline=float(full[21:24] @ t / np.linalg.norm(t)),
-        rotation=float(np.linalg.norm(full[18:21])),
-        focal_px=(float(full[0:2].mean()), float(full[N_INTRINSIC : N_INTRINSIC + 2].mean())),
+        baseline=float(full[PAIR_SHIFT] @ t / np.linalg.norm(t)),
+        rotation=float(np.linalg.norm(full[PAIR_TURN])),
+        focal_px=(float(full[OF_LEFT][:2].mean()), float(full[OF_RIGHT][:2].mean())),
         # of all parameters together: most differences are along directions that the views tell badly
         sigmas=float(np.sqrt(difference @ scaled_solve(C, difference) / s)),
     )

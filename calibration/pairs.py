@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -55,9 +55,12 @@ class PairsJudged:
     right_poses: dict[int, Pose]  # of the right image alone, in the left camera's axes, for pairs
     apart: dict[int, str]  # view -> why its two images are not taken for one place
     bad_images: dict[tuple[int, int], str]  # (view, camera) -> why it cannot be used even alone
+    left_poses: dict[int, Pose] = field(default_factory=dict)  # of the left image alone, for pairs, once judged
 
 
-def judge_pairs(observations: Observations, fit: Refinement, apart: Sequence[int]) -> PairsJudged:
+def judge_pairs(
+    observations: Observations, fit: Refinement, apart: Sequence[int], elsewhere: Collection[int] = ()
+) -> PairsJudged:
     """Compare the poses of both images together with those of each image alone.
 
     A common pose has six parameters less. What chi-square it costs, with everything that all views share refined again,
@@ -67,6 +70,7 @@ def judge_pairs(observations: Observations, fit: Refinement, apart: Sequence[int
     cameras stand.
 
     observations : with the views' numbers; fit : of the same, the pairs `apart` with places of their own
+    elsewhere : views at which the cameras stood otherwise to each other: no measure of what is usual
     """
     observations = observations[np.argsort(observations.view, kind="stable")]
     model, n = fit.model, len(fit.model.R_left_board) - len(apart)
@@ -98,15 +102,17 @@ def judge_pairs(observations: Observations, fit: Refinement, apart: Sequence[int
     if len(both) >= LEAST_PAIRS:
         cost = _cost_of_one_place(fit, (in_sight, together), (seen_alone, alone), both, places)
         square_together, _ = _misfit(observations, together, n)
-        for k in np.flatnonzero(cost > TOO_FAR**2 * max(float(np.median(cost)), 6.0)):
+        usual = cost[[v not in elsewhere for v in both]]
+        for k in np.flatnonzero(cost > TOO_FAR**2 * max(float(np.median(usual)), 6.0)):
             misfit = np.sqrt(square_together[both[k]] / (count[both[k]] + count[n + k]))
             found[both[k]] = f"{misfit:.2g} px if they did, where the median image has {typical:.2g} px"
     found |= {v: "behind a camera if they did" for v in both if v in behind}
     right = {v: (alone.R_left_board[n + k], alone.t_left_board[n + k]) for k, v in enumerate(both)}
+    left = {v: (alone.R_left_board[v], alone.t_left_board[v]) for v in both}
     R, t = together.R_left_board.copy(), together.t_left_board.copy()
     for v in found:
-        R[v], t[v] = alone.R_left_board[v], alone.t_left_board[v]
-    return PairsJudged(replace(together, R_left_board=R, t_left_board=t), right, found, bad)
+        R[v], t[v] = left[v]
+    return PairsJudged(replace(together, R_left_board=R, t_left_board=t), right, found, bad, left)
 
 
 def _cost_of_one_place(

@@ -20,14 +20,16 @@ from calibration.assessment import (
 from calibration.board import Board, Target
 from calibration.brief import Brief
 from calibration.camera import StereoRig
+from calibration.camera_moved import camera_moved
 from calibration.chessboard import BoardNotFound, CornerView, find_corners
 from calibration.errors import CalibrationError
-from calibration.lens_field import FieldFit, fit_lens_field
-from calibration.model_choice import TermsTried, choose_board
+from calibration.lens_field import FieldFit
+from calibration.model_choice import TermsTried
 from calibration.motion_size import likely_motion
-from calibration.pairs import PairsJudged, judge_pairs, motion_between_exposures, own_places, pairs_that_agree
+from calibration.pairs import PairsJudged, pairs_that_agree
 from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
+from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import (
@@ -44,7 +46,6 @@ from calibration.wide_lens import too_wide
 CAMERA_NAMES = ("left", "right")
 SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
-REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
 Progress = Callable[[str, int, int], None]
 Finder = Callable[[NDArray, bool], CornerView | BoardNotFound]  # image, whether to search thoroughly
 
@@ -232,6 +233,11 @@ def calibrate_from_corners(
     names = tuple(names or [(f"left {i}", f"right {i}") for i in range(n_views)])
     if table_view is not None and not 0 <= table_view < n_views:
         raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {n_views - 1}")
+
+    def report(text: str) -> None:
+        if progress:
+            progress(text, 0, 0)
+
     views = (list(left_views), list(right_views))
     rejected, warnings = _views_not_found(views, names)
     _require_views(views, names, rejected, table_view)
@@ -242,72 +248,34 @@ def calibrate_from_corners(
     observations = _observations(views)
     start, agrees, right_poses = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
     wide = too_wide(observations, board.points, start.cameras)
-    pairs = pairs_that_agree(observations, start, board.points, agrees, right_poses)
-
-    def report(text: str) -> None:
-        if progress:
-            progress(text, 0, 0)
-
+    left_poses = {v: (start.R_left_board[v], start.t_left_board[v]) for v in right_poses}
+    pairs = PairsJudged(start, right_poses, {}, {}, left_poses)
+    moved = camera_moved(observations, pairs, start, table_view)  # seen best by cameras that no pair has pulled yet
+    if moved is None:
+        pairs = pairs_that_agree(observations, start, board.points, agrees, right_poses)
+    else:
+        pairs = moved.set_apart(pairs)
     report("refining")
     seen = np.bincount(observations.point, minlength=len(board.points))
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
-    boards = shapes if settings.board == "auto" else (settings.board,)
-    lens = (RICHEST if settings.distortion == "auto" else settings.distortion, settings.equal_aspect)
-    places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
-    refinement, candidates = choose_board(*places, board.points, boards, *lens, report)
-    for _ in range(REJUDGED):
-        before = sorted(pairs.apart)
-        pairs = judge_pairs(observations, refinement, before)
-        if sorted(pairs.apart) == before and not pairs.bad_images:
-            break
-        observations, pairs, lost, notes = _without_images(observations, pairs, names)
-        rejected, warnings = rejected | lost, [*warnings, *notes]
-        places = own_places(observations, pairs.model, sorted(pairs.apart), pairs.right_poses)
-        refinement, again = choose_board(*places, board.points, (refinement.terms.board,), *lens, report)
-        candidates = (*candidates, *again)
-    report("trying a field of the lenses")
-    motion, lens_fit = motion_between_exposures(refinement), fit_lens_field(refinement, board.points)
-    moved = motion is not None and motion.is_likely
-    if motion is not None and moved and lens_fit is not None:
-        # a field puts boards elsewhere for each camera, too, and what is left of it does: by the scatter before it
-        left = motion_between_exposures(lens_fit.refinement) or motion
-        motion = replace(left, scatter=max(motion.scatter, left.scatter))
-        moved = motion.is_seen
-    if motion is not None and moved:
-        report("pairs that were not synchronised: with a motion of the board between the exposures")
-        begin = motion.as_random(board.points)
-        refinement, again = choose_board(*places, board.points, boards, *lens, report, begin)
-        candidates = (*candidates, *again)
-        lens_fit = fit_lens_field(refinement, board.points)
-    apart = _told_apart(pairs.apart, names, bool(wide))
-    warnings += apart
-    if table_view is not None and table_view in rejected | pairs.apart:
-        reason = rejected.get(table_view) or apart[0]
-        raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
-    n_used = len(np.unique(refinement.observations.view[refinement.kept]))
-    if n_used < MIN_VIEWS:
-        also = f"{'; '.join(wide)}. " if wide else ""
-        reasons = {where: why for where, _, why in (text.partition(": ") for text in rejected.values())}
-        raise CalibrationError(
-            f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
-        )
-    if lens_fit is not None:
-        refinement = lens_fit.refinement
+    free = FreeTerms(
+        shapes if settings.board == "auto" else (settings.board,),
+        RICHEST if settings.distortion == "auto" else settings.distortion,
+        settings.equal_aspect,
+    )
+    fit = fit_jointly(observations, pairs, board.points, free, names, table_view, moved, report)
+    rejected |= fit.lost
+    apart = _told_apart(fit, names, bool(wide), table_view)
+    _require_fitted(fit, rejected, apart, wide, table_view)
     report("judging")
-    inflation = max(consistency_factor(refinement), 1.0)
-    shape = board_shape(refinement, board.points, inflation)
-    refinement = as_made(refinement, board.points, shape)
+    inflation = max(consistency_factor(fit.refinement), 1.0)
+    shape = board_shape(fit.refinement, board.points, inflation)
+    refinement = as_made(fit.refinement, board.points, shape)
+    covariance, shape_note = _covariance(refinement, board, shapes, settings.board, shape, inflation)
     origin = on_the_table(board.points, shape)
-    unseen = None if refinement.problem.motion is not None else likely_motion(refinement)
-    covariance = stereo_covariance(refinement, unseen.gradients if unseen else None)
-    if refinement.terms.board in shapes:
-        left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
-        covariance = covariance + left_out
-        if sigmas > 1.0:
-            warnings.append(_not_as_told(settings.board, shape, sigmas))
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     with_board = with_tolerances(
-        replace(rig, lens_field=lens_fit.field if lens_fit else None),
+        replace(rig, lens_field=fit.lens.field if fit.lens else None),
         board.points,
         table_view,
         board_thickness,
@@ -315,7 +283,7 @@ def calibrate_from_corners(
         shape,
     )
     halves = half_set_differences(refinement, inflation)
-    assessment = assess(refinement, candidates, rig, with_board, table_view, inflation, halves, motion, wide)
+    assessment = assess(refinement, fit.candidates, rig, with_board, table_view, inflation, halves, fit.motion, wide)
     return StereoCalibration(
         rig=with_board,
         refinement=refinement,
@@ -327,13 +295,44 @@ def calibrate_from_corners(
         view_names=names,
         corner_views=(tuple(views[0]), tuple(views[1])),
         rejected_views=dict(sorted(rejected.items())),
-        apart=tuple(sorted(pairs.apart)),
-        candidates=candidates,
+        apart=tuple(sorted(fit.pairs.apart)),
+        candidates=fit.candidates,
         assessment=assessment,
-        warnings=(*warnings, *assessment.warnings),
-        lens=lens_fit,
+        warnings=(*warnings, *fit.notes, *apart, *shape_note, *assessment.warnings),
+        lens=fit.lens,
         shape=shape,
     )
+
+
+def _covariance(
+    refinement: Refinement, board: Target, shapes: tuple[str, ...], told: str, shape: BoardShape, inflation: float
+) -> tuple[Array, list[str]]:
+    """Covariance of the free stereo parameters, and a warning where the board has another shape than it was given.
+
+    shapes : that its points tell; told : which one the user wants, or auto
+    """
+    unseen = None if refinement.problem.motion is not None else likely_motion(refinement)
+    covariance = stereo_covariance(refinement, unseen.gradients if unseen else None)
+    if refinement.terms.board not in shapes:
+        return covariance, []
+    left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
+    return covariance + left_out, [_not_as_told(told, shape, sigmas)] if sigmas > 1.0 else []
+
+
+def _require_fitted(
+    fit: JointFit, rejected: dict[int, str], apart: Sequence[str], wide: Sequence[str], table_view: int | None
+) -> None:
+    """Raises CalibrationError where the table view is lost, or too few views are left."""
+    if table_view is not None and table_view in rejected | fit.pairs.apart:
+        reason = rejected.get(table_view) or apart[0]
+        raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
+    n_used = len(np.unique(fit.plain.observations.view[fit.plain.kept]))
+    if n_used < MIN_VIEWS:
+        also = f"{'; '.join(wide)}. " if wide else ""
+        reasons = {where: why for where, _, why in (text.partition(": ") for text in rejected.values())}
+        raise CalibrationError(
+            f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
+        )
 
 
 def _views_not_found(
@@ -439,36 +438,19 @@ def _agree_on_order(
     return (views[0], right), note
 
 
-def _without_images(
-    observations: Observations, pairs: PairsJudged, names: Sequence[tuple[str, str]]
-) -> tuple[Observations, PairsJudged, dict[int, str], list[str]]:
-    """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
-    model, apart, rejected, warnings = pairs.model, dict(pairs.apart), {}, []
-    R, t = model.R_left_board.copy(), model.t_left_board.copy()
-    for (view, camera), reason in pairs.bad_images.items():
-        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly"
-        observations = observations[(observations.view != view) | (observations.camera != camera)]
-        apart.pop(view, None)
-        if camera == 0 and view in pairs.right_poses:
-            R[view], t[view] = pairs.right_poses[view]
-        if np.any(observations.view == view):
-            warnings.append(f"{text}: left out, the other image of the pair is used for its own camera")
-        else:
-            rejected[view] = text
-    pairs = replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart, bad_images={})
-    return observations, pairs, rejected, warnings
-
-
-def _told_apart(apart: dict[int, str], names: Sequence[tuple[str, str]], wide: bool) -> list[str]:
-    """A warning about pairs whose images are used each for its own camera."""
+def _told_apart(fit: JointFit, names: Sequence[tuple[str, str]], wide: bool, table_view: int | None) -> list[str]:
+    """Warnings about pairs whose images are used each for its own camera."""
+    told = [fit.moved.told(names, table_view)] if fit.moved else []
+    apart = {v: why for v, why in fit.pairs.apart.items() if not (fit.moved and v in fit.moved.others)}
     if not apart:
-        return []
+        return told
     shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]
     more = f" and {len(apart) - 3} more" if len(apart) > 3 else ""
     return [
+        *told,
         f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "
         f"exposures, or they are not a pair{', or the lens is wider than the model' if wide else ''}. Each image is "
-        "used for its own camera, none of them for how the cameras stand to each other"
+        "used for its own camera, none of them for how the cameras stand to each other",
     ]
 
 

@@ -5,7 +5,7 @@ Webcams of 640 x 480 px, 8 to 15 cm apart, before a board of 9 x 6 inner corners
 middle by `turn` [rad], normal, per axis.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -83,3 +83,9 @@ def pairs(
 def _image(points: NDArray, rig: Rig, camera: int) -> NDArray:
     matrix, distortion = rig.matrices[camera], rig.distortions[camera]
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+
+
+def turned(rig: Rig, turn: NDArray, shift: NDArray) -> Rig:
+    """The rig after its right camera was turned by a rotation vector [rad] about its centre, and shifted [m]."""
+    R = cv2.Rodrigues(np.asarray(turn, float))[0] @ rig.R
+    return replace(rig, R=R, t=R @ (rig.R.T @ rig.t) - R @ np.asarray(shift, float))

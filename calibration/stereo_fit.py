@@ -1,0 +1,119 @@
+"""The rounds of a joint fit of both cameras: the board's shape, which images are pairs, what moved, the lenses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.arrays import Array
+from calibration.board_motion import BoardMotion
+from calibration.camera_moved import CameraMoved, camera_moved
+from calibration.lens_field import FieldFit, fit_lens_field
+from calibration.model_choice import TermsTried, choose_board
+from calibration.pairs import PairMotion, PairsJudged, judge_pairs, motion_between_exposures, own_places
+from calibration.refinement import Refinement
+from calibration.stereo_model import Observations
+
+REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
+Names = Sequence[tuple[str, str]]
+Refined = tuple[Refinement, tuple[TermsTried, ...]]
+
+
+@dataclass(frozen=True)
+class FreeTerms:
+    """What the fit may change, and choose of."""
+
+    boards: tuple[str, ...]  # of stereo_model.BOARD_MODELS, simplest first
+    distortion: str  # key of stereo_model.DISTORTION_MODELS
+    equal_aspect: bool
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """What `fit_jointly` arrives at."""
+
+    plain: Refinement  # without a field of the lenses
+    lens: FieldFit | None
+    candidates: tuple[TermsTried, ...]  # all that were compared
+    pairs: PairsJudged
+    moved: CameraMoved | None
+    motion: PairMotion | None  # of the boards between the exposures
+    lost: dict[int, str]  # views of which no image can be used -> reason
+    notes: tuple[str, ...]  # about images that cannot
+
+    @property
+    def refinement(self) -> Refinement:
+        """With the field of the lenses, where there is one."""
+        return self.plain if self.lens is None else self.lens.refinement
+
+
+def fit_jointly(
+    observations: Observations,
+    pairs: PairsJudged,
+    nominal: Array,
+    free: FreeTerms,
+    names: Names,
+    table_view: int | None = None,
+    moved: CameraMoved | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> JointFit:
+    """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
+
+    pairs : as roughly judged, with the poses to start from; names : (left, right) of every view
+    table_view : where a camera was moved, the cameras' places are those at this view; moved : as seen by the start
+    """
+
+    def refined(by: PairsJudged, boards: tuple[str, ...], motion: BoardMotion | None = None) -> Refined:
+        places = own_places(observations, by.model, sorted(by.apart), by.right_poses)
+        return choose_board(*places, nominal, boards, free.distortion, free.equal_aspect, report, motion)
+
+    used = pairs
+    refinement, candidates = refined(used, free.boards)
+    lost: dict[int, str] = {}
+    notes: list[str] = []
+    for _ in range(REJUDGED):
+        pairs = judge_pairs(observations, refinement, sorted(used.apart), moved.others if moved else ())
+        moved = camera_moved(observations, pairs, refinement.model, table_view)
+        pairs = pairs if moved is None else moved.set_apart(pairs)
+        if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
+            break
+        observations, used, more, texts = _without_images(observations, pairs, names)
+        lost, notes = lost | more, [*notes, *texts]
+        refinement, again = refined(used, (refinement.terms.board,))
+        candidates = (*candidates, *again)
+    report("trying a field of the lenses")
+    motion, lens = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
+    likely = motion is not None and motion.is_likely
+    if motion is not None and likely and lens is not None:
+        # a field puts boards elsewhere for each camera, too, and what is left of it does: by the scatter before it
+        left = motion_between_exposures(lens.refinement) or motion
+        motion = replace(left, scatter=max(motion.scatter, left.scatter))
+        likely = motion.is_seen
+    if motion is not None and likely:
+        report("pairs that were not synchronised: with a motion of the board between the exposures")
+        refinement, again = refined(used, free.boards, motion.as_random(nominal))
+        candidates = (*candidates, *again)
+        lens = fit_lens_field(refinement, nominal)
+    return JointFit(refinement, lens, candidates, pairs, moved, motion, lost, tuple(notes))
+
+
+def _without_images(
+    observations: Observations, pairs: PairsJudged, names: Names
+) -> tuple[Observations, PairsJudged, dict[int, str], list[str]]:
+    """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
+    model, apart, rejected, warnings = pairs.model, dict(pairs.apart), {}, []
+    R, t = model.R_left_board.copy(), model.t_left_board.copy()
+    for (view, camera), reason in pairs.bad_images.items():
+        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly"
+        observations = observations[(observations.view != view) | (observations.camera != camera)]
+        apart.pop(view, None)
+        if camera == 0 and view in pairs.right_poses:
+            R[view], t[view] = pairs.right_poses[view]
+        if np.any(observations.view == view):
+            warnings.append(f"{text}: left out, the other image of the pair is used for its own camera")
+        else:
+            rejected[view] = text
+    pairs = replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart, bad_images={})
+    return observations, pairs, rejected, warnings
