@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import os
 import threading
@@ -282,8 +283,23 @@ def _format_notes(frame: Any) -> list[str]:
 
 
 def _varies(plane: Any) -> bool:
-    rows = np.frombuffer(plane, np.uint8)[: plane.line_size * plane.height].reshape(plane.height, -1)[:, : plane.width]
+    rows = _rows(plane, plane.height)[:, : plane.width]
     return bool((rows != rows[0, 0]).any())
+
+
+def _rows(plane: Any, height: int) -> NDArray[np.uint8]:
+    """Bytes of a plane's rows (height, bytes), the upper first; a view of its memory where that begins with them."""
+    size = abs(plane.line_size)
+    if plane.line_size >= 0:
+        return np.frombuffer(plane, np.uint8)[: size * height].reshape(height, size)
+    first = plane.buffer_ptr + (height - 1) * plane.line_size  # bottom up: the plane says where the upper row lies
+    return np.frombuffer(ctypes.string_at(first, size * height), np.uint8).reshape(height, size)[::-1]
+
+
+def _without_palette(frame: Any) -> bool:
+    """True where all entries are alike: a recorder of grey values left the palette out, and all would be black."""
+    colours = np.frombuffer(frame.planes[1], np.uint8)[:1024].reshape(256, 4)[:, :3]
+    return bool((colours == colours[0]).all())
 
 
 def _luma(frame: Any, where: str) -> Image:
@@ -298,11 +314,12 @@ def _luma(frame: Any, where: str) -> Image:
         dtype = np.uint8 if component.bits == 8 else np.dtype("<u2")
         if component.bits in (8, 9, 10, 12, 14, 16):
             step, first = {"yuyv422": (2, 0), "uyvy422": (2, 1)}.get(name, (1, 0))
-            rows = np.frombuffer(plane, dtype)[: plane.line_size * frame.height // np.dtype(dtype).itemsize]
-            rows = rows.reshape(frame.height, -1)[:, first : step * frame.width : step]
-            return np.asarray(rows)
+            rows = _rows(plane, frame.height).view(dtype)
+            return np.asarray(rows[:, first : step * frame.width : step])
     if name in ("gray10be", "gray12be", "gray14be", "gray16be"):
         return np.asarray(frame.to_ndarray(format=name)).astype(np.uint16)
+    if name == "pal8" and _without_palette(frame):
+        return _rows(frame.planes[0], frame.height)[:, : frame.width]
     if name in ("rgb24", "bgr24", "bgr0", "rgba", "bgra", "argb", "gbrp", "pal8"):
         return as_grey(np.asarray(frame.to_ndarray(format="rgb24")), where)
     raise RecordingError(f"{where}: pixel format {name} is not read. Export as grey of 8, 10, 12 or 16 bit (ffv1).")

@@ -1,5 +1,6 @@
 """Every format gives back the grey values that an independent library wrote, in any order, and names what is lost."""
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -295,6 +296,44 @@ def test_hdf5_pixels_that_do_not_fill_their_bytes_are_those_that_the_library_rea
         stack.write(h5py.h5s.ALL, h5py.h5s.ALL, frames)
     reader = open_frames("a.h5", tmp_path, "left")
     assert_array_equal([reader.read(i) for i in range(4)], frames)
+
+
+def bitmaps_in_avi(frames, palette, top_down):
+    """An AVI file of frames (n, height, width) uint8 as uncompressed bitmaps, by Microsoft's description (1992)."""
+    n, height, width = frames.shape
+    rows = -(-width // 4) * 4
+    padded = np.pad(frames, ((0, 0), (0, 0), (0, rows - width)))
+    pictures = [picture.tobytes() for picture in (padded if top_down else padded[:, ::-1])]
+
+    def chunk(kind, content):
+        return kind + struct.pack("<I", len(content)) + content + bytes(len(content) % 2)
+
+    def listed(kind, *content):
+        return chunk(b"LIST", kind + b"".join(content))
+
+    size = rows * height
+    info = struct.pack("<IiiHHIIiiII", 40, width, -height if top_down else height, 1, 8, 0, size, 0, 0, 0, 0) + palette
+    stream = b"vidsDIB " + struct.pack("<IHHIIIIIIIIhhhh", 0, 0, 0, 0, 1, 25, 0, n, size, 0, 0, 0, 0, width, height)
+    head = struct.pack("<IIIIIIIIIIIIII", 40000, 0, 0, 0, n, 0, 1, size, width, height, 0, 0, 0, 0)
+    streams = listed(b"strl", chunk(b"strh", stream), chunk(b"strf", info))
+    movie = listed(b"movi", *(chunk(b"00db", picture) for picture in pictures))
+    return chunk(b"RIFF", b"AVI " + listed(b"hdrl", chunk(b"avih", head), streams) + movie)
+
+
+@pytest.mark.parametrize("top_down", [False, True])
+@pytest.mark.parametrize("width", [68, 69])
+def test_bitmaps_in_avi_stand_upright_whatever_their_palette(tmp_path, width, top_down):
+    frames = np.random.default_rng(5).integers(0, 256, (4, 11, width)).astype(np.uint8)
+    level = np.arange(256, dtype=np.uint8)[:, None]
+    grey = np.concatenate([level, level, level, 0 * level], axis=1)
+    for palette, expected in ((grey, frames), (grey[::-1], ~frames), (grey[:0], frames)):
+        (tmp_path / "a.avi").write_bytes(bitmaps_in_avi(frames, palette.tobytes(), top_down))
+        reader = open_frames("a.avi", tmp_path, "left")
+        assert_array_equal([reader.read(i) for i in range(4)], expected)
+    colours = np.concatenate([level, 255 - level, level, 0 * level], axis=1)
+    (tmp_path / "a.avi").write_bytes(bitmaps_in_avi(frames, colours.tobytes(), top_down))
+    with pytest.raises(RecordingError, match="a colour image"):
+        open_frames("a.avi", tmp_path, "left")
 
 
 def test_luma_of_limited_range_is_not_stretched(tmp_path):
