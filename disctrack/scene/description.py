@@ -305,7 +305,7 @@ def scene_toml(scene: Scene) -> str:
     return "\n".join(toml_lines(scene)).lstrip() + "\n"
 
 
-MOST = 1e7  # of a real number: no length, angle, rate or grey value of a laboratory is larger in its unit
+MOST = 1e7  # no length, angle, rate, grey value or number of frames of a laboratory is larger in its unit
 MOST_PIXELS = 16384  # a side
 _NOT_NEGATIVE = {
     "rig.variation",
@@ -388,7 +388,7 @@ def _of_the_disc(scene: Scene) -> Iterator[_Complaint]:
 def _of_the_images(scene: Scene) -> Iterator[_Complaint]:
     cameras, render, size = scene.cameras, scene.render, scene.cameras.image_size
     yield cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", cameras.bit_depth, "8, 10, 12, 16"
-    yield cameras.n_frames < 1, "cameras.n_frames", cameras.n_frames, "at least 1"
+    yield not 1 <= cameras.n_frames <= MOST, "cameras.n_frames", cameras.n_frames, f"1 to {MOST:.0f}"
     yield min(size) < 16, "cameras.image_size", size, "at least 16 x 16"
     yield max(size) > MOST_PIXELS, "cameras.image_size", size, f"at most {MOST_PIXELS} pixels a side"
     hot = scene.sensor.hot_pixels

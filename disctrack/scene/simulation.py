@@ -20,7 +20,7 @@ from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion, Regime
 from disctrack.rolling.simulate import simulate
-from disctrack.scene.description import load_scene
+from disctrack.scene.description import MOST, load_scene
 from disctrack.scene.motion import effects_in_words, rolling_model, rolling_start
 
 SCHEMA, SCHEMA_VERSION = "disctrack motion", 1
@@ -65,6 +65,9 @@ def run_simulate(
     refuse_existing(output, overwrite)
     rate = scene.cameras.frame_rate_hz if rate is None else rate
     duration = max(scene.cameras.n_frames - 1, 1) / scene.cameras.frame_rate_hz if duration is None else duration
+    if duration * rate > MOST:
+        instants = f"{duration:g} s at {rate:g} Hz are {duration * rate:.3g} instants"
+        raise SceneError(f"{scene_path}: {instants}; expected at most {MOST:g}")
     motion = simulate(rolling_model(scene), rolling_start(scene), duration, rate=rate)
     text = scene_path.read_text(encoding="utf-8")
     settings = {"duration_s": duration, "rate_hz": rate}

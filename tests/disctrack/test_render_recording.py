@@ -328,6 +328,7 @@ def test_truth_of_another_file_is_refused(tmp_path):
         ("[markers]\ncentres_mm = [[36, 0], [0, 9], [9, 0]]", "a dot over the disc's rim"),
         ("[motion]\nposes = [[1, 2, 3]]", "motion.poses"),
         ("[light]\ndirection = [1, 0, 0]", "light.direction = .*; expected a lamp above the table"),
+        ("[cameras]\nn_frames = 1000000000", "cameras.n_frames = 1000000000; expected 1 to 10000000"),
         ("[light]\ndirected = 1.5", "light.directed = 1.5; expected a share, 0 to 1"),
         ("[[light.glare]]\nsigma_px = 0.0", "light.glare.sigma_px = 0.0; expected a positive number"),
         ("[[faults.occluders]]\nwidth_px = -5.0", "faults.occluders.width_px = -5.0; expected a positive number"),

@@ -97,6 +97,8 @@ def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
     (tmp_path / "there.h5").write_text("")
     with pytest.raises(OutputError, match="exists"):
         run_simulate(scene, tmp_path / "there.h5")
+    with pytest.raises(SceneError, match=r"2 s at 1e\+300 Hz are 2e\+300 instants; expected at most 1e\+07"):
+        run_simulate(scene, tmp_path / "motion.h5", duration=2.0, rate=1e300)
     scene.write_text('[motion]\nkind = "static"\n')
     with pytest.raises(SceneError, match='needs kind = "rolling"'):
         run_simulate(scene, tmp_path / "motion.h5")
