@@ -72,6 +72,12 @@ def _start(state: State, theta_end: float) -> Array:
     y = state.array
     if not np.isfinite(y).all():
         raise ModelError(f"the state has numbers that are not finite: {state}")
+    given = [name for name in ("v_x", "v_y", "z", "v_z") if getattr(state, name) is not None]
+    if len(given) != len(y) - 8:
+        raise ModelError(
+            f"of the velocity and height of O, the state has {', '.join(given)}: give none for rolling, v_x and v_y "
+            "for slip, v_x, v_y, z and v_z for flight"
+        )
     if not theta_end < state.theta <= np.pi / 2:
         raise ModelError(
             f"nutation {np.degrees(state.theta):.4g} deg is outside ({np.degrees(theta_end):.4g}, 90] deg: the motion "

@@ -126,6 +126,12 @@ def test_published_friction_stops_the_disc_in_about_one_and_a_half_seconds(k_m, 
     assert_allclose(motion.end_time, 1.5, rtol=0.08)
 
 
+@pytest.mark.parametrize("some", [{"v_x": 1.0}, {"z": 0.1, "v_z": 0.0}, {"v_x": 0.0, "v_y": 0.0, "z": 0.1}])
+def test_a_start_with_part_of_the_velocity_or_height_is_refused(some):
+    with pytest.raises(rolling.ModelError, match=f"the state has {', '.join(some)}: give none for rolling"):
+        rolling.simulate(rolling.Model(MA_2014), rolling.State(omega2=5.0, **some), 0.01)
+
+
 def test_a_start_below_the_end_is_refused():
     with pytest.raises(rolling.ModelError, match="outside"):
         rolling.simulate(IDEAL, State(theta=np.radians(0.3), omega2=1.0), 1.0)
