@@ -28,6 +28,8 @@ def test_saturation_shows_where_pixels_are_clipped_and_only_there(rng, dtype, le
     light = rng.normal(0.9 * level, 0.03 * level, (200, 200))
     light[:, :60] *= 0.2
     assert saturation_level(np.rint(light * 0.8).astype(dtype)) is None
+    evenly = (level // 2 + rng.integers(0, 50, light.shape)).astype(dtype)  # hundreds of pixels at the largest value,
+    assert saturation_level(evenly) is None  # and as many at every other
     clipped = np.minimum(np.rint(light * 1.1), level).astype(dtype)
     assert saturation_level(clipped) == level
 
