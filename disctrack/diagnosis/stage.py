@@ -14,7 +14,15 @@ from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
 from disctrack.diagnosis.disc.form_misfit import with_form
-from disctrack.diagnosis.disc.learned_law import UNLIKELY, LearnedLaw, learn, with_law, without_idle_terms
+from disctrack.diagnosis.disc.learned_law import (
+    UNLIKELY,
+    LearnedLaw,
+    learn,
+    shortest_to_first_order,
+    with_amounts,
+    with_law,
+    without_idle_terms,
+)
 from disctrack.diagnosis.disc.left_over import LeftOver, left_over
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.disc.plan import open_questions, plan, separations
@@ -95,9 +103,10 @@ def diagnose_trajectory(
     assert held_after is not None
     if learned is not None:
         remembering = with_memory(_judged(diagnosis, system), learned.fit)
-        wider, course = with_form(system, remembering, learned.law, diagnosis.noise)
-        learned = replace(learned, fit=wider, course=course)
         left = left_over(system, learned.fit, diagnosis.noise)
+        not_noise = left is not None and not left.white
+        wider, course = with_form(system, remembering, learned.law, diagnosis.noise, not_noise)
+        learned = replace(learned, fit=wider, course=course)
     else:
         diagnosis = replace(diagnosis, after=with_memory(_judged(diagnosis, system), diagnosis.after))
     fit_ = learned.fit if learned else diagnosis.after
@@ -223,15 +232,22 @@ def _beyond_the_catalogue(
     of_motion, faults = (
         tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
     )
+    looked_for = any(f.candidate.sought for f in of_motion)
     sets: list[tuple[Found, ...]] = [faults]
-    if diagnosis.verdict == "nothing missing" or (explained and len(of_motion) < 2 and not doubtful):
+    if diagnosis.verdict == "nothing missing":
         return None, (), ()
-    if diagnosis.held_out_before is None:
+    if diagnosis.held_out_before is None or (explained and not of_motion and not doubtful):
         return None, (), ()
     base = diagnosis.before
     known = _length(system, diagnosis, diagnosis.after, diagnosis.found)
-    if explained:
+    if explained and len(of_motion) == 1 and not (doubtful or looked_for):
+        beside = _beside_them(base, faults)
+        if not shortest_to_first_order(system, beside, diagnosis.after, diagnosis.noise) < known:
+            return None, (), ()
+    if explained and (doubtful or len(of_motion) > 1):
         sets += [(*faults, f) for f in of_motion]
+    elif of_motion and not explained:  # they describe most of it, and the law may be what is left
+        sets.append(diagnosis.found)
     answers = [_law_beside(system, diagnosis, kept) for kept in sets]
     best = min((a for a in answers if a is not None), key=lambda a: (not a.fit.converged, a.length), default=None)
     if best is None:
@@ -272,7 +288,7 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     """The law that takes the place of what was found but for `kept`; None if there is none."""
     explained = diagnosis.verdict == "found"
     base = _beside_them(diagnosis.before, kept)
-    along = diagnosis.after if explained else diagnosis.nearest
+    along = diagnosis.after if diagnosis.found else diagnosis.nearest
     law = learn(system, base, diagnosis.noise, along, along.cost / diagnosis.noise if explained and along else np.inf)
     if law is None:
         return None
@@ -288,7 +304,7 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     for found in kept:  # in what the law leaves, is it still an effect?
         rest = [f for f in again if f is not found]
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
-        without = with_law(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
+        without = _with_law_in_two_steps(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / diagnosis.noise
         if without.converged and gain < found.threshold:
             again, fitted = rest, without
@@ -298,6 +314,17 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     if explained:
         length += law.looked * len(law.families)
     return _Beside(law, known, fitted, tuple(again), length)
+
+
+def _with_law_in_two_steps(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    """The law's fit; where that does not arrive, from where its amounts alone lead: far from it, edges make kinks."""
+    fitted = with_law(system, base, law)
+    if fitted.converged:
+        return fitted
+    amounts = with_amounts(system, base, law)
+    reached = replace(law.candidate, start=tuple(amounts.values[n] for n in law.candidate.names))
+    again = with_law(system, base, replace(law, candidate=reached, values=amounts.values))
+    return min(fitted, amounts, again, key=lambda f: (not f.converged, f.cost))
 
 
 def _rivals(

@@ -148,3 +148,43 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
         assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength) < 0.2
     assert abs(fitted.values["kz.k_z"] - 6e-5) < 3 * fitted.sigma("kz.k_z") < 2e-6
     assert "Missing in the model: pivoting friction" in beside.sentence
+
+
+def test_a_thread_that_twists_is_no_shaken_table():
+    """Seven numbers, a frequency among them, leave noise of a moment that grows with the turn: a law leaves less."""
+    made = unknown("twisted_thread")
+    result = diagnose_trajectory(made.trajectory, separate=False)
+    assert result.diagnosis.found == ()
+    assert result.learned is not None
+    assert any("table_shaken" in note for note in result.notes)
+    course = result.learned.course
+    true = np.stack([np.interp(course.time, made.time, made.moment[:, i]) for i in range(3)], axis=1)
+    assert (np.abs(course.moment - true) < 3 * course.sigma).all()
+    assert np.sqrt(np.mean(course.sigma[:, 2] ** 2)) < np.sqrt(np.mean(true[:, 2] ** 2))
+
+
+@pytest.mark.parametrize(("name", "creep"), [("stribeck_slip", 7.0e-4), ("viscous_contact", 1.0 / 30.0)])
+def test_friction_by_the_speed_of_slip_is_creep(name, creep):
+    """2 % of the coefficient: friction by Stribeck's law is not quite linear, and fast creep is not quite at once."""
+    result = diagnose_trajectory(unknown(name).trajectory, separate=False)
+    assert [found.candidate.name for found in result.diagnosis.found] == ["creep"]
+    assert result.diagnosis.verdict == "found"
+    assert abs(result.after_fit.values["creep.c"] / creep - 1.0) < 0.02
+
+
+def test_one_friction_in_another_s_place_competes_with_laws():
+    """A drag along one direction: creep leaves noise of it, and a law of the same length leaves less; both are told."""
+    made = unknown("drag_one_way")
+    result = diagnose_trajectory(made.trajectory, separate=False)
+    assert result.learned is not None
+    assert any("known effects" in note for note in result.notes)
+    course = result.learned.course
+    true = np.stack([np.interp(course.time, made.time, made.moment[:, i]) for i in range(3)], axis=1)
+    assert np.mean(np.abs(course.moment - true) < 3 * course.sigma) > 0.85
+
+
+def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
+    """A step of the table is wider than any hill of the library: its derivatives are taken inwards."""
+    result = diagnose_trajectory(unknown("seam").trajectory, separate=False)
+    assert result.diagnosis.verdict == "unexplained"
+    assert result.learned is None or np.isfinite(result.learned.course.sigma).all()

@@ -11,6 +11,7 @@ from disctrack.diagnosis.disc import form_misfit
 from disctrack.diagnosis.disc.system import Patience
 from disctrack.diagnosis.engine.system import GivenUp
 from disctrack.rolling import Model, sensitivities, simulate, steady_precession
+from disctrack.rolling.model import body_constants
 from disctrack.scene.description import Scene
 
 
@@ -20,7 +21,7 @@ def test_numbers_beside_a_misfit_scatter_as_generalised_least_squares_has_it(rng
     monkeypatch.setattr(form_misfit, "SIZES", np.array([0.7]))
     U, inverse = form_misfit._solver(A)
     taken = inverse @ (U.T @ B)
-    second, misfit = form_misfit._second_moment(B - U @ (U.T @ B), right - U @ (U.T @ right))
+    second, misfit = form_misfit._second_moment(B - U @ (U.T @ B), right - U @ (U.T @ right), [6])
     found = np.linalg.inv(A.T @ A) + taken @ second @ taken.T
     weight = np.linalg.inv(np.eye(40) + 0.49 * B @ B.T)
     covariance = np.linalg.inv(A.T @ weight @ A)
@@ -33,10 +34,22 @@ def test_the_size_of_a_misfit_is_read_from_the_residual(rng):
     """Where the residual holds none, next to nothing is allowed for; where it holds one, its size."""
     B = 1e3 * rng.standard_normal((400, 60))
     noise = rng.standard_normal(400)
-    none = form_misfit._second_moment(B, noise)[1]
-    some = form_misfit._second_moment(B, noise + 0.1 * B @ rng.standard_normal(60))[1]
+    none = form_misfit._second_moment(B, noise, [60])[1]
+    some = form_misfit._second_moment(B, noise + 0.1 * B @ rng.standard_normal(60), [60])[1]
     assert none < 0.003
     assert some == pytest.approx(0.1, rel=0.3)
+
+
+def test_what_the_recording_does_not_show_of_a_misfit_is_as_large_as_before_the_data(rng):
+    """Of three parts one is seen and absent, one is seen and there, one leaves no trace: each has a size of its own."""
+    B = 1e3 * rng.standard_normal((400, 60))
+    B[:, 40:] = 0.0
+    right = rng.standard_normal(400) + 0.1 * B[:, 20:40] @ rng.standard_normal(20)
+    second, _ = form_misfit._second_moment(B, right, [20, 20, 20])
+    sizes = [float(np.sqrt(np.mean(np.diag(second)[20 * i : 20 * i + 20]))) for i in range(3)]
+    assert sizes[0] < 0.003
+    assert sizes[1] == pytest.approx(0.1, rel=0.4)
+    assert sizes[2] == pytest.approx(float(np.sqrt(np.mean(form_misfit.SIZES**2))), rel=1e-6)
 
 
 def test_the_moment_of_a_law_of_the_air_is_that_of_the_air_of_the_recording():
@@ -50,6 +63,24 @@ def test_the_moment_of_a_law_of_the_air_is_that_of_the_air_of_the_recording():
     ]
     assert np.abs(moments[0]).max() > 1e-8
     assert_allclose(moments[1], moments[0] / 3, rtol=1e-12)
+
+
+def test_a_tilted_table_counts_as_the_force_along_it():
+    """The same moment as a level force m g tilt at the centre, on the same motion."""
+    disc = Scene().declared_disc
+    tilted = Model(disc).with_values({"table_tilt.tilt_x": 1e-3, "table_tilt.tilt_y": -4e-4})
+    motion = simulate(tilted, steady_precession(np.radians(14.0), disc), times=np.linspace(0.0, 0.1, 10))
+    body = body_constants(tilted, 0.01)
+    pulled = Model(disc).with_values({"spring.k": 0.0, "spring.F_x": disc.mass * body["g_x"]})
+    pulled = pulled.with_values({"spring.F_y": disc.mass * body["g_y"]})
+    moments = [
+        form_misfit.moment_about_contact(SimpleNamespace(disc=disc, model_with=lambda _, m=model: m), {}, motion)
+        for model in (tilted, pulled)
+    ]
+    assert np.abs(moments[1]).max() > 1e-6
+    assert_allclose(moments[0][:, 2], moments[1][:, 2], rtol=1e-9)
+    by_weight = 0.5 * (1e-3**2 + 4e-4**2) * disc.mass * 9.81 * disc.radius  # 1 - cos(tilt) of it is missing
+    assert_allclose(moments[0], moments[1], atol=1.01 * by_weight)
 
 
 def test_slip_that_takes_too_long_is_not_followed():

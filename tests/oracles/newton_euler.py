@@ -42,6 +42,7 @@ class Disc:
         self.dips = dips  # of the rim: (depth, angle in the body, width)
         self.gives_way = gives_way  # compliance of a table that `yielding` makes move [m/N]
         self.table = table  # t -> displacement, velocity, acceleration in the axes of the world; None: at rest
+        self.wears = 0.0  # [m/s] by which the radius shrinks; `r` is that of the instant
         self.g = np.array(gravity, float)
         J1 = m * r * r / 4 + m * h * h / 3
         self.J = np.diag([J1, J1, m * r * r / 2]) if J_body is None else np.array(J_body, float)
@@ -92,7 +93,7 @@ class Instant:
         self.d, self.sine, self.cosine = d, sine, d[2]
         rim, height = disc.r - disc.edge, disc.h - disc.edge
         self.arm = -rim * e2 - height * d - disc.edge * K
-        self.arm_rate = -rim * e2_rate - height * d_rate
+        self.arm_rate = -rim * e2_rate - height * d_rate + disc.wears * e2
         self.normal, self.normal_rate = K, np.zeros(3)
         if disc.bowl is not None:
             self.touch_the_bowl(disc, d, d_rate)
@@ -166,6 +167,7 @@ def accelerations(disc, state, regime):
     # a + wd x arm + w x arm_rate = the table's, all of it (rolling) or its vertical part (slipping), or F = 0
     constraint = np.hstack([np.eye(3), -S(now.arm), np.zeros((3, 3))])
     right = now.u_acceleration - np.cross(w, now.arm_rate)
+    right = right - disc.wears * now.cosine * now.thetadot * K  # what touches sinks with the radius, by r' sin(theta)
     if regime == "rolling":
         A[6:9], b[6:9] = constraint, right
     elif regime == "slipping":

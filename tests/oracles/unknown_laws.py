@@ -38,6 +38,8 @@ class Unknown:
     omega3: float = 0.6
     duration: float = 0.7
     rate_of_memory: Callable | None = None  # (disc, instant, memory) -> rate of one more number, which the law reads
+    remembered: Callable | None = None  # (instant) -> that number at the start; psidot^2, if not given
+    wears: float = 0.0  # [m/s] by which the radius shrinks
     com: Callable | None = None  # instant -> centre of mass in the body
     friction: Callable | None = None  # slip speed -> coefficient: the disc slips, and there is no true moment
     shift: Callable | None = None  # times -> (n, 6) by which the coordinates are seen beside the motion
@@ -145,6 +147,44 @@ def sticker(mass, arm, size, frequency):
     return law
 
 
+def over_iron(strength):
+    """A magnet along the axis above an iron table, with its image: U = -C (1 + cos^2 theta) / z^3."""
+
+    def law(disc, now):
+        z = now.O[2]
+        torque = -2 * strength * now.cosine * now.sine / z**3 * now.n0
+        return torque, ZERO, -3 * strength * (1 + now.cosine**2) / z**4 * K
+
+    return law
+
+
+def seam(angle, offset, height, width):
+    """Two halves of a table, one higher than the other."""
+    normal = level(angle)[:2]
+
+    def gradient(A):
+        s = (A[:2] @ normal - offset) / width
+        return height / (width * np.sqrt(np.pi)) * np.exp(-s * s) * normal
+
+    return gradient
+
+
+def nail(strength, place):
+    """A magnet in the face, 25 mm from its centre, pulled towards a nail below the table: U = -C / d^3."""
+
+    def law(disc, now):
+        lever = 0.025 * now.R[:, 0]
+        d = now.O + lever - np.array(place)
+        pull = -3 * strength * d / np.linalg.norm(d) ** 5
+        return np.cross(lever, pull), ZERO, pull
+
+    return law
+
+
+def azimuth(now):
+    return np.arctan2(now.n0[1], now.n0[0])
+
+
 def stribeck(static, dynamic, speed):
     return lambda w: dynamic + (static - dynamic) * np.exp(-((w / speed) ** 2))
 
@@ -192,6 +232,40 @@ UNKNOWN: dict[str, Unknown] = {
     "magnus_by_height": Unknown(force(lambda d, n: 0.05 * n.sine * np.cross(n.omega, n.v) * (1, 1, 0))),
     "soft_start": Unknown(by_load(lambda d, n: -2e-4 * np.exp(-d.t / 0.1) * rolling(n))),
     "brake_by_tilt": Unknown(by_load(lambda d, n: -3e-3 * n.sine**2 * rolling(n))),
+    "tilt_by_azimuth": Unknown(by_load(lambda d, n: -6e-4 * n.sine * np.cos(2 * azimuth(n) - 0.5) * rolling(n))),
+    "wear": Unknown(None, wears=20e-6),
+    "magnet_over_iron": Unknown(over_iron(3e-11)),
+    "seam": Unknown(uneven(seam(0.9, 0.045, 6e-6, 4e-3))),
+    "rough_rim": Unknown(by_load(lambda d, n: -2e-4 * smooth((np.cos(n.phi - 1.0) - 0.5) / 0.1) * rolling(n))),
+    "puddle": Unknown(
+        moment(lambda d, n: -1.5e-5 * n.psidot * np.exp(-np.sum((contact(n)[:2] - PLACE) ** 2) / 0.015**2) * n.m0)
+    ),
+    "hinged_frame": Unknown(
+        force(lambda d, n: d.m * 9.81 * d.memory * np.array([1.0, 0.0, 0.0])),
+        rate_of_memory=lambda d, n, z: (5e-3 * (contact(n)[0] + 0.1) - z) / 0.04,
+        remembered=lambda n: 5e-3 * (contact(n)[0] + 0.1),
+    ),
+    "fan": Unknown(force(lambda d, n: -0.01 * (n.v - 0.5 * smooth((d.t - 0.3) / 0.02) * level(1.3)) * (1, 1, 0))),
+    "liquid": Unknown(
+        lambda d, n: (-4e-6 * (n.omega @ n.d - d.memory) * n.d, ZERO, ZERO),
+        omega3=1.5,
+        rate_of_memory=lambda d, n, z: (n.omega @ n.d - z) / 0.1,
+        remembered=lambda n: 0.0,
+    ),
+    "thrust": Unknown(force(lambda d, n: 3e-3 * n.d)),
+    "twisted_thread": Unknown(
+        moment(lambda d, n: -3e-6 * d.memory * K),
+        rate_of_memory=lambda d, n, z: n.omega[2],
+        remembered=lambda n: 0.0,
+        omega3=1.5,
+    ),
+    "worn_in": Unknown(  # friction that falls with the distance rolled
+        by_load(lambda d, n: -1.5e-4 * np.exp(-d.memory / 0.4) * rolling(n)),
+        rate_of_memory=lambda d, n, z: d.r * np.linalg.norm(n.omega - n.omega[2] * K),
+        remembered=lambda n: 0.0,
+    ),
+    "cross_drag": Unknown(force(lambda d, n: 6e-4 * n.psidot * n.sine * n.n0)),
+    "nail": Unknown(nail(3e-10, (0.05, 0.01, -0.02))),
 }
 
 
@@ -212,6 +286,7 @@ class _Body(newton_euler.Disc):
         self.t, self.memory = t, state[15] if len(state) > 15 else 0.0
         if self._unknown.com is not None:
             self.com = np.array(self._unknown.com(t))
+        self.r, self.wears = DISC.radius - self._unknown.wears * t, self._unknown.wears
         if self._unknown.friction is not None:
             now = newton_euler.Instant(self, state[:15])
             self.mu = float(self._unknown.friction(np.linalg.norm(now.v_contact)))
@@ -225,10 +300,12 @@ def motion(unknown: Unknown):
     theta = np.radians(unknown.theta_deg)
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
     state = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, unknown.omega3)
+    state[9] -= unknown.wears * np.sin(theta)  # the centre sinks with the radius
     if regime == "slipping":
         state[7:9] += (5e-3, -3e-3)
     if unknown.rate_of_memory is not None:
-        state = np.append(state, newton_euler.Instant(body, state).psidot ** 2)
+        now = newton_euler.Instant(body, state)
+        state = np.append(state, now.psidot**2 if unknown.remembered is None else unknown.remembered(now))
 
     def rate(t, s):
         ydot = newton_euler.rate(body.moved(t, s), s[:15], regime)
@@ -250,7 +327,7 @@ def motion(unknown: Unknown):
     for i, (t, s) in enumerate(zip(found.t, states, strict=True)):
         now = newton_euler.Instant(body.moved(t, s), s[:15])
         speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
-    if regime == "rolling" and unknown.com is None and unknown.shift is None:
+    if regime == "rolling" and unknown.com is None and unknown.shift is None and not unknown.wears:
         for i in range(0, len(q), 6):
             body.moved(found.t[i], states[i])
             wrench[i] = moment_of(body, states[i][:15])

@@ -1,27 +1,40 @@
 """How well is a law known whose form was picked from a library? Its course over time, and what its form may be off by.
 
 A fit takes the form for exact: its sigmas are those of the coefficients. The true law has another form, of which the
-data show little. So the moment about the contact is taken for the law's plus a misfit: a normal process with a
-correlation as long as a probe, of a size in proportion to the law's own. The size's probability follows from the
-residual (Kennedy and O'Hagan 2001: a discrepancy beside the parameters), and all numbers are averaged over it.
+data show little. So the moment about the contact is taken for the law's plus a misfit (Kennedy and O'Hagan 2001: a
+discrepancy beside the parameters). Where the form is nearly right, it is a normal process with a correlation as long as
+a probe. Where it is another's, it is a sum: along each axis such a process, and some that change slowly beside the
+precession and its harmonics, as what depends on place and direction does; each of a size of its own, so that what the
+recording does not show may be as large as the law. All sizes are in proportion to the law's, and their probabilities
+follow from the residual. That the form is another's is certain where the residual is not noise, and else as probable as
+laws of other kinds are that describe the data too. What a law's numbers could take up themselves is no misfit (Plumlee
+2017).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from calibration.arrays import Array
-from disctrack.diagnosis.disc.learned_law import WIDTH, LearnedLaw, probe
+from disctrack.diagnosis.disc.learned_law import WIDTH, LearnedLaw, _Blocks, probe
 from disctrack.diagnosis.disc.motion import state_of
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, triangle
 from disctrack.diagnosis.engine.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_wrench, kinematics
+from disctrack.rolling.model import body_constants
 
-SIZES = np.logspace(-3, 0, 25)  # of the misfit over the law's rms: before the data, each as probable
+SIZES = np.logspace(-3, 0, 25)  # of a part of the misfit over the law's rms: before the data, each as probable
+HARMONICS = 2  # of the precession, beside which a part changes slowly
+SLOW = 1.0 / 3.0  # of the recording: correlation of a part that changes slowly
+SELDOM = 0.05  # probability that the form is another's, where no other describes the data
+SWEEPS = 4  # over the parts, the size of each judged beside the others
 STEP = 1e-4  # of a number, for the derivative of the course
 UNSEEN = 1e-10  # share of a column's length below which the data do not show it
 
@@ -39,7 +52,8 @@ class LawCourse:
 def moment_about_contact(system: DiscSystem, values: Values, motion: Motion, only: str | None = None) -> Array:
     """(n, 3) of the effects at `values` on a given motion [N m]; a force X at the centre counts as -r_OA x X.
 
-    A sharp edge on a flat table, as the arm goes.   only : the effect of this name
+    A sharp edge on a flat table, as the arm goes; a tilt counts as the force by which gravity is another than declared.
+    only : the effect of this name
     """
     model = system.model_with(values)
     k = kinematics(motion.q, motion.qdot, system.disc, model.gravity, motion.time, model.air_density)
@@ -51,13 +65,22 @@ def moment_about_contact(system: DiscSystem, values: Values, motion: Motion, onl
         if effect.law is not None and only in (None, effect.name):
             moment, force = effect_wrench(effect, k, motion.contact_force[:, 2])
             total += moment - np.cross(arm, force)
+    if only is None:
+        body = body_constants(model, THETA_END)
+        pull = system.disc.mass * np.array([body["g_x"], body["g_y"], body["g_z"] + model.gravity])
+        cp, sp = np.cos(motion.q[:, 3]), np.sin(motion.q[:, 3])
+        along = [pull[0] * cp + pull[1] * sp, pull[1] * cp - pull[0] * sp, np.full(len(motion), pull[2])]
+        total -= np.cross(arm, np.stack(along, axis=1))
     return total
 
 
-def with_form(system: DiscSystem, fitted: Fit, law: LearnedLaw, noise: float) -> tuple[Fit, LawCourse | None]:
+def with_form(
+    system: DiscSystem, fitted: Fit, law: LearnedLaw, noise: float, remembers: bool = False
+) -> tuple[Fit, LawCourse | None]:
     """The fit with sigmas that know of the form's misfit, and the law's course; the fit alone where the disc slips.
 
     system : knows the law.   noise : variance of the residual's noise over that stated
+    remembers : what the fit leaves is not noise
     """
     blocks = probe(system, fitted)
     if blocks is None:
@@ -65,20 +88,32 @@ def with_form(system: DiscSystem, fitted: Fit, law: LearnedLaw, noise: float) ->
     n, k = blocks.n_fitted, len(blocks.time)
     R = triangle(np.vstack([*(part / np.sqrt(noise) for part in blocks.triangles), blocks.prior]))
     course, own, by_number = _courses(system, fitted, law, blocks.time)
-    distance = (blocks.time[:, None] - blocks.time) / blocks.spacing
-    root = np.linalg.cholesky(np.exp(-0.5 * distance**2) + 1e-6 * np.eye(k))
-    S = np.kron(np.eye(3), float(np.sqrt(np.mean(np.sum(own**2, axis=1)))) * root)  # axis by axis, as the probes are
-    B = R[:, n:-1] @ S / (WIDTH * np.sqrt(2 * np.pi))  # neighbouring probes add up to this
+    parts = _parts(system, fitted, blocks, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
+    others = sum(odds for rival, odds in law.rivals if not _kinds(rival) & _kinds(law))
+    wrong = 1.0 if remembers else max(SELDOM, others / (1.0 + others))
+    laws = by_number[:, np.any(by_number != 0.0, axis=0)]
+    Q = _solver(laws)[0] if laws.size else laws
     U, inverse = _solver(R[:, :n])
-    taken = inverse @ (U.T @ B)  # by which the fitted numbers give way to a misfit
     right = R[:, -1] - U @ (U.T @ R[:, -1])
-    second, misfit = _second_moment(B - U @ (U.T @ B), right)
-    moved = S - by_number @ taken
-    variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1) + np.sum((moved @ second) * moved, axis=1)
+    variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1)
+    covariance, misfit = fitted.covariance.copy(), 0.0
+    for probability, some in ((1.0 - wrong, [np.concatenate(parts[:: HARMONICS + 2], axis=1)]), (wrong, parts)):
+        S = np.concatenate(some, axis=1)
+        S = S - Q @ (Q.T @ S)
+        B = R[:, n:-1] @ S / (WIDTH * np.sqrt(2 * np.pi))  # neighbouring probes add up to this
+        taken = inverse @ (U.T @ B)  # by which the fitted numbers give way to a misfit
+        second, size = _second_moment(B - U @ (U.T @ B), right, [part.shape[1] for part in some])
+        moved = S - by_number @ taken
+        variance += probability * np.sum((moved @ second) * moved, axis=1)
+        covariance += probability * taken @ second @ taken.T
+        misfit += probability * size**2
     variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_rivals(system, fitted, law, course, blocks.time)
     sigma = np.sqrt(variance)
-    wider = replace(fitted, covariance=fitted.covariance + taken @ second @ taken.T)
-    return wider, LawCourse(blocks.time, course, sigma, misfit)
+    return replace(fitted, covariance=covariance), LawCourse(blocks.time, course, sigma, float(np.sqrt(misfit)))
+
+
+def _kinds(law: LearnedLaw) -> set[str]:
+    return {family.kind for family in law.families}
 
 
 def _courses(system: DiscSystem, fitted: Fit, law: LearnedLaw, time: Array) -> tuple[Array, Array, Array]:
@@ -90,6 +125,7 @@ def _courses(system: DiscSystem, fitted: Fit, law: LearnedLaw, time: Array) -> t
     for i, name in enumerate(fitted.names):
         if system.model.has_name(name) and fitted.sigma(name) > 0:
             step = STEP * max(abs(values[name]), fitted.sigma(name))
+            step = step if values[name] + step <= fitted.quantities[i].upper else -step
             moved = moment_about_contact(system, {**values, name: values[name] + step}, motion)
             by_number[:, i] = ((moved - course) / step)[1:].T.ravel()
     own = moment_about_contact(system, values, motion, law.candidate.effect)
@@ -120,16 +156,48 @@ def _solver(A: Array) -> tuple[Array, Array]:
     return U[:, seen], (V[seen] / singular[seen, None]).T / length[:, None]
 
 
-def _second_moment(B: Array, right: Array) -> tuple[Array, float]:
-    """E[u u'] of right = B f u + noise, u normal of size 1, averaged over f in SIZES, times f^2; and the rms of f."""
-    left, shown, W = np.linalg.svd(B, full_matrices=False)
-    projected = left.T @ right
-    power = (SIZES[:, None] * shown) ** 2
-    density = -0.5 * np.sum(np.log1p(power) - projected**2 * power / (1 + power), axis=1)
-    weight = np.exp(density - density.max())
-    weight /= weight.sum()
-    second = np.zeros((B.shape[1], B.shape[1]))
-    for w, f, p in zip(weight, SIZES, power, strict=True):
-        mean = W.T @ (np.sqrt(p) / (1 + p) * projected)
-        second += w * f**2 * (np.eye(len(second)) - (W.T * (p / (1 + p))) @ W + np.outer(mean, mean))
-    return second, float(np.sqrt(weight @ SIZES**2))
+def _parts(system: DiscSystem, fitted: Fit, blocks: _Blocks, size: float) -> list[Array]:
+    """Roots (3 k, m) of the covariances of the misfit's parts, axis by axis; their rms is that of the law, `size`."""
+    time, k = blocks.time, len(blocks.time)
+    distance = time[:, None] - time
+    short = np.linalg.cholesky(np.exp(-0.5 * (distance / blocks.spacing) ** 2) + 1e-6 * np.eye(k))
+    lasts = SLOW * float(system.time[-1] - system.time[0])
+    variance, modes = np.linalg.eigh(np.exp(-0.5 * (distance / lasts) ** 2))
+    slow = modes[:, variance > 1e-3 * variance[-1]] * np.sqrt(variance[variance > 1e-3 * variance[-1]])
+    psi = _motion(system, fitted.values, time).q[1:, 3]
+    roots = [short, slow]
+    for n in range(1, HARMONICS + 1):
+        roots.append(np.column_stack([np.cos(n * psi)[:, None] * slow, np.sin(n * psi)[:, None] * slow]))
+    return [size * np.kron(np.eye(3)[:, [axis]], root) for axis in range(3) for root in roots]
+
+
+def _second_moment(B: Array, right: Array, parts: Sequence[int]) -> tuple[Array, float]:
+    """E[u u'] of right = B u + noise, and the rms of u; its parts u_i = f_i v_i with normal v_i of size 1.
+
+    parts : how many columns each has. f_i is averaged over SIZES, the others' at their rms.
+    """
+    edges = np.concatenate([[0], np.cumsum(parts)])
+    own = [slice(a, b) for a, b in pairwise(edges)]
+    f2 = np.full(len(parts), SIZES[0] ** 2)
+    _, R = np.linalg.qr(np.column_stack([B, right])) if len(B) > B.shape[1] + 1 else (None, np.column_stack([B, right]))
+    B, right = R[:, :-1], R[:, -1]
+    for _ in range(SWEEPS):
+        for i, columns in enumerate(own):
+            others = np.eye(len(B))
+            for j, theirs in enumerate(own):
+                if j != i:
+                    others += f2[j] * B[:, theirs] @ B[:, theirs].T
+            L = np.linalg.cholesky(others)
+            left, shown, _ = np.linalg.svd(solve_triangular(L, B[:, columns], lower=True), full_matrices=False)
+            projected = left.T @ solve_triangular(L, right, lower=True)
+            power = (SIZES[:, None] * shown) ** 2
+            density = -0.5 * np.sum(np.log1p(power) - projected**2 * power / (1 + power), axis=1)
+            weight = np.exp(density - density.max())
+            f2[i] = float(weight @ SIZES**2 / weight.sum())
+    size = np.repeat(np.sqrt(f2), parts)
+    scaled = B * size
+    precision = np.eye(len(size)) + scaled.T @ scaled
+    covariance = np.linalg.inv(precision)
+    mean = covariance @ (scaled.T @ right)
+    second = size[:, None] * (covariance + np.outer(mean, mean)) * size
+    return second, float(np.sqrt(np.sum(f2)))

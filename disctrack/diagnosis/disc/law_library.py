@@ -34,6 +34,7 @@ SCALARS = (
     ("psidot", "psidot"),
     ("psidot |psidot|", "psidot * magnitude(psidot)"),
     ("psidot^3", "psidot * psidot * psidot"),
+    ("psidot sin theta", "omega2"),
     ("phidot sin theta", "phidot * sin_theta"),
     ("omega_3", "omega3"),
     ("sin theta", "sin_theta"),
@@ -41,6 +42,7 @@ SCALARS = (
     ("1 / sin^2 theta", "1.0 / (sin_theta * sin_theta)"),
     ("time", "time"),
 )
+FOR_FORCES = 14  # of them, that are tried for forces, too
 _SPEED = "sqrt(v_n * v_n + v_m * v_m + 1e-12)"
 _X, _Y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"  # the place along n0 and m0
 # the contact's place on the table: O minus (r cos theta - h sin theta) m0
@@ -87,7 +89,7 @@ def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[F
         yield from _angular(axis)
     yield from _places()
     yield from _magnets()
-    for words, formula in SCALARS[:13]:
+    for words, formula in SCALARS[:FOR_FORCES]:
         yield Family(f"a force X_z by {words}", ({"X_z": formula},), kind="lift")
     yield from _drifts(time)
     yield from _gates(q, time, path)
@@ -107,7 +109,11 @@ def _angular(axis: str) -> Iterator[Family]:
     for angle in ("psi", "phi", "(psi + phi)"):
         for n in range(1, HIGHEST_HARMONIC + 1 if angle != "(psi + phi)" else 2):
             pair = tuple({f"M_{axis}": f"{f}({n}.0 * {angle})"} for f in ("cos", "sin"))
-            yield Family(f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}", pair, kind="angle")
+            title = f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}"
+            yield Family(title, pair, kind="angle")
+            for words, factor in (("sin theta", "sin_theta"), ("1 / sin theta", "1.0 / sin_theta"), ("time", "time")):
+                grown = tuple({c: f"{f} * {factor}" for c, f in parts.items()} for parts in pair)
+                yield Family(f"{title}, times {words}", grown, kind="angle")
 
 
 def _places() -> Iterator[Family]:
@@ -136,7 +142,7 @@ def _places() -> Iterator[Family]:
     across = {"X_n": "-v_m", "X_m": "v_n"}
     yield Family("a force across the velocity", (across,), kind="drag")
     for n in ("X_n", "X_m"):
-        for words, formula in SCALARS[:13]:
+        for words, formula in SCALARS[:FOR_FORCES]:
             yield Family(f"a force {n} by {words}", ({n: formula},), kind="force")
     body = ("cos(psi + phi)", "sin(psi + phi)")
     turning = tuple(f(g) for f in (along_x, along_y) for g in body)

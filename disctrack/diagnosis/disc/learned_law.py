@@ -357,6 +357,22 @@ def learn(
     return without_idle_terms(law, current)
 
 
+def shortest_to_first_order(system: DiscSystem, base: Fit, along: Fit, noise: float) -> float:
+    """Chi-square with all prices of the law without a shape that comes nearest; infinite where the disc slips.
+
+    along : fit of known effects, in the place of which the law stands beside the base's
+    """
+    if responding(system, along) is None:
+        return np.inf
+    scan = _Scan(system, along, base.quantities)
+    rate = float(1.0 / np.median(np.diff(system.time)))
+    library = list(families(scan.motion.q, scan.motion.time, rate, system.disc))
+    price, looked = float(np.log(np.sum(system.weights))), 2.0 * float(np.log(len(library)))
+    proposals = scan.proposals(family for family in library if not family.shape)
+    nearest = min((scan.chi_square - p.gain) / noise + price * p.family.n_numbers for p in proposals)
+    return nearest + looked + price * sum(not np.isfinite(q.prior_sigma) for q in base.quantities)
+
+
 def _with_base_only(base: Fit, along: Fit) -> Fit:
     """The base fit, to start where the other one ended, without the effects that it has beyond the base."""
     beyond = {q.name: q.null for q in along.quantities if q.name not in base.names}
@@ -419,6 +435,13 @@ def with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
     """The base model's fit with the law's numbers fitted along."""
     start = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
     return fit(system, (*base.quantities, *law.candidate.quantities), start, MAX_ITERATIONS, may_crawl=False)
+
+
+def with_amounts(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    """The same with the numbers of its shapes held."""
+    start = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    amounts = [q for q in law.candidate.quantities if not _is_shape(q)]
+    return fit(system, (*base.quantities, *amounts), start, MAX_ITERATIONS, may_crawl=False)
 
 
 def _free_name(model: Model) -> str:

@@ -29,6 +29,7 @@ MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
 SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
+TWO_SIDED = float(stats.norm.isf(0.025))
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -508,7 +509,9 @@ class _Search:
         threshold = self.threshold(len(c.names))
         gain = trial.gain if trial else score.gain / self.noise
         if gain <= threshold:
-            return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}"
+            # beside an effect that was found, the first score says nothing of what may be there
+            bound = "" if found else _bounds(score)
+            return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}{bound}"
         if trial and not trial.fit.converged:
             return "its refit does not converge"
         if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
@@ -524,6 +527,16 @@ def _refusal(base: Fit, settings: Settings) -> Diagnosis:
         "that nothing is attributed"
     )
     return Diagnosis("unexplained", reason, (), base, base, None, None, np.nan, (), settings)
+
+
+def _bounds(score: Score) -> str:
+    """What the data leave room for, where they show no more than noise does."""
+    sizes = zip(score.candidate.quantities, np.abs(score.values), score.sigma, strict=True)
+    open_ = [(q, size + TWO_SIDED * sigma) for q, size, sigma in sizes if np.isfinite(size + sigma)]
+    most = ", ".join(
+        f"{q.name.partition('.')[2]} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_
+    )
+    return f"; only bounded: {most} (95 %)" if most else ""
 
 
 def _surprise(candidate: Candidate, fit_: Fit) -> float:

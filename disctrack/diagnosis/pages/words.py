@@ -16,6 +16,8 @@ from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Found
 from disctrack.diagnosis.engine.system import Quantity
 
+SEEN = 1.96  # standard deviations within which a number may be nought
+SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
 _PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
 _PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
 
@@ -55,10 +57,29 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
     amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities if not q.name.startswith("state.")]
     sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
     text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, diagnosis)}"
+    text += "".join(f"; {bound}" for bound in bounds(found, fit))
     if found.cannot_be_told_from:
         rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)
         text += f"; this recording cannot tell it from {rivals}"
     return text
+
+
+def bounds(found: Found, fit: Fit) -> list[str]:
+    """Numbers of the effect that the data do not tell from nought: how large they may be, and what keeps them open."""
+    texts = []
+    spread = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    for q in found.candidate.quantities:
+        name, value, sigma = shown(q, fit)
+        if q.name.startswith("state.") or q.name == SLIP or not sigma > 0 or abs(value - q.null) >= SEEN * sigma:
+            continue
+        i = fit.names.index(q.name)
+        shared = np.abs(fit.covariance[i]) / np.where(spread > 0, spread, np.inf) / spread[i]
+        shared[i] = 0.0
+        partner = int(np.argmax(shared))
+        why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise of the dots"
+        most = quantity_text(abs(value - q.null) + SEEN * sigma, 0.0, q.unit)
+        texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
+    return texts
 
 
 def together(found: Found, fit: Fit) -> tuple[Correlated, ...]:
