@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
+from disctrack.diagnosis.disc.errors import simulated
 from disctrack.diagnosis.disc.law_library import Family, families
 from disctrack.diagnosis.disc.motion import STATE_SCALES, state_of
 from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
@@ -594,8 +595,6 @@ def _busy(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
 
 def learned_moment(system: DiscSystem, fit: Fit, law: LearnedLaw) -> Array:
     """(n, 3) contact moment of the law in the fitted motion [N m]."""
-    from disctrack.diagnosis.disc.errors import simulated
-
     motion = simulated(system, fit.values)
     k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time, system.model.air_density)
     effect = motion.model.effect(law.candidate.effect)

@@ -22,6 +22,7 @@ from disctrack.diagnosis.disc.motion import (
     state_quantities,
 )
 from disctrack.diagnosis.disc.sought import sought
+from disctrack.diagnosis.disc.start import start_values
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.diagnosis.engine.fit import triangle
@@ -266,8 +267,6 @@ class DiscSystem:
 
     def start(self) -> dict[str, float]:
         """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
-        from disctrack.diagnosis.disc.start import start_values
-
         return start_values(self, self.known)
 
     def again(
