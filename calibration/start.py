@@ -16,6 +16,7 @@ from calibration.stereo_model import Observations, StereoModel
 
 MIN_POINTS = 8  # of one view in one camera, to start its pose
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
+ONE_PLACE = 1e-3  # of the board's distance: rays that meet at 0.06 deg tell no distance
 MIN_VIEWS = 3  # Zhang: fewer do not determine a camera
 
 
@@ -128,6 +129,16 @@ def _refuse_mirrored(poses: Sequence[Mapping[int, tuple[Array, Array]]], nominal
         )
 
 
+def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
+    """Raise CalibrationError where both cameras stand in one place: then no distance can be told."""
+    apart, distance = float(np.linalg.norm(t_pair)), float(np.median(np.linalg.norm(boards, axis=-1)))
+    if apart < ONE_PLACE * distance:
+        raise CalibrationError(
+            f"the left and the right images show the board from one place (the cameras would stand {1e3 * apart:.2g} "
+            f"mm apart, the board {1e3 * distance:.3g} mm away): do both patterns name the images of one camera?"
+        )
+
+
 def start_stereo(
     observations: Observations, nominal: Array, image_sizes: tuple[tuple[int, int], tuple[int, int]], n_views: int
 ) -> tuple[StereoModel, Mask, dict[int, tuple[Array, Array]]]:
@@ -145,6 +156,7 @@ def start_stereo(
     best, agree = common_pair(rotations, translations)
     _refuse_mirrored((left_poses, right_poses), nominal, agree)
     R_pair, t_pair = rotations[best], np.median(translations[agree], axis=0)
+    _refuse_one_place(t_pair, [left_poses[v][1] for v in both])
     usable = np.ones(n_views, bool)
     usable[[v for v, ok in zip(both, agree, strict=True) if not ok]] = False
     by_right = {v: (R_pair.T @ right_poses[v][0], R_pair.T @ (right_poses[v][1] - t_pair)) for v in both}

@@ -263,7 +263,7 @@ def calibrate_from_corners(
         RICHEST if settings.distortion == "auto" else settings.distortion,
         settings.equal_aspect,
     )
-    fit = fit_jointly(observations, pairs, board.points, free, names, table_view, moved, report)
+    fit = fit_jointly(observations, pairs, board.points, free, names, table_view, moved, bool(wide), report)
     rejected |= fit.lost
     apart = _told_apart(fit, names, bool(wide), table_view)
     _require_fitted(fit, rejected, apart, wide, table_view)

@@ -57,12 +57,14 @@ def fit_jointly(
     names: Names,
     table_view: int | None = None,
     moved: CameraMoved | None = None,
+    wide: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
     pairs : as roughly judged, with the poses to start from; names : (left, right) of every view
     table_view : where a camera was moved, the cameras' places are those at this view; moved : as seen by the start
+    wide : a lens is wider than the model, which is a reason why an image may not fit
     """
 
     def refined(by: PairsJudged, boards: tuple[str, ...], motion: BoardMotion | None = None) -> Refined:
@@ -79,7 +81,7 @@ def fit_jointly(
         pairs = pairs if moved is None else moved.set_apart(pairs)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
-        observations, used, more, texts = _without_images(observations, pairs, names)
+        observations, used, more, texts = _without_images(observations, pairs, names, wide)
         lost, notes = lost | more, [*notes, *texts]
         refinement, again = refined(used, (refinement.terms.board,))
         candidates = (*candidates, *again)
@@ -100,13 +102,14 @@ def fit_jointly(
 
 
 def _without_images(
-    observations: Observations, pairs: PairsJudged, names: Names
+    observations: Observations, pairs: PairsJudged, names: Names, wide: bool
 ) -> tuple[Observations, PairsJudged, dict[int, str], list[str]]:
     """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
     model, apart, rejected, warnings = pairs.model, dict(pairs.apart), {}, []
     R, t = model.R_left_board.copy(), model.t_left_board.copy()
+    or_else = ", or the board lies where the lens is wider than the model" if wide else ""
     for (view, camera), reason in pairs.bad_images.items():
-        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly"
+        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly{or_else}"
         observations = observations[(observations.view != view) | (observations.camera != camera)]
         apart.pop(view, None)
         if camera == 0 and view in pairs.right_poses:

@@ -337,6 +337,13 @@ def test_one_camera_that_shows_a_mirror_image_is_named_and_two_are_one_world(sce
     assert calibrate_from_corners(*mirrored, board, FLAT).rms_px < 0.2
 
 
+def test_the_images_of_one_camera_twice_are_no_pair(scene_maker, rng):
+    left, right = corner_views(small_scene(scene_maker, n_views=6), rng, 0.02)
+    with pytest.raises(CalibrationError, match=r"from one place .* do both patterns name the images of one camera"):
+        calibrate_from_corners(left, left, BOARD, FLAT)
+    assert calibrate_from_corners(left, right, BOARD, FLAT).rms_px < 0.1
+
+
 def test_views_in_another_order_are_not_taken_for_mirrored(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=9)
     o = scene.observations(0.02, rng)
