@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 
 import disctrack
 from disctrack.diagnosis.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, terms
+from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import checked
 from disctrack.diagnosis.equations.formulas import formulas
 from disctrack.diagnosis.equations.noise import fast_part, step_of
@@ -513,3 +514,192 @@ def test_a_term_whose_absence_led_the_fit_far_off_is_fitted_from_the_declared_va
     assert answer.found == ("coulomb_w",)
     assert within(answer, "J", 1.4e-4)
     assert within(answer, "coulomb_w.c", 0.0312 / 1.4e-4)
+
+
+def test_an_input_held_for_an_hour_costs_a_step_a_sample(rng):
+    """At large times too a step ends before the input's next piece begins; against the closed form."""
+    time = 2000.0 + np.arange(3000.0)
+    u = rng.standard_normal(3000)
+    x = np.empty(3000)
+    x[0], decay = 0.3, np.exp(-1 / 7.0)
+    for i in range(2999):
+        x[i + 1] = decay * x[i] + (1 - decay) * u[i]
+    equations = Equations({"x": "(u - x)/tau"}, {"tau": 7.0}, inputs=["u"])
+    run = Run(time, {"x": x}, 1e-3, inputs={"u": u}, hold="hold")
+    (samples,) = checked(equations, [run])
+    system = EquationSystem(formulas(equations, [], equations.channels(run)), [samples], np.ones(1), {})
+    residual, _ = system.linearise({"state.x[run1]": 0.3, "tau": 7.0}, [])
+    assert np.abs(residual).max() * 1e-3 < 1e-9
+    p, out = system.numbers({}, samples), np.empty((1, 3000, 1))
+    done, steps = kernel.integrate(
+        system.formulas.rhs, np.array([0.3]), p, np.zeros(0, np.int64), samples.time[[0, -1]], 1, samples.knots,
+        samples.pieces, system.sizes, 1e-10, 400_000, samples.time[None].copy(), out,
+    )  # fmt: skip
+    assert done == kernel.DONE
+    assert steps < 1.1 * 3000  # 45 000 when the end of a step looked into the next piece
+
+
+@pytest.mark.parametrize("friction", [0.35, 0.0])
+def test_friction_that_ends_the_motion_within_few_turns_is_found_where_none_was_declared(friction):
+    """Without it the model loses the data within a turn: a stretch shorter than that tells next to nothing."""
+    time, rng = 0.1 * np.arange(400), np.random.default_rng(0)
+    x = motion(lambda t, y: [y[1], -0.49 * y[0] - friction * y[1]], [1.0, 0.2], time)[0]
+    run = Run(time, {"x": x + 0.05 * rng.standard_normal(400)})
+    answer = diagnose(Equations({"x": "v", "v": "-w**2*x"}, {"w": 0.6}), run)
+    assert answer.found == (("viscous_v",) if friction else ())
+    assert within(answer, "w", 0.7)
+    if friction:
+        assert within(answer, "viscous_v.c", friction)
+        assert not answer.diagnosis.found[0].cannot_be_told_from
+        assert answer.before["x"].held_out > 3 * answer.after["x"].held_out
+
+
+def test_a_noisy_sensor_of_an_arm_at_rest_loses_nothing(rng):
+    """Before the arm is pushed there is nothing but noise to follow."""
+    time = 0.01 * np.arange(1200)
+    push = lambda t: np.where(t > 3, np.sin(2 * (t - 3)) ** 2, 0.0)  # noqa: E731
+
+    def rates(t, y):
+        return [y[1], 9 * float(push(t)) - 2 * y[1] - 0.8 * abs(y[1]) * y[1] - 9 * np.sin(y[0])]
+
+    u = push(time)
+    x, v = solve_ivp(rates, (0, 12), [0.0, 0.0], t_eval=time, rtol=1e-8, atol=1e-10, method="LSODA", max_step=0.05).y
+    run = Run(time, {"x": x + 1e-3 * rng.standard_normal(1200), "v": v + 0.05 * rng.standard_normal(1200)},
+              inputs={"u": u})  # fmt: skip
+    arm = Equations({"x": "v", "v": "g*u - b*v - k*sin(x)"}, {"g": 7.5, "b": 1.5, "k": 8.0}, inputs=["u"])
+    answer = diagnose(arm, run, [terms.coulomb("v"), terms.quadratic("v"), terms.constant("v")])
+    assert answer.found == ("quadratic_v",)
+    assert within(answer, "quadratic_v.c", 0.8)
+    assert not any("stretches" in note for note in answer.notes)
+
+
+def test_what_would_help_most_is_told_where_nothing_is_named(rng):
+    """A friction that is offered, beside a larger force that no offered term describes."""
+    time = 0.02 * np.arange(1500)
+    extra = lambda t: 0.6 * np.sin(0.37 * t + 2 * np.sin(0.11 * t))  # noqa: E731
+    x = motion(lambda t, y: [y[1], -9 * y[0] - 0.15 * y[1] + extra(t)], [2.0, 0.0], time)[0]
+    run = Run(time, {"x": x + 2e-3 * rng.standard_normal(1500)})
+    answer = diagnose(Equations({"x": "v", "v": "-k*x"}, {"k": 8.0}), run, [terms.viscous("v"), terms.quadratic("v")])
+    assert answer.verdict == "unexplained"
+    assert not answer.found
+    assert "viscous friction on v [viscous_v] (c = 0.148" in " ".join(answer.notes)
+    assert "would help most and still leave" in " ".join(answer.notes)
+    assert abs(answer.nearest["viscous_v.c"] - 0.15) < 0.01
+    again = Run(time, {"x": x}, name=run.name)
+    left = {near: np.std(answer.forecast(again, nearest=near)["x"] - x) for near in (False, True)}
+    assert left[True] < left[False]
+
+
+DRIVEN = 0.02 * np.arange(1500)
+
+
+def drive(t):
+    return 2.0 * np.sin(1.1 * t) + 1.5 * np.sin(2.3 * t + 1)
+
+
+LIMITED = {  # by term: what becomes of the input, what else acts, and the numbers that are found
+    "saturation_u": (lambda u: np.clip(u, -2.2, 2.2), None, {"share": 1.0, "limit": 2.2}),
+    "dead_zone_u": (lambda u: np.sign(u) * max(abs(u) - 0.3, 0.0), None, {"width": 0.3}),
+    "stribeck_v": (
+        None,
+        lambda t, x, v: -0.5 * np.exp(-((v / 0.3) ** 2)) * np.tanh(v / 1e-4),
+        {"c": 0.5, "speed": 0.3},
+    ),
+    "stop_x": (None, lambda t, x, v: -8.0 * max(x - 0.9, 0.0), {"k": 8.0, "place": 0.9}),
+    "coulomb_v": (None, lambda t, x, v: -0.3 * np.tanh(v / 1e-4) * (1 + 0.5 * np.sin(0.5 * t)), {"c": 0.3}),
+    "": (None, None, {}),
+}
+
+
+@pytest.mark.parametrize("name", LIMITED)
+def test_limits_are_looked_for_along_the_motion(name, rng):
+    """What saturates, sticks or strikes does so beyond a value that nobody declared; all are offered each time."""
+    limited, extra, truth = LIMITED[name]
+
+    def rates(t, y):
+        u, x, v = drive(t), *y
+        u = limited(u) if limited else u
+        return [v, 1.5 * u - 0.4 * v - 4 * x - 0.2 * np.tanh(v / 1e-4) + (extra(t, x, v) if extra else 0.0)]
+
+    x = solve_ivp(rates, (0, 30), [0.3, 0.0], t_eval=DRIVEN, rtol=1e-8, atol=1e-10, max_step=0.02).y[0]
+    numbers = {"g": 1.3, "b": 0.3, "k": 3.6, "c": 0.15}
+    slide = Equations({"x": "v", "v": "g*u - b*v - k*x - c*sign(v)"}, numbers, inputs=["u"])
+    offered = [
+        terms.saturation("v", "u", "g"), terms.dead_zone("v", "u", "g"), terms.stribeck("v"),
+        terms.end_stop("v", "x"), terms.coulomb("v", load="1 + 0.5*sin(0.5*t)"), terms.cubic_spring("v", "x"),
+        terms.quadratic("v"), terms.input_delay("v", "u", "g"),
+    ]  # fmt: skip
+    answer = diagnose(
+        slide, Run(DRIVEN, {"x": x + 1e-3 * rng.standard_normal(1500)}, inputs={"u": drive(DRIVEN)}), offered
+    )
+    assert answer.found == ((name,) if name else ())
+    assert answer.verdict == ("found" if name else "nothing missing")
+    for number, value in truth.items():
+        assert within(answer, f"{name}.{number}", value)
+
+
+@pytest.mark.parametrize("late", [0.03, 0.0])
+def test_a_held_input_that_acts_late_is_found(late, rng):
+    """A controller holds its output from sample to sample, 0.1 s; a third of one is lost on the way."""
+    time = 0.1 * np.arange(600)
+    u = np.repeat(rng.standard_normal(200), 3)
+    fine = 0.01 * np.arange(6000)
+    held = u[np.clip(np.floor((fine - late + 1e-9) / 0.1).astype(int), 0, 599)]
+    x = np.zeros(6000)
+    decay = np.exp(-0.01 / 0.8)
+    for i in range(5999):
+        x[i + 1] = decay * x[i] + (1 - decay) * held[i]
+    run = Run(time, {"x": x[::10] + 2e-3 * rng.standard_normal(600)}, inputs={"u": u}, hold="hold")
+    lag = Equations({"x": "(u - x)/tau"}, {"tau": 0.6}, inputs=["u"])
+    answer = diagnose(lag, run, [terms.input_delay("x", "u", "1/tau"), terms.quadratic("x"), terms.constant("x")])
+    assert answer.found == (("delay_u",) if late else ())
+    if late:  # to first order in the delay over the time that the motion takes
+        assert abs(answer.values["delay_u.tau"] - late) < 0.1 * late
+
+
+@pytest.mark.parametrize("top", [6.0, 60.0])
+def test_a_tank_that_runs_over_into_another_that_alone_is_seen(top):
+    """Two tanks after a public benchmark, in small steps with levels that are cut off; the upper one is not seen."""
+    rng = np.random.default_rng(4)
+    time = 4.0 * np.arange(600)
+    u = np.repeat(rng.uniform(0.5, 4.5, 60), 10)
+    upper, lower = 4.0, 4.0
+    seen = np.empty(600)
+    for i in range(600):
+        seen[i] = lower
+        for _ in range(400):
+            upper += 0.01 * (0.06 * u[i] - 0.06 * np.sqrt(upper))
+            over, upper = max(upper - top, 0.0), min(upper, top)
+            lower = max(lower + 0.01 * (0.06 * np.sqrt(upper) - 0.055 * np.sqrt(lower)) + 0.4 * over, 1e-6)
+    equations = Equations(
+        {"h1": "k4*u - k1*sqrt(Max(h1, 0.001))", "h2": "k1*sqrt(Max(h1, 0.001)) - k3*sqrt(Max(h2, 0.001))"},
+        {"k1": 0.05, "k3": 0.05, "k4": 0.05}, inputs=["u"], observed={"y": "h2"},
+    )  # fmt: skip
+    offered = [
+        terms.overflow(equations, "h1", into="h2"), terms.overflow(equations, "h2"), terms.saturation("h1", "u", "k4"),
+        terms.viscous("h2"), terms.sensor_offset("y"),
+    ]  # fmt: skip
+    run = Run(time, {"y": seen + 3e-3 * rng.standard_normal(600)}, inputs={"u": u}, hold="hold", start={"h1": 4.0})
+    answer = diagnose(equations, run, offered)
+    assert answer.found == (("overflow_h1",) if top < 10 else ())
+    if answer.found:
+        assert within(answer, "overflow_h1.top", top)
+        assert within(answer, "overflow_h1.caught", 0.4)
+        assert abs(answer.values["overflow_h1.share"] - 1.0) < 0.02
+    assert within(answer, "k3", 0.055)
+
+
+def test_a_number_of_the_equations_may_have_the_name_of_a_terms_own(rng):
+    """A gain that is handed to a library term means the equations' number, whatever the term calls its own."""
+    time = 0.02 * np.arange(800)
+    x = motion(lambda t, y: [y[1], -9 * y[0] - 0.4 * y[1] + 2.0 * np.sin(1.7 * (t - 0.05))], [0.5, 0.0], time)[0]
+    run = Run(time, {"x": x + 1e-3 * rng.standard_normal(800)}, inputs={"u": np.sin(1.7 * time)})
+    for gain in ("tau", "g"):  # the delay's own number is called tau
+        equations = Equations({"x": "v", "v": f"-k*x - c*v + {gain}*u"}, {"k": 8.0, "c": 0.3, gain: 1.8}, inputs=["u"])
+        answer = diagnose(equations, run, [terms.input_delay("v", "u", gain), terms.cubic_spring("v", "x")])
+        assert answer.found == ("delay_u",)
+        assert abs(answer.values["delay_u.tau"] - 0.05) < 2e-3
+        assert abs(answer.values[gain] - 2.0) < 0.01  # to first order in the delay
+    mine = Term("mine", {"v": "-own_k*x**3 - k*own_b*x"}, parameters={"k": 0.0, "b": 0.0})
+    found = formulas(equations, [mine], {"x": "x"})
+    assert {s.name for s in found.rates[1].free_symbols} >= {"k", "term1_k", "term1_b"}

@@ -33,6 +33,7 @@ class Fit:
     n_data: int
     converged: bool
     n_iterations: int
+    promised: float = 0.0  # chi-square that one more full step would lower, were the prediction linear
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -138,6 +139,7 @@ def fit(
     prior, prior_matrix = prior_rows(moved, values)
     cost = _cost(residual, prior, derivative, common)
     converged, iteration, crawled = False, 0, 0
+    expected = float("inf")
     matrix, right = np.zeros((0, len(names))), np.zeros(0)
     while np.isfinite(cost) and iteration < max_iterations:
         iteration += 1
@@ -145,7 +147,7 @@ def fit(
         right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
         x = np.array([values[n] for n in names])
         step = solve_bounded(right, matrix, lower - x, upper - x)
-        expected = right @ right - np.sum((right - matrix @ step) ** 2)
+        expected = float(right @ right - np.sum((right - matrix @ step) ** 2))
         if expected < TOLERANCE * max(1.0, cost / n_data):
             converged = True
             break
@@ -183,7 +185,7 @@ def fit(
         covariance = covariance[np.ix_(order, order)]
     elif common.names:
         covariance = np.zeros((len(quantities), len(quantities)))
-    return Fit(quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration)
+    return Fit(quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration, expected)
 
 
 def no_fit(quantities: Sequence[Quantity], values: Values) -> Fit:

@@ -16,7 +16,7 @@ from scipy import stats
 
 from calibration.arrays import Mask
 from disctrack.diagnosis.engine.chance import Chance, chance
-from disctrack.diagnosis.engine.fit import Fit, fit, no_fit
+from disctrack.diagnosis.engine.fit import Fit, fit, no_fit, prior_rows
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
@@ -24,6 +24,7 @@ from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, Values, hurried
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
+ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
@@ -118,7 +119,7 @@ def diagnose(system: System, start: Values, settings: Settings | None = None, ro
     """
     settings = settings or Settings()
     base = fit(system, system.base, start)
-    if not base.converged:
+    if not (base.converged or _near_enough(system, base)):
         return _refusal(base, settings)
     answer = _Search(system, settings, rows).run(base)
     if settings.noise is not None or answer.verdict == "unexplained":
@@ -149,6 +150,7 @@ class _Search:
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
         self.refits: dict[str, Trial] = {}
+        self.rough = bool(getattr(system, "several_minima", False))
         self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
         self.free_runs: list[tuple[Fit, HeldOut]] = []
 
@@ -223,7 +225,7 @@ class _Search:
     def _fit(self, candidates: Sequence[Candidate], start: Values, patient: bool = False) -> Fit:
         """With these effects.   patient : however long it takes; else a fit that is given up has not converged"""
         key = frozenset(c.name for c in candidates)
-        if key in self.fits:
+        if key in self.fits and not self._better(start, self.fits[key]):
             return self.fits[key]
         values = dict(start)
         for c in candidates:
@@ -237,6 +239,15 @@ class _Search:
         if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
             self.fits[key] = found
         return found
+
+    def _better(self, start: Values, known: Fit) -> bool:
+        """Does a fit begin below the minimum that is known of its effects? Then that was not the lowest."""
+        if not self.rough:
+            return False
+        values = known.values | {q.name: start.get(q.name, q.null) for q in known.quantities}
+        right, _ = prior_rows(known.quantities, values)
+        cost = float(np.sum(self.system.linearise(values, ())[0] ** 2) + right @ right)
+        return cost < known.cost - CLASS_GAIN * self.noise
 
     def _best_fit(self, current: Trial, extra: Sequence[Candidate]) -> Fit:
         """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
@@ -346,7 +357,8 @@ class _Search:
     def _enough(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
         k = len({n for c in extra for n in c.names})
         enough = self.threshold(k) if len(extra) == 1 else self.threshold(k) + self.threshold(1)
-        return trial.fit.converged and trial.gain > enough and not self._incredible(trial, extra)
+        rough = self.rough and trial.fit.promised < ROUGH * trial.gain
+        return (trial.fit.converged or rough) and trial.gain > enough and not self._incredible(trial, extra)
 
     def _incredible(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
         """Is an amount at the limit of what is ever met, or do two faults of the measurement undo each other?"""
@@ -374,7 +386,7 @@ class _Search:
             rest = tuple(c for c in trial.candidates if c is not candidate)
             smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
             loss = self._cost(smaller) - self._cost(trial.fit)
-            if smaller.converged and loss < self.threshold(len(candidate.names)):
+            if loss < self.threshold(len(candidate.names)):  # converged or not: further on it would lose less
                 trial = replace(trial, candidates=rest, fit=smaller, held_out=self._held_out(smaller))
         return trial
 
@@ -389,7 +401,7 @@ class _Search:
                 smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
                 loss = self._cost(smaller) - self._cost(trial.fit)
                 enough = left * self.threshold(len(candidate.names)) * max(factors[n] for n in candidate.names) ** 2
-                if smaller.converged:
+                if smaller.converged or loss < enough:  # a fit that has not converged loses even less further on
                     losses.append((loss / enough, candidate.name, rest, smaller))
             if not losses or min(losses, key=lambda item: item[0])[0] >= 1.0:
                 return trial
@@ -518,6 +530,15 @@ class _Search:
             return "the free run over held-out data does not improve"
         than_chosen = "less than what was chosen" if found else "too little of what is missing"
         return f"gains {gain:.4g}, {than_chosen}"
+
+
+def _near_enough(system: System, base: Fit) -> bool:
+    """Is what a fit has not gained yet nothing beside what no fit of it will?
+
+    Where equations jump, chi-square is rough: far above the noise no step may lead to the bottom of a rough valley.
+    """
+    excess = base.chi_square - base.degrees_of_freedom
+    return bool(getattr(system, "several_minima", False) and base.promised < ROUGH * excess)
 
 
 def _refusal(base: Fit, settings: Settings) -> Diagnosis:

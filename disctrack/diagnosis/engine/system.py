@@ -143,6 +143,11 @@ class Wrapped:
         """As the system's."""
         return self._system.starts(candidate, values)
 
+    @property
+    def several_minima(self) -> bool:
+        """As the system's: may fits of the same quantities end in different minima?"""
+        return bool(getattr(self._system, "several_minima", False))
+
     def hurried(self, share: float) -> Wrapped:
         """As the system's."""
         return self.over(hurried(self._system, share))

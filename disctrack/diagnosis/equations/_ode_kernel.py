@@ -29,29 +29,36 @@ _A_EXTRA, _C_EXTRA = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(
 _SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
 
 
-@njit(types.void(_f, _v, types.float64[:, :, ::1], _v, _v), cache=True, error_model="numpy", nogil=True)
-def inputs_at(t, knots, pieces, u, u_rate):
-    """Piecewise cubics (channels, 4, knots - 1), highest power first, at t; beyond the ends the last piece goes on."""
-    if len(u) == 0:
-        return
-    i = min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
-    x = t - knots[i]
+@njit(types.int64(_f, _v), cache=True, error_model="numpy", nogil=True)
+def piece_at(t, knots):
+    """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
+    return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
+
+
+@njit(types.void(_f, types.int64, _v, types.float64[:, :, ::1], _v, _v), cache=True, error_model="numpy", nogil=True)
+def inputs_at(t, i, knots, pieces, u, u_rate):
+    """Piecewise cubics (channels, 5, knots - 1), highest power first: the i-th piece at t.
+
+    The fifth number is added to the slope: that of an input that is held, which steps.
+    """
     for c in range(len(u)):
+        x = t - knots[i]
         a, b, d, e = pieces[c, 0, i], pieces[c, 1, i], pieces[c, 2, i], pieces[c, 3, i]
         u[c] = ((a * x + b) * x + d) * x + e
-        u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d
+        u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d + pieces[c, 4, i]
 
 
 @njit(
-    types.void(RHS_TYPE, _f, _v, _v, types.int64[::1], _v, types.float64[:, :, ::1], _v, _v, _v, _m, _m, _v),
+    types.void(RHS_TYPE, _f, types.int64, _v, _v, types.int64[::1], _v, types.float64[:, :, ::1], _v, _v, _v, _m, _m,
+               _v),
     error_model="numpy",
     cache=True,
     nogil=True,
-)
-def _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
-    """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt."""
+)  # fmt: skip
+def _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
+    """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
     n, k = len(f), len(columns)
-    inputs_at(t, knots, pieces, u, u_rate)
+    inputs_at(t, piece, knots, pieces, u, u_rate)
     rhs(t, z[:n], p, u, u_rate, f, J, P)
     out[:n] = f
     for c in range(k):
@@ -90,7 +97,8 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
     largest = np.zeros(k)
     pointer = np.zeros(groups, np.int64)
     t, end = span[0], span[1]
-    _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
+    piece = piece_at(t, knots)
+    _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
     speed = 0.0
     for i in range(n):
         speed = max(speed, abs(K[0, i]) / size[i])
@@ -111,21 +119,20 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
             if last and remaining <= 0:
                 break
             return TOO_MANY_STEPS, steps
-        # at the end of a step that stops at a knot the inputs of the piece before it hold
-        end_of_piece = t + step * (1.0 - 1e-13) if len(knots) else t + step
         for s in range(1, 12):
             for i in range(N):
                 total = 0.0
                 for j in range(s):
                     total += _A[s, j] * K[j, i]
                 work[i] = z[i] + step * total
-            _slope(rhs, min(t + _C[s] * step, end_of_piece), work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
+            _slope(rhs, t + _C[s] * step, piece, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
         for i in range(N):
             total = 0.0
             for j in range(12):
                 total += _B[j] * K[j, i]
             new[i] = z[i] + step * total
-        _slope(rhs, end_of_piece, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
+        # at a knot too the inputs of the piece before it hold for this step
+        _slope(rhs, t + step, piece, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
         worst = 0.0
         for c in range(k + 1):
             e5, e3, top = 0.0, 0.0, 0.0
@@ -180,7 +187,9 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
                     for j in range(13 + e):
                         total += _A_EXTRA[e, j] * K[j, i]
                     work[i] = z[i] + step * total
-                _slope(rhs, t + _C_EXTRA[e] * step, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[13 + e])
+                _slope(
+                    rhs, t + _C_EXTRA[e] * step, piece, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[13 + e]
+                )
             for i in range(N):
                 delta = new[i] - z[i]
                 F[0, i] = delta
@@ -207,8 +216,9 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
         steps += 1
         t = arrival
         z[:] = new
-        if len(knots):
-            _slope(rhs, t, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
+        before, piece = piece, piece_at(t, knots)
+        if piece != before:
+            _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
         else:
             K[0] = K[12]
         grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**-0.125))
@@ -231,7 +241,7 @@ def observe_all(observe, times, states, p, knots, pieces, seen, by_state, by_par
     """What the sensors see at instants (m,) in states (m, n): seen (m, w) and derivatives (m, w, n), (m, w, n_p)."""
     u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
     for i in range(len(times)):
-        inputs_at(times[i], knots, pieces, u, u_rate)
+        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
         observe(times[i], states[i], p, u, u_rate, seen[i], by_state[i], by_parameter[i])
 
 
@@ -244,5 +254,5 @@ def rates_all(rhs, times, states, p, knots, pieces, rates, by_parameter):
     n = states.shape[1]
     u, u_rate, J = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0]), np.zeros((n, n))
     for i in range(len(times)):
-        inputs_at(times[i], knots, pieces, u, u_rate)
+        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
         rhs(times[i], states[i], p, u, u_rate, rates[i], J, by_parameter[i])

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Settings
-from disctrack.diagnosis.engine.system import System
-from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box
+from disctrack.diagnosis.engine.system import Candidate, System
+from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box, no_memory
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.diagnosis.equations.loop import Answered, ask
 from disctrack.diagnosis.equations.system import EquationSystem, fitted_rows
@@ -24,6 +23,8 @@ from disctrack.diagnosis.pages.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
+
+FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,39 @@ class Answer:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the data and on what they do not tell."""
-        return self.asked.notes
+        return (*self.asked.notes, *self._what_helps_most(), *self._not_white())
+
+    def _what_helps_most(self) -> list[str]:
+        """Where no term is named: those that gain most, and what they leave."""
+        d = self.diagnosis
+        if self.found or not d.partial or d.nearest is None:
+            return []
+        names = " and ".join(f"{c.title} [{c.name}] ({self._numbers_of(c)})" for c in d.partial)
+        left = self._errors(d.nearest, None)
+        sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
+        return [f"{names} would help most and still leave {sizes}".replace(" 1 of", " of")]
+
+    def _numbers_of(self, candidate: Candidate) -> str:
+        """Its numbers in the nearest description, shapes that were held among them."""
+        found = {q.name: q.null for q in (*candidate.quantities, *candidate.shape)} | self.nearest
+        own = [q.name for q in (*candidate.quantities, *candidate.shape)]
+        return ", ".join(f"{n.partition('.')[2]} = {found[n]:.4g}" for n in own)
+
+    @property
+    def nearest(self) -> dict[str, float]:
+        """All fitted numbers with the terms that help most, where they leave too much to be named; else empty."""
+        d = self.diagnosis
+        return {} if self.found or d.nearest is None else {n: d.nearest.values[n] for n in d.nearest.names}
+
+    def _not_white(self) -> list[str]:
+        """Where what is left is called noise by its size: is it so by its memory?"""
+        if self.verdict == "unexplained" or not self.whiteness < self.diagnosis.settings.false_alarm:
+            return []
+        chance = f"noise has so much with a probability of {self.whiteness:.1g}"
+        return [
+            f"what is left is as large as the noise but has a memory ({chance}): something smaller is missing besides, "
+            "or the noise changes with time"
+        ]
 
     @property
     def found(self) -> tuple[str, ...]:
@@ -107,18 +140,21 @@ class Answer:
         stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
         return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
 
-    def forecast(self, run: Run, *, before: bool = False) -> dict[str, Array]:
+    def forecast(self, run: Run, *, before: bool = False, nearest: bool = False) -> dict[str, Array]:
         """What the sensors should show (n,) at the instants of a run, by channel: a free run of the model.
 
         A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
         begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
         before : by the equations as declared (and fitted)
+        nearest : with the terms that help most, where none is named
         """
         (samples,) = checked(self.equations, [run])
         if not run.name:
             first = self.system.stretches[0]
             samples = replace(samples, run=first.run, groups=first.groups)
         fit = self.diagnosis.before if before else self.diagnosis.after
+        if nearest and self.nearest and self.diagnosis.nearest is not None:
+            fit = self.diagnosis.nearest
         (found,) = self.system.with_(stretches=[samples]).predictions(fit.values)
         shape = (len(samples.time), len(self.system.formulas.channels))
         seen = np.full(shape, np.nan) if found is None else found.seen
@@ -149,6 +185,10 @@ class Answer:
     def sentence(self) -> str:
         """The answer in plain words."""
         d = self.diagnosis
+        if d.held_out_before is None:
+            loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
+            open_ = f" {', '.join(loose)} cannot be told: declare a value or bounds." if loose else ""
+            return f"No answer: {d.reason}.{open_} Values from which to begin nearer to the truth may help."
         level = ", ".join(
             f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")
             for c, e in self.after.items()
@@ -206,6 +246,7 @@ def _whiteness(judged: System, system: EquationSystem, fit: Fit) -> float:
     for rows, s in zip(system.rows, system.stretches, strict=True):
         for c in range(residual.shape[1]):
             x = residual[rows, c][np.isfinite(s.data[:, c])]
-            if len(x) > 4 * LAGS:
-                p_values.append(float(stats.chi2.sf(ljung_box(x[:, None])[0], LAGS)))
+            lags = min(LAGS, len(x) // 4)
+            if lags >= FEWEST_LAGS:
+                p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
     return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")

@@ -27,6 +27,7 @@ class Parameter:
     per: str = ""  # "run": each run has one of its own; a key of the runs' `groups`: each group has
     typical: float | None = None  # of a term: size that would surprise nobody; None: a tenth of the motion's own forces
     shape: bool = False  # of a term's law (an exponent, a scale): held at `value` until the term is found
+    along: str = ""  # of a shape: a formula whose values along the motion are tried for it (a limit, a speed)
     meaning: str = ""
 
     def __post_init__(self) -> None:
@@ -42,6 +43,7 @@ class Term:
     """Something that the equations, or the picture that sensors give of them, may lack.
 
     Its formulas are added to what is declared; its parameters' own values (0, if not said) are those of its absence.
+    A parameter k may be written own_k in its formulas; a plain k there then is that of the equations.
     """
 
     name: str
@@ -152,7 +154,7 @@ class Samples:
     data: Array  # (n, w) NaN where missing
     sigma: Array  # (n, w)
     knots: Array  # (m,) [s] of the inputs
-    pieces: Array  # (c, 4, m - 1)
+    pieces: Array  # (c, 5, m - 1) cubics, highest power first, and what is added to their slope
     constants: Mapping[str, float]
     start: Mapping[str, float]
     known: Mapping[str, tuple[float, float]]
@@ -250,7 +252,7 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
     from scipy.interpolate import CubicSpline
 
     if not equations.inputs:
-        return np.zeros(0), np.zeros((0, 4, 0))
+        return np.zeros(0), np.zeros((0, 5, 0))
     columns = []
     for u in equations.inputs:
         if u not in run.inputs:
@@ -259,17 +261,21 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
     values = np.array(columns)
     if not np.isfinite(values).all():
         raise AnalysisError(f"run {name}: an input must be known at every sample; fill the gaps first.")
+    pieces = np.zeros((len(values), 5, len(time) - 1))
     if run.hold == "smooth":
-        return time, np.ascontiguousarray(CubicSpline(time, values, axis=1).c.transpose(2, 0, 1))
+        pieces[:, :4] = CubicSpline(time, values, axis=1).c.transpose(2, 0, 1)
+        return time, pieces
     if run.hold not in ("linear", "hold"):
         raise AnalysisError(f"run {name}: hold = {run.hold!r}; expected 'smooth', 'linear' or 'hold'.")
-    pieces = np.zeros((len(values), 4, len(time) - 1))
     pieces[:, 3] = values[:, :-1]
     if run.hold == "linear":
         pieces[:, 2] = np.diff(values, axis=1) / np.diff(time)
         return time, pieces
     changes = np.flatnonzero(np.any(np.diff(pieces[:, 3], axis=1) != 0, axis=0)) + 1
-    kept = np.concatenate([[0], changes])
+    # the rate of a step is spread over the sample that it begins: what it moves has felt all of it by then
+    pieces[:, 4, changes] = (np.diff(pieces[:, 3], axis=1) / np.diff(time)[1:])[:, changes - 1]
+    kept = np.unique(np.concatenate([[0], changes, changes + 1]))
+    kept = kept[kept < len(time) - 1]
     return np.concatenate([time[kept], time[-1:]]), np.ascontiguousarray(pieces[:, :, kept])
 
 

@@ -19,6 +19,8 @@ from disctrack.diagnosis.equations.declared import Equations, Parameter, Term
 from disctrack.diagnosis.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
 from disctrack.errors import AnalysisError
 
+OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
+
 
 @dataclass(frozen=True)
 class Formulas:
@@ -39,6 +41,7 @@ class Formulas:
     observed: tuple[sympy.Expr, ...]
     late: tuple[sympy.Expr, ...]  # by channel: true instant minus the time beside the sample, in t and numbers
     widths: dict[sympy.Expr, sympy.Symbol]
+    along: dict[str, sympy.Expr]  # by name of a shape: values along the motion that are tried for it
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -94,8 +97,16 @@ class Formulas:
     @cached_property
     def jump_arguments(self) -> Any:
         """(t, y, p, u) -> the arguments of all jumps, each (m,)."""
+        return self._along_motion(list(self.widths))
+
+    @cached_property
+    def scanned(self) -> Any:
+        """(t, y, p, u) -> what each shape of `along` is tried along, each (m,)."""
+        return self._along_motion(list(self.along.values()))
+
+    def _along_motion(self, expressions: Sequence[sympy.Expr]) -> Any:
         t = sympy.Symbol("t", real=True)
-        return sympy.lambdify((t, self.states, self.numbers, self.inputs), list(self.widths), "numpy")
+        return sympy.lambdify((t, self.states, self.numbers, self.inputs), expressions, "numpy")
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all numbers; the widths of jumps are 1 until they are known."""
@@ -125,6 +136,7 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     late = dict.fromkeys(channels, sympy.Integer(0))
     position = {name: i for i, name in enumerate(states)}
     seen: set[str] = set()
+    along: dict[str, sympy.Expr] = {}
     for term in terms:
         if term.name in seen or "[" in term.name or "." in term.name:
             raise AnalysisError(f"term {term.name!r}: needs a name of its own, without '.' and '['.")
@@ -133,7 +145,15 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
         for name, p in term.parameters.items():
             checked_name(name, f"parameter of term {term.name}")
             fitted[f"{term.name}.{name}"] = (mine[name], _parameter(p))
-        words, here = {**everything, **mine}, f"term {term.name}"
+        here = f"term {term.name}"
+        own_names = {f"{OWN}{name}": s for name, s in mine.items()}
+        written = [*term.rates.values(), *term.observed.values(), *term.lag.values(), term.clock]
+        # where a term says which numbers are its own, other names are the equations'
+        mine = own_names if any(OWN in str(f) for f in written) else mine | own_names
+        words = {**everything, **mine}
+        for name, p in term.parameters.items():
+            if isinstance(p, Parameter) and p.along:
+                along[f"{term.name}.{name}"] = parsed(p.along, everything, f"{here}, {name} along")
         for name, f in term.rates.items():
             _known(name, states, f"{here}, rates")
             rates[position[name]] += parsed(f, words, f"{here}, rate of {name}")
@@ -153,7 +173,7 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     return Formulas(
         equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(inputs.values()),
         tuple(input_rates.values()), tuple(rates), tuple(smooth(e, widths) for e in observed.values()),
-        tuple(late.values()), widths,
+        tuple(late.values()), widths, along,
     )  # fmt: skip
 
 

@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 from scipy.linalg import qr
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.fit import Fit, compress, fit
+from disctrack.diagnosis.engine.fit import Fit, compress, fit, solve_bounded
 from disctrack.diagnosis.engine.held_out import held_out
-from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.engine.search import CLASS_GAIN, Diagnosis, Found, Rival, Settings, Tried, diagnose
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.significance import wald
-from disctrack.diagnosis.engine.system import System
+from disctrack.diagnosis.engine.system import Quantity, System
 from disctrack.diagnosis.equations import terms as library
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.diagnosis.equations.formulas import formulas
@@ -38,6 +39,7 @@ MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
 FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
+SCANNED = 8  # values along the motion that are tried for a limit
 ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
@@ -76,39 +78,35 @@ def ask(
     notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
     system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
     system, declared = _prepared(system)
-    start = None
+    start: Start | None = None
+    leading: dict[str, Start] = {}
     if stretch is None:
         start = led(system, declared)
-        if start.followed == 0.0:
-            raise AnalysisError(_not_followed(system, declared))
         followed = system.with_(stretches=first_part(system.stretches, start.followed))
-        held, remark = redundant(followed, start.values)
+        held, remark = redundant(followed, start.values) if start.followed > 0.0 else ((), "")
         if held:
             system, notes = system.with_(held=held), [*notes, remark]
             start = led(system, declared)
-    values = declared if start is None else start.values
-    if start is not None and start.followed < min(turn(s) for s in system.stretches):
-        notes += _helpful(system, declared, start)
-    if start is None or not start.whole:
-        length = stretch or (SAFE * start.followed if start else np.inf)
-        system, values, note = _in_stretches(system, values, length)
-        notes.append(note)
-    if not np.isfinite(system.linearise(values, [])[0]).all():
-        raise AnalysisError(_not_followed(system, values))
-    system = _sized(system, values)
-    diagnosis = diagnose(system, values, settings, system.training)
-    sharper = _sharp_enough(system, diagnosis.after)
-    if sharper is not system:
-        system = sharper
-        diagnosis = diagnose(system, diagnosis.before.values, settings, system.training)
+        if start.followed < min(turn(s) for s in system.stretches):
+            leading = _leading(system, declared)
+            if start.followed == 0.0 and not leading:
+                raise AnalysisError(_not_followed(system, declared))
+            notes.append(_lost_soon(start, leading))
+    if leading:
+        term, way = next(iter(leading.items()))
+        system, diagnosis = _whole(system.with_(promoted=(term,)), (term,), way.values, settings)
+        diagnosis = _with_equals(system, diagnosis, leading)
+    else:
+        system, diagnosis, more = _as_far_as_followed(system, declared, start, settings, stretch)
+        notes += more
     if not np.isfinite(diagnosis.before.chi_square):
         raise AnalysisError(
             "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
             "at a stiff contact. Write the contact wider, or cut the data into runs without it."
         )
-    if start is not None and not start.whole and diagnosis.found:
-        system, diagnosis, more = _joined(system, samples, diagnosis, settings)
-        notes += more
+    if start is not None and not start.whole and not leading and diagnosis.found:
+        system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
+        notes.append(remark)
     judged: System = diagnosis.judged or system
     memory = None
     if settings.noise is None:
@@ -122,13 +120,96 @@ def ask(
     return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory)
 
 
-def _helpful(system: EquationSystem, values: Mapping[str, float], start: Start) -> list[str]:
-    """With which of the terms would a model follow the data that loses them within a turn? A remark."""
-    names = [c.name for c in system.candidates if led(system.with_(promoted=(c.name,)), dict(values)).whole]
-    text = f"the model loses the data after {start.followed:.2g} s, less than a turn: sizes of terms mean little"
-    if names:
-        text += f"; with {' or '.join(names)} it follows them to their end: put it into the equations, and ask again"
-    return [text]
+def _as_far_as_followed(
+    system: EquationSystem, declared: Mapping[str, float], start: Start | None, settings: Settings,
+    stretch: float | None,
+) -> tuple[EquationSystem, Diagnosis, list[str]]:  # fmt: skip
+    """The search over whole runs, or over stretches as long as the model follows them; and a note that says so."""
+    values: Mapping[str, float] = declared if start is None else start.values
+    notes = []
+    if start is None or not start.whole:
+        length = stretch or (SAFE * start.followed if start else np.inf)
+        system, values, note = _in_stretches(system, values, length)
+        notes.append(note)
+    if not np.isfinite(system.linearise(values, [])[0]).all():
+        raise AnalysisError(_not_followed(system, values))
+    return *_searched(_sized(system, values), values, settings), notes
+
+
+def _searched(
+    system: EquationSystem, values: Mapping[str, float], settings: Settings
+) -> tuple[EquationSystem, Diagnosis]:
+    """The engine's search, with jumps as sharp as the motion asks, and limits where they tell most."""
+    system = _aimed(system, values)
+    scans = SCANNED * len(system.formulas.along)
+    if scans:  # each value that was looked at is a chance more
+        share = len(system.candidates) / (len(system.candidates) + scans)
+        settings = replace(settings, false_alarm=settings.false_alarm * share)
+    diagnosis = diagnose(system, values, settings, system.training)
+    sharper = _sharp_enough(system, diagnosis.after)
+    if sharper is system:
+        return system, diagnosis
+    return sharper, diagnose(sharper, diagnosis.before.values, settings, sharper.training)
+
+
+def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
+    """With a start for every term that has a number to be tried along the motion, where it explains most."""
+    f = system.formulas
+    if not f.along:
+        return system
+    passed: list[list[Array]] = []
+    for s, motion in zip(system.stretches, system.predictions(values), strict=True):
+        if motion is not None:
+            p = system.numbers(values, s)
+            found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
+            passed.append([np.broadcast_to(x, s.time.shape) for x in found])
+    names = [q.name for q in system.base]
+    amounts = {c.name: c for c in system.with_(aims={}).candidates if any(n.startswith(f"{c.name}.") for n in f.along)}
+    best: dict[str, tuple[float, dict[str, float]]] = {}
+    for share in (np.arange(SCANNED) + 0.5) / SCANNED:
+        tried = {}
+        for i, name in enumerate(f.along):
+            value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
+            bounds = f.fitted[name][1]
+            tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
+        there = system.with_(aims=tried)
+        asked = [*names, *(n for c in amounts.values() for n in c.names)]
+        residual, derivative = there.linearise(values, asked)
+        right, matrix = compress(residual, derivative)
+        if not np.isfinite(matrix).all():
+            continue
+        for c in amounts.values():
+            own = [asked.index(n) for n in c.names]
+            gain, amounts_there = _first_order(right, matrix[:, : len(names)], matrix[:, own], c.quantities)
+            if gain > best.get(c.name, (0.0, {}))[0]:
+                limits = {n: v for n, v in tried.items() if n.startswith(f"{c.name}.")}
+                best[c.name] = gain, limits | dict(zip(c.names, amounts_there.tolist(), strict=True))
+    return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
+
+
+def _first_order(right: Array, base: Array, columns: Array, quantities: Sequence[Quantity]) -> tuple[float, Array]:
+    """Gain of chi-square when these quantities are fitted beside the base, within their bounds; and their values."""
+    free = np.full(base.shape[1], np.inf)
+    lower, upper = ([getattr(q, side) - q.null for q in quantities] for side in ("lower", "upper"))
+    both = np.column_stack([base, columns])
+    step = solve_bounded(right, both, np.concatenate([-free, lower]), np.concatenate([free, upper]))
+    without = right - base @ solve_bounded(right, base, -free, free)
+    values = step[base.shape[1] :] + np.array([q.null for q in quantities])
+    return float(without @ without - np.sum((right - both @ step) ** 2)), values
+
+
+def _leading(system: EquationSystem, values: Mapping[str, float]) -> dict[str, Start]:
+    """Terms with which the model follows to their end data that it loses within a turn; best first."""
+    ways = {c.name: led(system.with_(promoted=(c.name,)), dict(values)) for c in system.candidates}
+    left = {name: misfit(system, way.values) for name, way in ways.items() if way.whole}
+    return {name: ways[name] for name in sorted(left, key=lambda name: left[name])}
+
+
+def _lost_soon(start: Start, leading: Mapping[str, Start]) -> str:
+    text = f"the model loses the data after {start.followed:.2g} s, less than a turn"
+    if leading:
+        return f"{text}; with {' or '.join(leading)} it follows them to their end: {next(iter(leading))} does so best"
+    return f"{text}: sizes of terms mean little"
 
 
 def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
@@ -151,9 +232,8 @@ def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> d
     square, count = np.zeros(len(f.widths)), 0
     for s, states in along:
         t, p = np.linspace(s.time[0], s.time[-1], len(states)), system.numbers({}, s)
-        u = [np.zeros(len(states)) for _ in f.inputs]
         with np.errstate(all="ignore"):
-            arguments = f.jump_arguments(t, list(states.T), p, u)
+            arguments = f.jump_arguments(t, list(states.T), p, system.inputs_of(s, t))
         square += [float(np.nansum(np.broadcast_to(a, t.shape) ** 2)) for a in arguments]
         count += len(states)
     size = np.sqrt(square / max(count, 1))
@@ -257,30 +337,66 @@ def _in_stretches(
 
 def _joined(
     system: EquationSystem, samples: Sequence[Samples], diagnosis: Diagnosis, settings: Settings
-) -> tuple[EquationSystem, Diagnosis, list[str]]:
+) -> tuple[EquationSystem, Diagnosis, str]:
     """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
     names = tuple(f.candidate.name for f in diagnosis.found)
     whole = system.with_(stretches=samples, promoted=names)
-    guesses, _ = guessed(whole)
     # a run's first stretch begins where the run does, under the same name
-    start = led(whole, guesses | diagnosis.after.values)
+    start = led(whole, guessed(whole)[0] | diagnosis.after.values)
     if not start.whole:
-        return system, diagnosis, [f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"]
-    rest = diagnose(whole, start.values, settings, whole.training)
+        return system, diagnosis, f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"
+    plain, merged = _whole(whole, names, start.values, settings, diagnosis)
+    return plain, merged, "with what was found the model follows the whole runs, and they are judged whole"
+
+
+def _whole(
+    whole: EquationSystem, names: tuple[str, ...], values: Mapping[str, float], settings: Settings,
+    stretches: Diagnosis | None = None,
+) -> tuple[EquationSystem, Diagnosis]:  # fmt: skip
+    """Whole runs, judged with terms that the model cannot follow them without.
+
+    stretches : where those terms were found, if not for that reason alone
+    """
+    whole, rest = _searched(_sized(whole, values), values, settings)
     plain = whole.with_(promoted=())
-    declared = _without(rest.before.values, names)
-    before = fit(plain, plain.base, declared)
-    found = []
-    for f in diagnosis.found:
-        smaller = whole.with_(promoted=tuple(n for n in names if n != f.candidate.name))
-        without = fit(smaller, smaller.base, _without(rest.before.values, (f.candidate.name,)))
-        found.append(replace(f, gain=float((without.cost - rest.before.cost) / rest.noise)))
-    merged = replace(
+    before = fit(plain, plain.base, _without(rest.before.values, names))
+    held = held_out(plain, plain.base, before.values, plain.training)
+    found, tried = [], list(rest.tried)
+    for c in (c for c in plain.candidates if c.name in names):
+        smaller = whole.with_(promoted=tuple(n for n in names if n != c.name))
+        without = fit(smaller, smaller.base, _without(rest.before.values, (c.name,)))
+        gain = float((without.cost - rest.before.cost) / rest.noise)
+        ahead = rest.held_out_before.log_density if rest.held_out_before else -np.inf
+        limit = float(stats.chi2.isf(settings.false_alarm / len(plain.candidates), len(c.quantities)))
+        found.append(Found(c, gain, float(2 * (ahead - held.log_density) / rest.noise), limit, ()))
+        tried.insert(0, Tried(c, gain, gain, found[-1].held_out_gain, "chosen"))
+    if stretches is not None:
+        known = {f.candidate.name: f for f in stretches.found}
+        found, tried = [replace(known[f.candidate.name], gain=f.gain) for f in found], list(stretches.tried)
+    return plain, replace(
         rest, verdict="found" if rest.verdict == "nothing missing" else rest.verdict, found=(*found, *rest.found),
-        before=before, held_out_before=held_out(plain, plain.base, before.values, plain.training),
-        tried=diagnosis.tried, reason=f"over the whole runs {rest.reason}",
+        before=before, held_out_before=held, tried=tuple(tried), reason=f"over the whole runs {rest.reason}",
     )  # fmt: skip
-    return plain, merged, ["with what was found the model follows the whole runs, and they are judged whole"]
+
+
+def _with_equals(system: EquationSystem, diagnosis: Diagnosis, leading: Mapping[str, Start]) -> Diagnosis:
+    """Which of the other terms that lead to the end describe the data as well as the one that was taken?"""
+    first, *others = diagnosis.found
+    rivals = []
+    for c in (c for c in system.candidates if c.name in list(leading)[1:]):
+        names = (c.name, *(f.candidate.name for f in others))
+        whole = system.with_(promoted=names)
+        values = _without(diagnosis.after.values, (first.candidate.name,)) | leading[c.name].values
+        fitted = fit(whole, whole.base, values)
+        loss = (fitted.cost - diagnosis.after.cost) / diagnosis.noise
+        if fitted.converged and loss < CLASS_GAIN:
+            ours, theirs = (
+                system.linearise(diagnosis.before.values, [])[0] - system.linearise(f.values, [])[0]
+                for f in (diagnosis.after, fitted)
+            )
+            cosine = np.sum(ours * theirs) / (np.linalg.norm(ours) * np.linalg.norm(theirs))
+            rivals.append(Rival(c, float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(loss), fitted))
+    return replace(diagnosis, found=(replace(first, cannot_be_told_from=tuple(rivals)), *others))
 
 
 def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, float]:

@@ -22,6 +22,8 @@ from disctrack.diagnosis.equations.system import EquationSystem, first_part
 
 GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
 LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
+LOOSE = 0.6  # the same where growing windows follow for less than a turn: most of the motion is still that of the model
+NOISY = 2.0  # variance over that stated, up to which a residual may be noise: sigmas are rough as yet
 _LEASH = 0.3  # relative change of a parameter from window to window, of which none is surprised
 _FAR = 1.0  # relative change of a parameter from its declared value, which is said to be right to some 30 %
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
@@ -137,13 +139,17 @@ class Start:
 
 
 def misfit(system: EquationSystem, values: dict[str, float]) -> float:
-    """Largest over the channels: rms of the residual over that of the signal, all stretches together."""
+    """Largest over the channels: rms of the residual over that of the signal, all stretches together.
+
+    What the noise may make of a residual is taken off: before a motion sets in, there is nothing but noise to follow.
+    """
     square, size = np.zeros(len(system.formulas.channels)), np.zeros(len(system.formulas.channels))
     for s, found in zip(system.stretches, system.predictions(values), strict=True):
         if found is None:
             return np.inf
-        square += np.nansum((s.data - found.seen) ** 2, axis=0)
-        size += np.nansum((s.data - np.nanmean(s.data, axis=0)) ** 2 + s.sigma**2 * np.isfinite(s.data), axis=0)
+        noise = np.where(np.isfinite(s.data), s.sigma**2, 0.0).sum(axis=0)
+        square += np.maximum(np.nansum((s.data - found.seen) ** 2, axis=0) - NOISY * noise, 0.0)
+        size += np.nansum((s.data - np.nanmean(s.data, axis=0)) ** 2, axis=0) + noise
     return float(np.sqrt(np.max(square / np.maximum(size, 1e-300))))
 
 
@@ -170,11 +176,18 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
     shift = [abs(found.values.get(q.name, q.null) - q.null) / max(abs(q.null), q.scale) for q in parameters]
     if found.whole and max(shift, default=0.0) < _FAR:
         return found
-    tied = tuple(replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale))) for q in parameters)
+    # a term's number is not known beforehand: nought is its absence
+    tied = tuple(
+        q if "." in q.name else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
+        for q in parameters
+    )
     states = tuple(q for q in system.base if q.name.startswith("state."))
     values = declared | fit(system, (*states, *tied), declared, max_iterations=30).values
     ends = [misfit(system, v) for v in (values, found.values)]
-    return Start(values, found.duration, found.duration) if ends[0] < min(ends[1], LOST) else found
+    if not found.whole and max(shift, default=0.0) >= _FAR:  # what led so far off and then lost the motion is no start
+        found = replace(found, values=found.values | {q.name: declared.get(q.name, q.null) for q in parameters})
+    enough = LOST if found.followed >= min(turn(s) for s in system.stretches) else LOOSE
+    return Start(values, found.duration, found.duration) if ends[0] < min(ends[1], enough) else found
 
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:

@@ -32,9 +32,12 @@ class Prediction:
 class EquationSystem:
     """Samples of all stretches, one after the other, with a row without data between two of them."""
 
+    several_minima = True  # what users declare may bend anyhow
+
     def __init__(
         self, formulas: Formulas, stretches: Sequence[Samples], sizes: Array, widths: Mapping[str, float],
         promoted: Sequence[str] = (), held: Sequence[str] = (), typical: Mapping[str, float] | None = None,
+        aims: Mapping[str, float] | None = None,
     ) -> None:  # fmt: skip
         """Make a system of stretches whose noise is known.
 
@@ -43,11 +46,12 @@ class EquationSystem:
         promoted : terms that every fit has
         held : parameters that no fit moves
         typical : sizes of the terms' numbers that would surprise nobody
+        aims : where the fit of a term begins that has a number tried along the motion
         """
         self.formulas, self.stretches = formulas, tuple(stretches)
         self.sizes, self.widths = np.asarray(sizes, float), dict(widths)
         self.promoted, self.held = tuple(promoted), tuple(held)
-        self.typical = dict(typical or {})
+        self.typical, self.aims = dict(typical or {}), dict(aims or {})
         lengths = [len(s.time) for s in self.stretches]
         first = np.cumsum([0] + [n + 1 for n in lengths])
         self.rows = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
@@ -59,7 +63,7 @@ class EquationSystem:
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
             self.training[rows] = fitted_rows(s)
         self._w = w
-        self._defaults = formulas.defaults() | self.widths
+        self._defaults = formulas.defaults() | self.widths | self._limits()
         self._per = {name: p.per for name, (_, p) in formulas.fitted.items() if p.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
@@ -68,7 +72,7 @@ class EquationSystem:
         """The same with other stretches, promoted terms, ..."""
         given = {
             "stretches": self.stretches, "sizes": self.sizes, "widths": self.widths, "promoted": self.promoted,
-            "held": self.held, "typical": self.typical,
+            "held": self.held, "typical": self.typical, "aims": self.aims,
         } | changes  # fmt: skip
         return EquationSystem(self.formulas, **given)  # type: ignore[arg-type]
 
@@ -84,7 +88,7 @@ class EquationSystem:
                     found.append(q)
         for name, (_, p) in self.formulas.fitted.items():
             term = name.partition(".")[0] if "." in name else ""
-            if name in self.held or p.shape or (term and term not in self.promoted):
+            if name in self.held or (p.shape and name not in self.aims) or (term and term not in self.promoted):
                 continue
             found += self._quantities(name, p)
         return found
@@ -94,8 +98,9 @@ class EquationSystem:
         typical = p.typical or self.typical.get(name, np.inf)
         names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
         declared = None if "." in name else p.value
+        null = self._limits().get(name, p.value)
         return [
-            Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
+            Quantity(n, p.unit, scale, null, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
             for n in names
         ]
 
@@ -110,10 +115,16 @@ class EquationSystem:
 
     def _candidate(self, term: Term) -> Candidate:
         own = {n: p for n, (_, p) in self.formulas.fitted.items() if n.startswith(f"{term.name}.")}
-        amounts = tuple(q for n, p in own.items() if not p.shape for q in self._quantities(n, p))
-        shape = tuple(q for n, p in own.items() if p.shape for q in self._quantities(n, p))
+        aimed = [n for n in own if n in self.aims]
+        amounts = tuple(q for n, p in own.items() if not p.shape or n in aimed for q in self._quantities(n, p))
+        shape = tuple(q for n, p in own.items() if p.shape and n not in aimed for q in self._quantities(n, p))
         kind = "measurement" if term.is_measurement else "motion"
-        return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, shape=shape)
+        start = tuple(self.aims.get(q.name.partition("[")[0], q.null) for q in amounts) if aimed else ()
+        return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, start, shape)
+
+    def _limits(self) -> dict[str, float]:
+        """Where the numbers lie that were tried along the motion: without their term's amount they move nothing."""
+        return {n: v for n, v in self.aims.items() if n in self.formulas.along}
 
     def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
         """No term has a threshold."""
@@ -229,6 +240,15 @@ class EquationSystem:
                 same = len(groups) - 1
             group_of.append(same)
         return by_number, group_of, np.ascontiguousarray(s.time + late[groups])
+
+    def inputs_of(self, s: Samples, times: Array | None = None) -> list[Array]:
+        """Every input (m,) at instants of a stretch (at its samples, if not said)."""
+        times = s.time if times is None else times
+        found = np.zeros((len(times), len(self.formulas.inputs)))
+        for t, u in zip(times, found, strict=True):
+            if len(u):
+                kernel.inputs_at(t, kernel.piece_at(t, s.knots), s.knots, s.pieces, u, np.zeros(len(u)))
+        return list(found.T)
 
     def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
         """Rates (m, n), their derivatives (m, n, n_p), sensors (m, w), theirs (m, w, n_p) along a stretch's motion."""
