@@ -26,6 +26,7 @@ from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
 from calibration.rig_file import beyond_model, read_beyond_model
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import TrajectoryFileError
+from disctrack.files.json_text import json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
@@ -83,7 +84,7 @@ def write_trajectory(
         file["disc"].attrs.update(_disc_attributes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
         file.attrs.update(_root_attributes(trajectory, provenance))
-        file.attrs["findings"] = json.dumps(dict(findings or {}))
+        file.attrs["findings"] = json_text(dict(findings or {}))
         file.attrs["complete"] = 1
     write_whole(path, buffer.getbuffer())
 

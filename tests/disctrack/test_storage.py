@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -203,6 +204,16 @@ def test_the_csv_is_in_millimetres_and_degrees_with_gaps_empty(tmp_path, traject
     assert_allclose(float(rows[7]["z_sigma_mm"]), 1e3 * trajectory.coordinate_sigma[7, 2], rtol=1e-6)
     assert rows[3]["x_mm"] == ""
     assert rows[3]["status"] == "unreadable"
+
+
+def test_findings_are_json_for_every_reader(tmp_path, trajectory):
+    findings = {"size": {"sigma": np.nan}, "blur_px": (0.7, np.inf)}
+    write_trajectory(tmp_path / "t.h5", trajectory, PROVENANCE, findings=findings)
+    with h5py.File(tmp_path / "t.h5") as handle:
+        assert json.loads(handle.attrs["findings"], parse_constant=pytest.fail) == {
+            "size": {"sigma": None},
+            "blur_px": [0.7, None],
+        }
 
 
 @pytest.mark.parametrize("i", [5, 28])  # precession 9 and 48 deg: every component of the axis counts
