@@ -31,6 +31,7 @@ from calibration.refinement import Refinement
 from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
 from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
 from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
+from calibration.stuck_pixels import repaired_views
 from calibration.table_frame import rig_with_covariance
 from calibration.tolerances import (
     BoardShape,
@@ -167,14 +168,18 @@ def calibrate_stereo(
     names = names or [(f"left {i}", f"right {i}") for i in range(len(left_images))]
     check_sizes(left_images, right_images, names)
     settings = settings or CalibrationSettings()
+    (left, note_left), (right, note_right) = (
+        repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
+    )
     views = located(
-        [*left_images, *right_images],
+        [*left, *right],
         lambda image, thorough: find_corners(image, board.inner_corners, thorough),
         settings.threads,
         progress,
     )
     n = len(left_images)
-    return calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
+    found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
+    return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings))
 
 
 def located(

@@ -65,6 +65,33 @@ def blind_pixels(views: Sequence[Image] | NDArray) -> Mask | None:
     return blind if 0 < blind.sum() <= MOST * blind.size else None
 
 
+def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:
+    """One camera's views of a board with `blind_pixels` replaced in copies, and what is to be said of it ("": none).
+
+    views : grey (height, width) or colour (height, width, channels), of one size and type; each channel by itself.
+    Of a sensor under a colour filter each value is mixed from several pixels, and a blind one spreads a little.
+    """
+    first = views[0] if len(views) else np.zeros((0, 0))
+    if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:
+        return list(views), ""
+    blind, mended = np.zeros(first.shape[:2], bool), list(views)
+    for channel in range(1 if first.ndim == 2 else first.shape[2]):
+        one = [np.ascontiguousarray(view if view.ndim == 2 else view[..., channel]) for view in views]
+        mask = blind_pixels(one)
+        if mask is None:
+            continue
+        if not blind.any():
+            mended = [np.array(view) for view in views]
+        blind |= mask
+        for view, values in zip(mended, one, strict=True):
+            values = np.array(values)
+            repair(values, mask)
+            view.reshape(*view.shape[:2], -1)[..., channel] = values
+    n = int(blind.sum())
+    note = f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
+    return mended, note if n else ""
+
+
 def repair(images: NDArray, stuck: Mask) -> None:
     """Replace, in place, the stuck pixels of images (..., height, width) by the median of their good neighbours."""
     width = stuck.shape[1]

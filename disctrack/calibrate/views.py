@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
 from calibration.board import Target
 from calibration.stereo import Progress, check_sizes
-from calibration.stuck_pixels import blind_pixels, repair
+from calibration.stuck_pixels import repaired_views
 from disctrack.calibrate.targets import find_target, other_board
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.frames import CAMERAS
@@ -158,31 +157,22 @@ def calibrate_views(
     names = [(str(views.left[i]), str(views.right[i])) for i in used]
     position = None if table_view is None else used.index(table_view)
     check_sizes(*images, names)
-    blind = [_repaired(side, name) for side, name in zip(images, CAMERAS, strict=True)]
+    (left_views, note_left), (right_views, note_right) = (
+        repaired_views(side, name) for side, name in zip(images, CAMERAS, strict=True)
+    )
     settings = settings or CalibrationSettings()
-    target, seen_left, seen_right = find_target(*images, target, settings.threads, progress)
+    target, seen_left, seen_right = find_target(left_views, right_views, target, settings.threads, progress)
     try:
         found = calibrate_from_corners(
             seen_left, seen_right, target, settings, position, board_thickness, names, progress
         )
     except CalibrationError as error:
-        if other := other_board([*images[0], *images[1]], [*seen_left, *seen_right], target):
+        if other := other_board([*left_views, *right_views], [*seen_left, *seen_right], target):
             raise CalibrationError(f"{str(error).rstrip('.')}. {other}") from error
         raise
-    return replace(found, warnings=(*(note for note in blind if note), *found.warnings)), tuple(problems)
-
-
-def _repaired(views: list[NDArray], camera: str) -> str:
-    """Replace pixels that do not see by their neighbours, in copies that take the views' places; what is to be said."""
-    if any(view.ndim != 2 or view.dtype not in (np.uint8, np.uint16) for view in views):
-        return ""  # of a colour image, whose pixels are mixed from several
-    mask = blind_pixels(views)
-    if mask is None:
-        return ""
-    for i, view in enumerate(views):
-        views[i] = np.array(view)
-        repair(views[i], mask)
-    return f"{camera} camera: {int(mask.sum())} pixels show one value in all views; their neighbours stand in for them"
+    return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings)), tuple(
+        problems
+    )
 
 
 def _pixels(view: View, where: str, flat: FlatField | None) -> NDArray:

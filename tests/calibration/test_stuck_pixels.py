@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from calibration import Board, CornerView, find_corners
-from calibration.stuck_pixels import blind_pixels, repair, stuck_pixels
+from calibration import Board, CornerView, calibrate_stereo, find_corners
+from calibration.stuck_pixels import blind_pixels, repair, repaired_views, stuck_pixels
 from disctrack.calibrate.views import calibrate_views, find_views
 
 
@@ -84,3 +84,29 @@ def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_cli
             both = seen.accepted & clean.accepted
             off.append((seen.points - clean.points)[both])
         assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1e-3
+
+
+def test_pixels_that_do_not_see_are_replaced_in_colour_views_and_in_arrays(sample_clip, rng):
+    views, notes = {}, {}
+    for side in ("left", "right"):
+        files = sorted((sample_clip / "calibration" / side).glob("*.png"))
+        grey = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]
+        seen = [np.stack([view, view, view // 2], axis=-1) for view in grey]
+        clean, note = repaired_views(seen, side)
+        assert note == ""
+        assert all(one is other for one, other in zip(clean, seen, strict=True))  # nothing is copied for nothing
+        where = rng.permutation(grey[0].size)[:50]
+        for view in seen:
+            view.reshape(-1, 3)[where[::2], 1], view.reshape(-1, 3)[where[1::2], 1] = 255, 0  # of one channel
+        before = [view.copy() for view in seen]
+        mended, notes[side] = repaired_views(seen, side)
+        assert_array_equal(np.stack(seen), np.stack(before))
+        for view, was, true in zip(mended, seen, grey, strict=True):
+            assert_array_equal(view[..., ::2], was[..., ::2])
+            changed = np.flatnonzero(view[..., 1] != was[..., 1])
+            assert set(changed) <= set(where)
+            assert np.median(np.abs(view[..., 1].astype(int) - true).flat[changed]) < 10
+        views[side] = seen
+    found = calibrate_stereo(views["left"], views["right"], Board((9, 6), 6e-3))
+    assert [text for text in found.warnings if "show one value" in text] == list(notes.values())
+    assert all(20 <= int(note.split()[2]) <= 50 for note in notes.values())
