@@ -46,17 +46,21 @@ def export_opencv(path: str | os.PathLike[str], rig: StereoRig) -> None:
 
 
 def import_opencv(
-    *paths: str | os.PathLike[str], image_size: tuple[int, int] | None = None, unit: float | None = None
+    *paths: str | os.PathLike[str],
+    image_size: tuple[int, int] | None = None,
+    unit: float | None = None,
+    world_is_table: bool = False,
 ) -> StereoRig:
     """A rig from one file, or from two (intrinsics.yml and extrinsics.yml of OpenCV's sample).
 
     image_size : (width, height) [px], needed where the files do not tell it
     unit : [m] length of the file's unit (0.025 where T is in squares of 25 mm); default: metres if the file says so
+    world_is_table : True if R_left_world and t_left_world are those of the table, k up, whether or not the file says so
 
     The covariance is zero: such files carry none. Raises RigFileError.
     """
     nodes: dict[str, Array] = {}
-    told_metres, is_table = False, False
+    told_metres, is_table = False, world_is_table
     names = ("M1", "D1", "M2", "D2", "R", "T", "image_size1", "image_size2", "R_left_world", "t_left_world")
     for path in map(Path, paths):
         storage = _opened(path)
@@ -80,6 +84,8 @@ def import_opencv(
     scale = 1.0 if unit is None else unit
     cameras = [_camera(nodes, number, image_size, where) for number in (1, 2)]
     world = "R_left_world" in nodes and "t_left_world" in nodes
+    if world_is_table and not world:
+        raise RigFileError(f"{where}: without R_left_world and t_left_world nothing says where the table is")
     return StereoRig(
         left=cameras[0],
         right=cameras[1],

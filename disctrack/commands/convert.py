@@ -18,6 +18,10 @@ from disctrack.trajectory.file import read_trajectory, write_csv
 
 TRAJECTORY = (".csv", ".mat", ".c3d")
 OPENCV = (".yml", ".yaml", ".xml")
+WORDS = ("table", "cameras", "image_size", "unit_mm")  # options that say what a foreign rig does not
+UNDERSTOOD = {".cameramodel": ("table",), ".toml": ("table", "cameras")} | dict.fromkeys(
+    OPENCV, ("table", "image_size", "unit_mm")
+)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -27,6 +31,11 @@ def run(arguments: argparse.Namespace) -> int:
         keep(source)
     refuse_existing(target, arguments.overwrite)
     refuse_input(target)
+    understood = UNDERSTOOD.get(arguments.source[0].suffix, ()) if target.suffix == ".h5" else ()
+    idle = [word for word in WORDS if getattr(arguments, word) and word not in understood]
+    if idle:
+        options = ", ".join(f"--{word.replace('_', '-')}" for word in idle)
+        raise OutputError(f"{options}: says nothing about {arguments.source[0]} as {target.suffix}; leave it out")
     if target.suffix in TRAJECTORY:
         written = [_trajectory(arguments)]
     elif target.suffix == ".h5":
@@ -38,7 +47,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _trajectory(arguments: argparse.Namespace) -> Path:
-
     trajectory = read_trajectory(_single(arguments.source))
     target: Path = arguments.target
     if target.suffix == ".csv":
@@ -46,12 +54,10 @@ def _trajectory(arguments: argparse.Namespace) -> Path:
         return target
     if target.suffix == ".mat":
         return write_mat(target, trajectory, overwrite=True)
-
     return write_c3d(target, trajectory, overwrite=True)
 
 
 def _foreign_rig(arguments: argparse.Namespace) -> Path:
-
     source, first = arguments.source, arguments.source[0]
     if first.suffix == ".cameramodel":
         if len(source) != 2:
@@ -63,7 +69,7 @@ def _foreign_rig(arguments: argparse.Namespace) -> Path:
     elif first.suffix in OPENCV:
         size = None if arguments.image_size is None else tuple(arguments.image_size)
         unit = None if arguments.unit_mm is None else 1e-3 * arguments.unit_mm
-        rig = import_opencv(*source, image_size=size, unit=unit)
+        rig = import_opencv(*source, image_size=size, unit=unit, world_is_table=arguments.table)
     else:
         raise RigFileError(f"{first}: rigs are read from .yml (OpenCV), .toml (Caliscope) and .cameramodel (mrcal)")
     write_rig(arguments.target, rig)
@@ -71,7 +77,6 @@ def _foreign_rig(arguments: argparse.Namespace) -> Path:
 
 
 def _own_rig(arguments: argparse.Namespace) -> list[Path]:
-
     target: Path = arguments.target
     if target.suffix not in (*OPENCV, ".toml", ".cameramodel"):
         known = ", ".join((*TRAJECTORY, *OPENCV, ".toml", ".cameramodel", ".h5"))
@@ -91,7 +96,6 @@ def _own_rig(arguments: argparse.Namespace) -> list[Path]:
 
 
 def _single(source: list[Path]) -> Path:
-
     if len(source) != 1:
         raise OutputError(f"{len(source)} files given; one is converted at a time")
     return source[0]

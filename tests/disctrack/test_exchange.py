@@ -255,6 +255,19 @@ def test_convert_goes_by_the_suffix_and_replaces_nothing(rig, tmp_path, capsys):
             == 0
         )
         assert read_rig(tmp_path / "back.h5").baseline == pytest.approx(rig.baseline)
+    for words in (["rig.toml", "back.h5", "--unit-mm", "25"], ["rig.yml", "back.h5", "--cameras", "0", "1"],
+                  ["rig.h5", "new.toml", "--table"]):  # fmt: skip
+        assert main(["convert", *(str(tmp_path / w) if "." in w else w for w in words), "--overwrite"]) == 1
+        assert f"{words[2]}: says nothing about" in capsys.readouterr().err
+    text = (tmp_path / "rig.yml").read_text().replace("world_is_table: 1", "world_is_table: 0")
+    (tmp_path / "silent.yml").write_text(text)
+    for words in ([], ["--table"]):
+        said = ["convert", str(tmp_path / "silent.yml"), str(tmp_path / "back.h5"), "--overwrite", *words]
+        assert main(said) == 0
+        assert read_rig(tmp_path / "back.h5").world_is_table == bool(words)
+    (tmp_path / "bare.yml").write_text(text.replace("R_left_world", "Q").replace("t_left_world", "q"))
+    assert main(["convert", str(tmp_path / "bare.yml"), str(tmp_path / "bare.h5"), "--table"]) == 1
+    assert "nothing says where the table is" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "rig.h5"), str(tmp_path / "rig.toml")]) == 1
     assert main(["convert", str(tmp_path / "rig.h5"), str(tmp_path / "rig.docx")]) == 1
     assert ".cameramodel" in capsys.readouterr().err
