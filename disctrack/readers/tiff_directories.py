@@ -21,7 +21,7 @@ Field = tuple[int, int, bytes]  # type, number of values, the values
 _TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 6: "b", 7: "B", 8: "h", 9: "i", 13: "I", 16: "Q", 17: "q", 18: "Q"}
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 # What libtiff needs to know of a page: layout, compression with its tables, and nothing that points elsewhere.
-_COPIED = (256, 257, 258, 259, 262, 266, 277, 278, 292, 317, 322, 323, 338, 339, 347)
+_COPIED = (256, 257, 258, 259, 262, 266, 277, 278, 292, 317, 320, 322, 323, 338, 339, 347)
 _MOST_TAGS = 1 << 12
 
 

@@ -85,3 +85,21 @@ def test_a_stack_behind_one_directory_is_read_whole_or_refused(tmp_path):
     assert_array_equal(read(tmp_path / "minisblack"), DEEP)
     with pytest.raises(RecordingError, match="4 frames in one directory, whose pixels are not plain"):
         read(tmp_path / "miniswhite")
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "packbits"])
+def test_palettes_are_heeded_in_files_and_stacks(tmp_path, compression):
+    def picture(frame, colours):
+        found = Image.frombytes("P", frame.shape[::-1], frame.tobytes())
+        found.putpalette(bytes(colours))
+        return found
+
+    level = np.arange(256, dtype=np.uint8)
+    grey = np.stack([255 - level] * 3, axis=-1)
+    for name, colours in (("grey", grey), ("colour", grey * np.array([1, 1, 0], np.uint8))):
+        first, *others = (picture(frame, colours.tobytes()) for frame in FRAMES[8])
+        (tmp_path / name).mkdir()
+        first.save(tmp_path / name / "stack.tif", save_all=True, append_images=others, compression=compression)
+    assert_array_equal(read(tmp_path / "grey"), 255 - FRAMES[8])
+    with pytest.raises(RecordingError, match="a colour image"):
+        read(tmp_path / "colour")
