@@ -216,7 +216,7 @@ def _pages_announced(description: str) -> int:
         found = re.search(r"^images=([0-9]{1,12})\s*$", description, re.MULTILINE)
         return int(found.group(1)) if found else 0
     if description.startswith("{") and '"truncated"' in description:
-        with suppress(ValueError, TypeError, KeyError):  # no note of that kind
+        with suppress(ValueError, TypeError, KeyError, OverflowError, RecursionError):  # no note of that kind
             *several, _, _ = json.loads(description)["shape"]
             return math.prod(map(int, several))
     return 0
