@@ -70,14 +70,16 @@ def bounds(found: Found, fit: Fit) -> list[str]:
     spread = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     for q in found.candidate.quantities:
         name, value, sigma = shown(q, fit)
-        if q.name.startswith("state.") or q.name == SLIP or not sigma > 0 or abs(value - q.null) >= SEEN * sigma:
+        if q.name.startswith("state.") or q.name == SLIP or q.null != 0.0:  # a limit is no size
+            continue
+        if not sigma > 0 or abs(value) >= SEEN * sigma:
             continue
         i = fit.names.index(q.name)
         shared = np.abs(fit.covariance[i]) / np.where(spread > 0, spread, np.inf) / spread[i]
         shared[i] = 0.0
         partner = int(np.argmax(shared))
-        why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise of the dots"
-        most = quantity_text(abs(value - q.null) + SEEN * sigma, 0.0, q.unit)
+        why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise"
+        most = quantity_text(abs(value) + SEEN * sigma, 0.0, q.unit)
         texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
     return texts
 
