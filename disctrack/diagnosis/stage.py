@@ -17,9 +17,9 @@ from disctrack.diagnosis.disc.form_misfit import with_form
 from disctrack.diagnosis.disc.learned_law import (
     UNLIKELY,
     LearnedLaw,
+    in_two_steps,
     learn,
     shortest_to_first_order,
-    with_amounts,
     with_law,
     without_idle_terms,
 )
@@ -304,7 +304,7 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     for found in kept:  # in what the law leaves, is it still an effect?
         rest = [f for f in again if f is not found]
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
-        without = _with_law_in_two_steps(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
+        without = in_two_steps(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / diagnosis.noise
         if without.converged and gain < found.threshold:
             again, fitted = rest, without
@@ -314,17 +314,6 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     if explained:
         length += law.looked * len(law.families)
     return _Beside(law, known, fitted, tuple(again), length)
-
-
-def _with_law_in_two_steps(system: System, base: Fit, law: LearnedLaw) -> Fit:
-    """The law's fit; where that does not arrive, from where its amounts alone lead: far from it, edges make kinks."""
-    fitted = with_law(system, base, law)
-    if fitted.converged:
-        return fitted
-    amounts = with_amounts(system, base, law)
-    reached = replace(law.candidate, start=tuple(amounts.values[n] for n in law.candidate.names))
-    again = with_law(system, base, replace(law, candidate=reached, values=amounts.values))
-    return min(fitted, amounts, again, key=lambda f: (not f.converged, f.cost))
 
 
 def _rivals(

@@ -15,6 +15,7 @@ from tests.oracles.measured_disc import K_M
 from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, motion, recording
 
 RIDGE = {"direction": 0.6, "edge": 0.05, "length": 3e-3}  # as UNKNOWN["groove"], of 20 um
+STEP = {"direction": 0.9, "edge": 0.045, "length": 4e-3}  # as UNKNOWN["seam"], of 6 um
 HILL = {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}  # as UNKNOWN["bump"], of 30 um
 
 
@@ -22,6 +23,7 @@ HILL = {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}  # as UNKN
     ("name", "title", "shape", "amount"),
     [
         ("groove", "a ridge or groove of the table", RIDGE, -20e-6 * 3e-3),
+        ("seam", "a step of the table", STEP, 6e-6),
         ("bump", "a hill or dip of the table", HILL, 30e-6 * 8e-3**2),
     ],
 )

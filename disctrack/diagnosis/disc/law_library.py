@@ -235,22 +235,25 @@ def _gates(q: Array, time: Array, path: Array) -> Iterator[Family]:
 
 
 def _uneven(q: Array, path: Array) -> Iterator[Family]:
-    """A table that is not flat: ridges and grooves, hills and dips, and a drag over a part of it, by where they are.
+    """A table that is not flat: ridges, grooves and steps, hills and dips, and a drag over a part of it, by where.
 
     The place of touch moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin
-    theta, H' its slope along n0. The number is the area of the profile, or the volume: it hardly depends on the width.
+    theta, H' its slope along n0. The number is the profile's area or volume, or the step's height: it hardly depends
+    on the width.
     """
     along = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
     off = f"(({along} - {{edge}}) / {{length}})"
     ridge = (
         f"2.0 * radius / sin_theta * cos(psi - {{direction}}) * {off} * exp(-{off} * {off}) / ({{length}} * {{length}})"
     )
+    step = f"-radius / sin_theta * cos(psi - {{direction}}) * exp(-{off} * {off}) / (1.7724539 * {{length}})"
     for direction in np.arange(0, np.pi, np.pi / 12):
         across = path @ np.array([np.cos(direction), np.sin(direction)])
         for edge in np.arange(across.min(), across.max(), 0.004):
             for length in (0.003, 0.008):
                 shape = {"direction": float(direction), "edge": float(edge), "length": length}
                 yield Family("a ridge or groove of the table", ({"load_m": ridge},), shape, "ridge")
+                yield Family("a step of the table", ({"load_m": step},), shape, "step")
     from_x, from_y = f"({_CONTACT_X} - {{x0}})", f"({_CONTACT_Y} - {{y0}})"
     away2 = f"({from_x} * {from_x} + {from_y} * {from_y}) / ({{length}} * {{length}})"
     along_n0 = f"({_X} - {{x0}} * cos(psi) - {{y0}} * sin(psi))"

@@ -42,6 +42,7 @@ REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
 MAX_ITERATIONS = 15  # of a law that describes the data; others wander
+COMES_NEAR = 1.5  # chi-square per degree of freedom, from which on a fit that did not arrive is worth another start
 WIDTHS = ("width", "softness", "length")  # shapes of a law that go with its amount
 IDLE = 1e-12  # share of an amount's variance that is none
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
@@ -53,7 +54,14 @@ COARSE = 0.1  # ... and share of what is missing, by which one may be that moves
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
 CHUNK = 240  # columns of the library that are held at a time
-_OF_PLACE = ("place", "part of the table", "ridge", "hill", "drag on a part")  # angles tell where the contact is
+_OF_PLACE = (
+    "place",
+    "part of the table",
+    "ridge",
+    "step",
+    "hill",
+    "drag on a part",
+)  # angles tell where the contact is
 _LOCKED = ("psi)", "phi)", "psi +", "psi -", "phi -")
 
 
@@ -438,11 +446,20 @@ def with_law(system: System, base: Fit, law: LearnedLaw) -> Fit:
     return fit(system, (*base.quantities, *law.candidate.quantities), start, MAX_ITERATIONS, may_crawl=False)
 
 
-def with_amounts(system: System, base: Fit, law: LearnedLaw) -> Fit:
-    """The same with the numbers of its shapes held."""
+def in_two_steps(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    """The law's fit; where that comes near and does not arrive, from where its amounts alone lead.
+
+    Far from the law's motion, edges make kinks on the way to it.
+    """
+    fitted = with_law(system, base, law)
+    if fitted.converged or not fitted.reduced_chi_square < COMES_NEAR:
+        return fitted
     start = dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
     amounts = [q for q in law.candidate.quantities if not _is_shape(q)]
-    return fit(system, (*base.quantities, *amounts), start, MAX_ITERATIONS, may_crawl=False)
+    held = fit(system, (*base.quantities, *amounts), start, MAX_ITERATIONS, may_crawl=False)
+    reached = replace(law.candidate, start=tuple(held.values[n] for n in law.candidate.names))
+    again = with_law(system, base, replace(law, candidate=reached, values=held.values))
+    return min(fitted, again, key=lambda f: (not f.converged, f.cost))
 
 
 def _free_name(model: Model) -> str:
