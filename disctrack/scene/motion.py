@@ -59,6 +59,8 @@ def _table(scene: Scene) -> SceneMotion:
         raise SceneError(f"{path}: no table of motion ({error}); expected rows t, x, y, z, psi, theta, phi") from error
     if rows.ndim != 2 or rows.shape[1] != 7 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0).all():
         raise SceneError(f"{path}: shape {rows.shape}; expected 2 or more rows of 7 with increasing t [s]")
+    if not np.isfinite(rows).all():
+        raise SceneError(f"{path}: row {np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]} holds no finite number")
     spline = CubicSpline(rows[:, 0], rows[:, 1:])
     n = _frames_within(scene, rows[0, 0], rows[-1, 0], str(path))
     return SceneMotion(spline, spline.derivative(), n)
@@ -66,6 +68,8 @@ def _table(scene: Scene) -> SceneMotion:
 
 def _rolling(scene: Scene) -> SceneMotion:
     motion = simulate_scene(scene)
+    if len(motion) < 2:
+        raise SceneError(f"the rolling model: over before anything is filmed: {motion.end.value}")
     spline = CubicHermiteSpline(motion.time, motion.q, motion.qdot)
     n = _frames_within(scene, motion.time[0], motion.time[-1], "the rolling model")
     return SceneMotion(spline, spline.derivative(), n, motion)

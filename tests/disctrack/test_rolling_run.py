@@ -11,6 +11,8 @@ from disctrack.cli import main
 from disctrack.errors import OutputError, SceneError
 from disctrack.files.toml_tree import toml_value
 from disctrack.rolling import CATALOGUE, ModelError, Regime, effects_from_tables
+from disctrack.scene.description import load_scene
+from disctrack.scene.motion import motion_of
 from disctrack.scene.simulation import run_simulate
 
 SCENE = """
@@ -91,6 +93,17 @@ def test_a_disc_that_never_touches_the_table_is_summed_up_too(scene, tmp_path):
     assert (run.motion.regime == Regime.FLYING).all()
     assert "never held by the table" in run.summary
     assert "nan" not in run.summary
+
+
+def test_a_scene_whose_motion_ends_where_it_starts_is_not_filmed(scene, tmp_path):
+    struck = "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05 }"  # without the effect slip
+    scene.write_text(SCENE.replace("theta_deg = 8", struck))
+    with pytest.raises(SceneError, match="over before anything is filmed: after losing contact"):
+        motion_of(load_scene(scene))
+    np.savetxt(tmp_path / "table.csv", [[0, 0, 0, 0, 0, 0.5, 0], [1, 0, 0, np.nan, 0, 0.5, 0]], delimiter=",")
+    scene.write_text('[motion]\nkind = "table"\ntable = "table.csv"\n')
+    with pytest.raises(SceneError, match="row 1 holds no finite number"):
+        motion_of(load_scene(scene))
 
 
 def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
