@@ -107,7 +107,7 @@ def _without_images(
     """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
     model, apart, rejected, warnings = pairs.model, dict(pairs.apart), {}, []
     R, t = model.R_left_board.copy(), model.t_left_board.copy()
-    or_else = ", or the board lies where the lens is wider than the model" if wide else ""
+    or_else = ", or the board lies too far out for the model of this lens" if wide else ""
     for (view, camera), reason in pairs.bad_images.items():
         text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly{or_else}"
         observations = observations[(observations.view != view) | (observations.camera != camera)]
