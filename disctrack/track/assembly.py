@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,7 +17,7 @@ from disctrack.disc import Disc
 from disctrack.track.as_printed import AsBuilt, motions_of_pattern, pattern_place, refine_as_built, share_of_places
 from disctrack.track.dots import NoiseModel, TemplateLimits
 from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
-from disctrack.track.exposure import shift_by_exposure
+from disctrack.track.exposure import Exposure, Pull, exposure_by_smear, exposure_of, shift_by_exposure
 from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.least_squares import step_to_minimum
@@ -47,7 +46,7 @@ class TrackingSettings:
     reject_outliers: bool = True
     table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
     search_always: bool = False  # at every frame where the disc is lost, whatever it costs: for single, unrelated poses
-    exposure: tuple[float, float] = (0.0, 0.0)  # [s] of the left and the right camera; 0 where it is not known
+    exposure: tuple[float, float] | None = None  # [s] of the left and the right camera; None: as the dots' smear tells
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (first_pass.py)
 
 
@@ -66,6 +65,7 @@ class Tracking:
     systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
     shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
     table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
+    exposure: Exposure  # that the dots were moved by
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     warnings: tuple[str, ...]
     doubts: tuple[str, ...] = ()  # what puts the result in question: images that are copies of others
@@ -88,12 +88,9 @@ def assemble(
 
     workers : threads; the result is the same to the last bit for any number of them
     """
-    if any(settings.exposure):  # which frames to trust with the acceleration is known when all have been judged
-        unmoved = replace(settings, exposure=(0.0, 0.0))
-        blurred = assemble(followers, deepcopy(tables), unmoved, taken, workers)
-        tables.pixels -= shift_by_exposure(blurred.trajectory, settings.exposure)
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
+    exposure = _to_mid_exposure(tables, first, settings, taken)
     _clean(tables, repeated, first.setup.rig)
     as_built, faults, outlying = _shared(tables, first.setup, settings, workers)
     fits = _fit_all(tables, as_built, settings.reject_outliers, workers)
@@ -107,7 +104,7 @@ def assemble(
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    warnings = warnings_of(first, faults, scatter, poses, table, trajectory)
+    warnings = (*exposure.warnings, *warnings_of(first, faults, scatter, poses, table, trajectory))
     return Tracking(
         trajectory=trajectory,
         noise=first.law.noise,
@@ -119,6 +116,7 @@ def assemble(
         shared_sigma=shared,
         systematic_px=scatter.systematic_px,
         table=table,
+        exposure=exposure,
         acquisitions=sum(f.acquisitions for f in followers),
         warnings=warnings,
         doubts=(
@@ -127,6 +125,18 @@ def assemble(
             *(text for text in warnings if text.startswith((MISFIT, ONE_SIDED))),
         ),
     )
+
+
+def _to_mid_exposure(tables: Tables, first: Follower, settings: TrackingSettings, taken: Taken) -> Exposure:
+    """Move the dots to where they were in the middle of the exposure, and tell by which exposure."""
+    where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
+    found = exposure_by_smear(*where, tables.blur_px, rig, disc)
+    exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
+    if any(exposure.seconds):
+        blur = np.nanmedian(tables.blur_px, axis=(0, 2)).tolist()
+        left, right = (Pull(*seen) for seen in zip(blur, first.law.light, first.law.noise, strict=True))
+        tables.pixels -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, (left, right))
+    return exposure
 
 
 def _clean(tables: Tables, repeated: Mask, rig: StereoRig) -> None:

@@ -1,49 +1,285 @@
-"""What a long exposure does to the dots of a moving disc, taken off where the exposure time is known.
+"""What an exposure does to the dots of a moving disc, taken off; the exposure time itself, where nobody declares it.
 
-Over an exposure T a dot's image is smeared along its path; its centre is the mean of the path, which lies beside the
-place at mid exposure by T^2 / 24 times the acceleration of the image (second order of the path; the first vanishes).
-While the disc rolls, this makes theta read low by sin(theta) (psidot T)^2 / 24 = g T^2 / (6 r), at every theta alike
-(steady precession, psidot^2 sin(theta) = 4 g / r): 0.6 mdeg at 0.5 ms and r = 37.5 mm.
+Over an exposure T a dot is smeared, and its template finds it beside its place at mid exposure by T^2 / 24 times
+(second order of the path; the first vanishes)
+
+    c'' + A [(K/2 - 1) (G + G^T) + (K/2 + 1) tr G] A^-1 c',   G = A^-1 A',
+
+c the image of the dot's centre, A (2, 2) the affine map from the disc's plane to the image there, primes rates. The
+first term is the mean of the path: while the disc rolls it makes theta read low by sin(theta) (psidot T)^2 / 24 =
+g T^2 / (6 r), at every theta alike (steady precession, psidot^2 sin(theta) = 4 g / r), 0.6 mdeg at 0.5 ms and
+r = 37.5 mm. The other comes from a dot whose outline changes while it moves, which smears one side more than the other:
+the image I(d) of the edge, d the signed distance, changes by T^2 / 24 (I' d_tt + I'' v_n^2) with
+d_tt = -n.a - kappa v_t^2 + 2 v_t dv_n/ds, and of that the template takes the first harmonic about the dot. I'' looks to
+it like a shift by K kappa, as light that may slope over the paper takes up the halo of the smeared side
+(`_pull_of_smear`; K = 1/2 if it might not).
+
+The smear tells T: an edge with normal n whose image moves by v T during the exposure is blurred by (v.n)^2 T^2 / 12
+more (variance of a uniform distribution), on the mean over the dot's edge. How fast a dot is changes with its place
+about the point of contact, not with the dot or its distance, which the optics' blur depends on: the two are told apart
+by a linear fit. Variance of the path and shift of its mean are both in proportion to T^2, whatever light does during
+the exposure.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from calibration.arrays import Array, Mask
-from disctrack import frames
+import numpy as np
+from scipy.special import erfc
+
+from calibration.arrays import Array, Array32, Mask
+from calibration.camera import StereoRig
+from disctrack.disc import Disc
+from disctrack.frames import CAMERAS
+from disctrack.track.dots import NoiseModel
 from disctrack.track.pose import marker_pixels
-from disctrack.trajectory import FrameStatus, Trajectory
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
+OF_SMEAR = 1500  # frames at most that the smear is taken from
+PARTS = 10  # stretches of the recording: what the fit leaves has a memory, its sum over a stretch scatters as it does
+LEAST_PARTS = 4.0  # that the motion is spread over: (sum w)^2 / sum w^2 of what each tells
+FEWEST = 2 * PARTS  # frames
+AT_ONCE = 4096  # poses
+BAND = 3.0  # blurs
+RADII, SIZES = 200, 5  # nodes across the edge, sizes of dots between which K is interpolated
+EDGE = 16  # directions about a dot
+OUTLYING = 4.0  # robust sigmas
+SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
+APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
+CONTRADICTS = 5.0  # sigmas between a declared exposure and the smear
 
 
-def shift_by_exposure(trajectory: Trajectory, exposure: tuple[float, float]) -> Array:
+class ExposureSquared(NamedTuple):
+    """T^2 of the left and the right camera, by the smear; NaN, and sigma infinite, where nothing tells it."""
+
+    value: Array  # (2,) [s^2]
+    sigma: Array  # (2,) [s^2]
+
+
+class Pull(NamedTuple):
+    """What a camera's templates see of an edge."""
+
+    blur_px: float  # sigma of the edge
+    light: tuple[float, float]  # grey value of the paper, and the dots' contrast with it
+    noise: NoiseModel
+
+
+class Exposure(NamedTuple):
+    """What was taken off, and what is to be told of it."""
+
+    seconds: tuple[float, float]  # [s] of the left and the right camera
+    note: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+def shift_by_exposure(
+    R: Array, t: Array, time: Array, exposure: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]
+) -> Array:
     """(n, 2, m, 2) [px] by which the dots of an exposure lie beside their places at mid exposure; zero where not known.
 
-    exposure: of the left and the right camera [s]. The acceleration is that of the poses of three measured frames in a
-    row: their noise adds at most 0.1 of itself (T as long as the frame interval), what differences leave out is
-    (psidot / frame_rate)^2 / 12 of the shift.
+    R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; time (n,) [s]; exposure (2,) of the left and the right
+    camera [s]; pulls: how each camera's dots are lit. Rates are those of three poses in a row: their noise adds at most
+    0.1 of itself (T as long as the frame interval), what differences leave out is (psidot / frame_rate)^2 / 12 of the
+    shift.
     """
-    measured = trajectory.frame_status == FrameStatus.MEASURED
-    R = frames.rotation_from_quaternion(np.where(measured[:, None], trajectory.quaternion, [1.0, 0.0, 0.0, 0.0]))
-    t = np.where(measured[:, None], trajectory.q[:, :3], np.nan)
-    pixels, _ = marker_pixels(R, t, trajectory.rig, trajectory.disc.marker_centres_body)
-    acceleration = np.full_like(pixels, np.nan)
-    if len(pixels) > 2:
-        before, after = (np.diff(trajectory.time)[part, None, None, None] for part in (slice(-1), slice(1, None)))
-        step = np.diff(pixels, axis=0)
-        acceleration[1:-1] = 2 * (step[1:] / after - step[:-1] / before) / (before + after)
-    known = _all_finite(acceleration)
+    each = np.empty((len(R), 2, disc.n_markers, 2))
+    for first in range(0, len(R), AT_ONCE):  # their derivatives are ten times as large
+        rows = slice(max(first - 1, 0), first + AT_ONCE + 1)
+        part = _second_order(R[rows], t[rows], time[rows], rig, disc, pulls)
+        each[first : first + AT_ONCE] = part[first - rows.start :][:AT_ONCE]
+    measured = np.isfinite(t).all(axis=1)
+    known = _all_finite(each)
     for distance in range(1, BORROWED_FROM + 1):
         for way in (-distance, distance):
             wanted = np.flatnonzero(measured & ~known)
             wanted = wanted[(wanted + way >= 0) & (wanted + way < len(known))]
             wanted = wanted[known[wanted + way]]
-            acceleration[wanted] = acceleration[wanted + way]
-        known = _all_finite(acceleration)
-    shift = np.array(exposure)[:, None, None] ** 2 / 24 * acceleration
+            each[wanted] = each[wanted + way]
+        known = _all_finite(each)
+    shift = np.asarray(exposure)[:, None, None] ** 2 / 24 * each
     return np.where(np.isfinite(shift), shift, 0.0)
+
+
+def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array32, rig: StereoRig, disc: Disc) -> ExposureSquared:
+    """The exposures that the dots' edges tell; arguments as of `shift_by_exposure`, blur_px (n, 2, m) sigma of an edge.
+
+    The squared blur is fitted by a constant of every dot, what changes with the distance (to second order) and with
+    the place in the image (to first), and T^2 times the smear of one second's exposure. Sigmas are those of sums over
+    stretches of the recording (sandwich), as what a lens adds is not white.
+    """
+    every = max(1, -(-len(t) // OF_SMEAR))
+    chosen = np.arange(0, len(t), every)
+    rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))
+    pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
+    velocity = _rate(pixels, time[rows])
+    velocity[~np.isin(rows, chosen)] = np.nan  # these are only there as neighbours of the chosen ones
+    smear = _smear(velocity, _affine(J, R[rows]))
+    points = disc.marker_centres_body @ np.swapaxes(R[rows], 1, 2) + t[rows, None]
+    value, sigma = np.full(2, np.nan), np.full(2, np.inf)
+    for camera, (R_camera_world, t_camera_world) in enumerate(rig.camera_poses()):
+        distance = points @ R_camera_world[2] + t_camera_world[2]
+        optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[:, camera], -1, 0))]
+        squared = np.asarray(blur_px[rows, camera], float) ** 2
+        value[camera], sigma[camera] = _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
+    return ExposureSquared(value, sigma)
+
+
+def exposure_of(found: ExposureSquared, declared: tuple[float, float] | None, longest: float) -> Exposure:
+    """The exposure to take off: as declared, else one of both cameras as the smear tells where it is sure, else none.
+
+    longest : [s] the frame interval, which no exposure exceeds.
+    """
+    words = [_in_words(*each) for each in zip(CAMERAS, found.value, found.sigma, strict=True)]
+    told = ", ".join(text for text in words if text)
+    if declared is None:
+        seconds = _likely(found, longest)
+        note = f"exposure by the smear of the moving dots: {told}; poses are of the middle of {1e6 * seconds:.0f} us"
+        return Exposure((seconds, seconds), note=note if seconds else "")
+    expected = np.array(declared) ** 2
+    doubt = np.hypot(found.sigma, APPROXIMATE * np.fmax(np.abs(found.value), expected))
+    if not (np.abs(found.value - expected) > CONTRADICTS * doubt).any():
+        return Exposure(declared)
+    said = " and ".join(f"{1e6 * T:g}" for T in declared)
+    return Exposure(
+        declared,
+        warnings=(
+            f"exposure_us is declared (or in the cameras' headers) as {said} us, the smear of the moving dots tells "
+            f"{told}. The declared one is used: poses are off by up to g T^2 / (6 r) in theta if it is wrong",
+        ),
+    )
+
+
+def _likely(found: ExposureSquared, longest: float) -> float:
+    """One exposure [s] of both cameras; 0 where the smear does not show one, or the cameras tell two."""
+    told = np.isfinite(found.sigma)
+    if not told.any():
+        return 0.0
+    weight = found.sigma[told] ** -2
+    mean = float(weight @ found.value[told] / weight.sum())
+    if not SURE * weight.sum() ** -0.5 < mean < longest**2 * (1 + SURE * APPROXIMATE):
+        return 0.0
+    doubt = np.hypot(np.hypot(*found.sigma), APPROXIMATE * mean)
+    if told.all() and abs(found.value[1] - found.value[0]) > SURE * doubt:
+        return 0.0
+    return min(float(np.sqrt(mean)), longest)
+
+
+def _in_words(camera: str, squared: float, sigma: float) -> str:
+    if not np.isfinite(sigma):
+        return ""
+    if squared > SURE * sigma:
+        return f"{camera} {1e6 * np.sqrt(squared):.0f} +- {5e5 * sigma / np.sqrt(squared):.0f} us"
+    return f"{camera} below {1e6 * np.sqrt(max(squared, 0.0) + SURE * sigma):.0f} us"
+
+
+def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]) -> Array:
+    """(n, 2, m, 2) [px/s^2] the bracket of the module's first equation; NaN at the ends and beside gaps."""
+    pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
+    affine = _affine(J, R)
+    velocity, acceleration = _rate(pixels, time), np.full_like(pixels, np.nan)
+    if len(pixels) > 2:
+        before, after = (np.diff(time)[part, None, None, None] for part in (slice(-1), slice(1, None)))
+        step = np.diff(pixels, axis=0)
+        acceleration[1:-1] = 2 * (step[1:] / after - step[:-1] / before) / (before + after)
+    known = np.isfinite(affine).all(axis=(-2, -1), keepdims=True)
+    affine = np.where(known, affine, np.eye(2))  # of a dot behind a camera; its rates are NaN
+    G = np.linalg.solve(affine, _rate(affine, time))
+    radius_px = 0.5 * disc.marker_diameter * np.sqrt(np.abs(np.linalg.det(affine)))
+    K = np.stack([_pull_of_smear(radius_px[:, camera], pull) for camera, pull in enumerate(pulls)], axis=1)[..., None]
+    v = np.linalg.solve(affine, velocity[..., None])[..., 0]
+    both = ((G + np.swapaxes(G, -1, -2)) @ v[..., None])[..., 0]
+    pulled = (K / 2 - 1) * both + (K / 2 + 1) * np.trace(G, axis1=-2, axis2=-1)[..., None] * v
+    return np.asarray(acceleration + (affine @ pulled[..., None])[..., 0])
+
+
+def _pull_of_smear(radius_px: Array, pull: Pull) -> Array:
+    """K of dots of these radii: by how much, over kappa, I'' of their edge looks like a shift to the template.
+
+    The first harmonic of the template's normal equations about a round dot, over its band of pixels and weighted by
+    their noise: of centre and slope of the light together.
+    """
+    sigma, (level, contrast) = pull.blur_px, pull.light
+    d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, RADII)  # as `_kernels` selects its pixels
+    edge = 1.0 - 0.5 * contrast * erfc(d / (np.sqrt(2.0) * sigma))
+    first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+    second = -d / sigma**2 * first
+    if not np.isfinite(radius_px).any():
+        return radius_px
+    sizes = np.linspace(np.nanmin(radius_px), np.nanmax(radius_px), SIZES)
+    K = np.empty(len(sizes))
+    for k, size in enumerate(sizes):
+        around = np.clip(size + d, 0.0, None)  # circumference over 2 pi
+        weight = around / pull.noise.variance(level * edge)
+        design = np.stack([first, around * edge])
+        K[k] = -np.linalg.solve(design * weight @ design.T, design @ (weight * second))[0] * size
+    return np.asarray(np.interp(radius_px, sizes, K))
+
+
+def _affine(J: Array, R: Array) -> Array:
+    """(n, 2, m, 2, 2) [px/m] disc's plane -> image: a step in the plane moves a dot as it moves the disc."""
+    return np.asarray(J[..., :3] @ R[:, None, None, :, :2])
+
+
+def _rate(values: Array, time: Array) -> Array:
+    """Central differences of `values` (n, ...) at `time` (n,) [s]; NaN at the ends and beside gaps."""
+    rate = np.full_like(values, np.nan)
+    if len(values) > 2:
+        rate[1:-1] = (values[2:] - values[:-2]) / (time[2:] - time[:-2]).reshape(-1, *[1] * (values.ndim - 1))
+    return rate
+
+
+def _smear(velocity: Array, affine: Array) -> Array:
+    """(n, 2, m) [px^2/s^2] variance that an exposure of 1 s adds to the edge, on the mean along it.
+
+    velocity (n, 2, m, 2) [px/s]; affine (n, 2, m, 2, 2) [px/m] from the disc's plane to the image.
+    """
+    angle = 2 * np.pi * np.arange(EDGE) / EDGE
+    tangent = affine @ np.stack([-np.sin(angle), np.cos(angle)])  # (n, 2, m, xy, EDGE)
+    length = np.hypot(tangent[..., 0, :], tangent[..., 1, :])
+    v = velocity[..., None]
+    outwards = (v[..., 0, :] * tangent[..., 1, :] - v[..., 1, :] * tangent[..., 0, :]) / length
+    return np.asarray((length * outwards**2).sum(axis=-1) / length.sum(axis=-1) / 12)
+
+
+def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
+    """Of y (n, m) over x (n, m), with its sigma: beside a constant of each column and slopes over `others` (n, m)."""
+    n, m = y.shape
+    use = np.isfinite(y) & np.isfinite([*others, x]).all(axis=0)
+    often = use.sum(axis=0) >= FEWEST
+    if n < FEWEST or not often.any():
+        return np.nan, np.inf
+    y, use, m = y[:, often].ravel(), use[:, often].ravel(), int(often.sum())
+    constants = np.broadcast_to(np.eye(m), (n, m, m))
+    rest = np.stack([*others, x], axis=-1)[:, often]
+    design = np.concatenate([constants, rest], axis=-1).reshape(n * m, -1)
+    scale = np.abs(design[use]).max(axis=0)
+    if not scale[-1] > 0:  # nothing moves
+        return np.nan, np.inf
+    scale[scale == 0.0] = 1.0
+    for _ in range(4):
+        told = use.copy()
+        A = design[told] / scale
+        solution = np.linalg.lstsq(A, y[told], rcond=None)[0]
+        residual = y - design / scale @ solution
+        size = 1.4826 * np.median(np.abs(residual[use]))
+        use &= np.abs(residual) <= OUTLYING * size
+    part = np.repeat(np.arange(n) * PARTS // n, m)
+    own = A[:, -1] - A[:, :-1] @ np.linalg.lstsq(A[:, :-1], A[:, -1], rcond=None)[0]
+    told_by = np.bincount(part[told], own**2, minlength=PARTS)
+    if not told_by.sum() ** 2 > LEAST_PARTS * np.sum(told_by**2):  # a sum over one or two stretches has no scatter
+        return np.nan, np.inf
+    inverse = np.linalg.pinv(A.T @ A)
+    score = design[use] / scale * residual[use, None]
+    sums = np.stack([score[part[use] == k].sum(axis=0) for k in range(PARTS)])
+    variance = (inverse @ (sums.T @ sums) @ inverse)[-1, -1]
+    return float(solution[-1] / scale[-1]), float(np.sqrt(variance) / scale[-1])
+
+
+def _standardised(x: Array) -> Array:
+    known = x[np.isfinite(x)]
+    spread = np.std(known) if known.size else 0.0
+    return np.asarray((x - np.mean(known)) / spread if spread else np.zeros_like(x))
 
 
 def _all_finite(values: Array) -> Mask:

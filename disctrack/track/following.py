@@ -54,6 +54,7 @@ class Law:
 
     noise: tuple[NoiseModel, NoiseModel] = (NoiseModel(1.0, 0.02), NoiseModel(1.0, 0.02))
     blur: tuple[float, float] = (TYPICAL_BLUR_PX, TYPICAL_BLUR_PX)
+    light: tuple[tuple[float, float], tuple[float, float]] = ((200.0, 0.85), (200.0, 0.85))  # paper's grey, contrast
     misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
 
     def limits(self, limits: TemplateLimits) -> TemplateLimits:
@@ -148,6 +149,7 @@ class Tables:
     status: NDArray[np.uint8]  # (n, 2, m)
     misfit: Array32  # (n, 2, m) reduced chi-square of the grey values round each dot
     n_pixels: Array32  # (n, 2, m) grey values that it was taken over
+    blur_px: Array32  # (n, 2, m) sigma of each dot's edge, smear of its motion included
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
     frame_status: NDArray[np.uint8]  # (n,)
@@ -265,6 +267,7 @@ def empty_tables(n: int, m: int) -> Tables:
         status=np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
         misfit=np.full((n, 2, m), np.nan, np.float32),
         n_pixels=np.full((n, 2, m), np.nan, np.float32),
+        blur_px=np.full((n, 2, m), np.nan, np.float32),
         R=np.full((n, 3, 3), np.nan),
         t=np.full((n, 3), np.nan),
         frame_status=np.full(n, FrameStatus.NOT_PROCESSED, np.uint8),
@@ -321,6 +324,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
     dots = dot_centres(results, rows.status)
     tables.pixels[own], tables.covariance_px2[own] = dots.pixels, dots.covariance_px2
     tables.misfit[own], tables.n_pixels[own] = dots.misfit, results[..., kernels.N_PIXELS]
+    tables.blur_px[own] = dots.blur_px
 
 
 def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, first: int) -> Mask:
@@ -469,7 +473,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
     """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
     setup, law = follower.setup, Law()
     n, m = min(NOISE_FRAMES, len(images)), setup.disc.n_markers
-    noise, blur = list(law.noise), list(law.blur)
+    noise, blur, light = list(law.noise), list(law.blur), list(law.light)
     views = list(enumerate(setup.rig.camera_poses()))
     for camera, (R_cw, t_cw) in views:
         # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
@@ -486,7 +490,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             noise[camera] = typical_noise(images[int(np.argmax(readable[:n, camera])), camera])
     misfit = 1.0
     for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
-        law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit)
+        law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit=misfit)
         trial = empty_rows(n, m)
         limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf, share=MOST_USUAL)
         done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
@@ -499,6 +503,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             if not len(fits):
                 continue
             blur[camera] = float(np.median(fits[:, kernels.FIT_SIGMA]))
+            light[camera] = tuple(np.median(fits[:, (kernels.FIT_LEVEL, kernels.FIT_CONTRAST)], axis=0).tolist())
             misfit = max(misfit, float(np.sqrt(np.median(fits[:, kernels.CHI_SQUARE]))))
             if not blur_known:
                 continue
@@ -516,7 +521,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
         _saturated(images[:done, 0], trial.results[:done, 0], noise[0]),
         _saturated(images[:done, 1], trial.results[:done, 1], noise[1]),
     )
-    follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1]), misfit))
+    follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1]), (light[0], light[1]), misfit))
 
 
 def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:

@@ -173,9 +173,10 @@ def measure(
     )
     unreadable = [not_read[place] for place in sorted(not_read)]
     seconds = time.perf_counter() - began
+    found = findings_of(tracking)
     findings = {
-        **findings_of(tracking),
-        "notes": [*pairs.notes, *exposure_source],
+        **found,
+        "notes": [*pairs.notes, *exposure_source, *found["notes"]],
         "warnings": list(dict.fromkeys([*pairs.warnings, *pairs.doubts, *tracking.doubts, *tracking.warnings])),
         "doubts": [*pairs.doubts, *tracking.doubts],
         "unreadable": [image.reason for image in unreadable],
@@ -192,7 +193,8 @@ def measure(
 def findings_of(tracking: Tracking) -> dict[str, Any]:
     """What tracking found out on the way, of JSON's types."""
     return {
-        "notes": [],
+        "notes": [tracking.exposure.note] if tracking.exposure.note else [],
+        "exposure_s": list(tracking.exposure.seconds),
         "warnings": list(tracking.warnings),
         "doubts": [],
         "unreadable": [],
@@ -219,14 +221,14 @@ def findings_of(tracking: Tracking) -> dict[str, Any]:
     }
 
 
-def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Of both cameras [s], 0 where nothing tells it; and where it is from, to be told."""
+def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
+    """Of both cameras [s], None where nobody tells it; and where it is from, to be told."""
     if recording.exposure is not None:
         return (recording.exposure, recording.exposure), ()
     headers = [header_of(reader) for reader in (pairs.left, pairs.right)]
-    left, right = (header.exposure or 0.0 if header is not None else 0.0 for header in headers)
-    if not (left or right):
-        return (0.0, 0.0), ()
+    left, right = (None if header is None else header.exposure for header in headers)
+    if left is None or right is None:
+        return None, ()
     return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} us (left, right) as the cameras' headers say",)
 
 

@@ -4,16 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, measure_pairs, read_recording, rolling
 from disctrack.errors import RecordingError
 from disctrack.render import render_disc
-from disctrack.track.exposure import shift_by_exposure
+from disctrack.track.dots import NoiseModel, locate_on_plane
+from disctrack.track.exposure import Pull, shift_by_exposure
 from disctrack.track.tracking import TrackingSettings
 from disctrack.trajectory import FrameStatus
 
 RATE, EXPOSURE = 1000.0, 1e-3  # Hz, s
 N = 40
+SIMPSON = np.array([1, 4, 2, 4, 2, 4, 2, 4, 1]) / 24
 
 
 @pytest.fixture(scope="module")
@@ -29,44 +32,72 @@ def motion(rendered_pairs):
 
 @pytest.fixture(scope="module")
 def measured(rendered_pairs, motion):
-    """The same images measured without and with their exposure, and the poses at mid exposure."""
+    """The poses at mid exposure; the same images measured with no exposure, theirs, an unknown and a wrong one."""
     q, qdot = motion
     cameras = replace(rendered_pairs.scene.cameras, exposure_s=EXPOSURE)
     scene = replace(rendered_pairs.scene, cameras=cameras)
     images = render_disc(
         q[:, 4], rendered_pairs.rig, rendered_pairs.disc, scene, np.random.default_rng(3), qdot=qdot[:N]
     )
-    told = [TrackingSettings(), TrackingSettings(exposure=(EXPOSURE, EXPOSURE))]
-    runs = [measure_pairs(images, rendered_pairs.rig, rendered_pairs.disc, RATE, settings=each) for each in told]
-    return q[:, 4], [run.trajectory for run in runs]
+    told = [(0.0, 0.0), (EXPOSURE, EXPOSURE), None, (0.2e-3, 0.2e-3)]
+    return q[:, 4], [
+        measure_pairs(
+            images, rendered_pairs.rig, rendered_pairs.disc, RATE, settings=TrackingSettings(exposure=exposure)
+        )
+        for exposure in told
+    ]
 
 
-def test_the_shift_is_the_mean_over_the_exposure(motion, measured, rendered_pairs):
-    """Against the quadrature (Simpson) of the dots' images along the simulated motion, gap and ends included."""
-    q, (trajectory, _) = motion[0], measured[1]
+def _seen(centres, affine, dark, blur_px):
+    """Image (64, 64) of a dot, the mean over its outlines: centres (k, 2) [px], affine (k, 2, 2) unit circle -> px."""
+    fine, total = 6, 0.0
+    axis = (np.arange(64 * fine) + 0.5) / fine - 0.5
+    pixels = np.stack(np.meshgrid(axis, axis), axis=-1)
+    for weight, centre, A in zip(SIMPSON, centres, affine, strict=True):
+        u = (pixels - centre) @ np.linalg.inv(A).T
+        distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(A))) * fine
+        total = total + weight * np.clip(distance + 0.5, 0, 1)
+    smooth = gaussian_filter(total, blur_px * fine).reshape(64, fine, 64, fine).mean((1, 3))
+    return np.round(50000 - (50000 - dark) * smooth).astype(np.uint16)
+
+
+@pytest.mark.parametrize(("dark", "noise"), [(10000, NoiseModel(4e5, 0.0)), (5000, NoiseModel(1e4, 8.0))])
+def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
+    """Against dots drawn along the simulated motion (no renderer, no formula), found by their template."""
+    q, rig, disc = motion[0], rendered_pairs.rig, rendered_pairs.disc
     R = frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
-    points = rendered_pairs.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[..., None, :3]
-    pixels = rendered_pairs.rig.project(points.reshape(-1, *points.shape[2:])).reshape(*q.shape[:2], 2, -1, 2)
-    weights = np.array([1, 4, 2, 4, 2, 4, 2, 4, 1]) / 24
-    expected = np.einsum("nkcmi,k->ncmi", pixels, weights) - pixels[:, 4]
-    status = trajectory.frame_status.copy()
-    status[20] = FrameStatus.CONTRADICTED
-    exact = replace(
-        trajectory,
-        q=q[:, 4],
-        quaternion=frames.quaternion_from_rotation(R[:, 4]),
-        frame_status=status,
-        rig=rendered_pairs.rig,
-        disc=rendered_pairs.disc,
-    )
-    found = shift_by_exposure(exact, (EXPOSURE, EXPOSURE))
+    known, where = R[:, 4].copy(), q[:, 4, :3].copy()
+    known[20], where[20] = np.nan, np.nan
+    pull = Pull(0.65, (50000.0, 1 - dark / 50000), noise)
+    exposures = np.array([EXPOSURE, EXPOSURE])
+    found = shift_by_exposure(known, where, np.arange(N) / RATE, exposures, rig, disc, (pull, pull))
     assert not found[20].any()
-    inner = np.setdiff1d(np.arange(1, N - 1), [19, 20, 21])
-    size = np.abs(expected).max()
-    assert size > 0.002  # px: g (2 T)^2 / 24 of the outermost dots, at some 4 px/mm
-    # differences over three frames and the fourth order of the exposure: (psidot / rate)^2 (1/12 + 1/80) of the shift
-    assert np.abs(found - expected)[inner].max() < 0.01 * size
-    assert np.abs(found - expected)[[0, 19, 21, N - 1]].max() < 0.25 * size  # a neighbour's, turned by psidot dt
+
+    turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    edge = 0.5 * disc.marker_diameter * np.column_stack([circle, np.zeros(16)])
+    expected, by_path, given = [], [], []
+    for frame, dot in ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4)):
+        points = np.concatenate([disc.marker_centres_body[[dot]], disc.marker_centres_body[dot] + edge])
+        outlines = rig.project(points @ np.swapaxes(R[frame], -1, -2) + q[frame, :, None, :3])  # (9, 2, 17, 2)
+        for camera in range(2):
+            centres, edges = outlines[:, camera, 0], outlines[:, camera, 1:]
+            affine = np.swapaxes(edges - centres[:, None], 1, 2) @ circle / 8
+            window = np.round(centres[4]) - 31
+            H = np.eye(3)
+            H[:2, :2], H[:2, 2] = affine[4], centres[4] - window
+            seen = [_seen(centres[k] - window, affine[k], dark, 0.6) for k in (np.arange(9), [4] * 9)]
+            smeared, still = (
+                locate_on_plane(image, H, np.zeros((1, 2)), 1.0, noise=noise, blur_px=0.65).pixels[0] for image in seen
+            )
+            expected.append(smeared - still)
+            by_path.append(SIMPSON @ centres - centres[4])
+            given.append(found[frame, camera, dot])
+    expected, by_path, given = np.array(expected), np.array(by_path), np.array(given)
+    size = np.sqrt(np.mean(expected**2))
+    assert size > 0.002  # px
+    assert np.sqrt(np.mean((given - expected) ** 2)) < 0.25 * size
+    assert np.sqrt(np.mean((by_path - expected) ** 2)) > 0.4 * size  # the mean of the path alone is not what is found
 
 
 def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
@@ -82,15 +113,42 @@ def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
 def test_theta_is_that_of_mid_exposure(measured, rendered_pairs):
     q, runs = measured
     expected = -9.81 * EXPOSURE**2 / (6 * rendered_pairs.disc.radius)  # steady precession, exposure.py
-    errors = [run.q[:, 4] - q[:, 4] for run in runs]
-    sigma = np.sqrt(np.mean(runs[0].pose_covariance[:, 3, 3] + runs[0].pose_covariance[:, 4, 4]) / 2 / N)
+    none, told, smeared, _ = (run.trajectory for run in runs)
+    errors = [trajectory.q[:, 4] - q[:, 4] for trajectory in (none, told, smeared)]
+    sigma = np.sqrt(np.mean(none.pose_covariance[:, 3, 3] + none.pose_covariance[:, 4, 4]) / 2 / N)
     assert abs(expected) > 8 * sigma
-    assert np.mean(errors[0]) == pytest.approx(expected, abs=4 * sigma)  # the fault is there when nobody tells
+    assert np.mean(errors[0]) == pytest.approx(expected, abs=4 * sigma)  # the fault is there when it is said to be nil
     assert np.mean(errors[1]) == pytest.approx(0.0, abs=4 * sigma)
+    assert np.mean(errors[2]) == pytest.approx(0.0, abs=4 * sigma)  # nobody tells
+
+
+def test_the_smear_tells_the_exposure(measured):
+    _, (none, told, smeared, wrong) = measured
+    assert smeared.findings["exposure_s"] == pytest.approx([EXPOSURE, EXPOSURE], rel=0.1)
+    assert "exposure by the smear" in smeared.findings["notes"][0]
+    assert told.findings["exposure_s"] == [EXPOSURE, EXPOSURE]
+    assert not [text for text in told.findings["warnings"] if "smear" in text]
+    for run, said in ((none, "0 and 0 us"), (wrong, "200 and 200 us")):
+        (warning,) = [text for text in run.findings["warnings"] if "smear" in text]
+        assert said in warning
+
+
+def test_no_smear_where_nothing_was_smeared(rendered_pairs, motion):
+    """Negative control: the same motion frozen at mid exposure, and as an exposure too short to be seen."""
+    q, qdot = motion
+    for exposure, moving in ((EXPOSURE, None), (20e-6, qdot[:N])):
+        scene = replace(rendered_pairs.scene, cameras=replace(rendered_pairs.scene.cameras, exposure_s=exposure))
+        images = render_disc(
+            q[:, 4], rendered_pairs.rig, rendered_pairs.disc, scene, np.random.default_rng(4), qdot=moving
+        )
+        run = measure_pairs(images, rendered_pairs.rig, rendered_pairs.disc, RATE)
+        assert run.findings["exposure_s"] == [0.0, 0.0]
+        assert run.findings["notes"] == []
 
 
 def test_noise_hardly_grows(measured):
-    _, (without, corrected) = measured
-    scatter = [np.std(np.diff(run.markers_px, n=3, axis=0)) for run in (without, corrected)]
-    assert scatter[1] == pytest.approx(scatter[0], rel=0.05)
-    assert (corrected.frame_status == FrameStatus.MEASURED).all()
+    without, *corrected = (run.trajectory for run in measured[1][:3])
+    for each in corrected:
+        scatter = [np.std(np.diff(run.markers_px, n=3, axis=0)) for run in (without, each)]
+        assert scatter[1] == pytest.approx(scatter[0], rel=0.05)
+        assert (each.frame_status == FrameStatus.MEASURED).all()
