@@ -133,8 +133,8 @@ def _to_mid_exposure(tables: Tables, first: Follower, settings: TrackingSettings
     found = exposure_by_smear(*where, tables.blur_px, rig, disc)
     exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
     if any(exposure.seconds):
-        blur = np.nanmedian(tables.blur_px, axis=(0, 2)).tolist()
-        left, right = (Pull(*seen) for seen in zip(blur, first.law.light, first.law.noise, strict=True))
+        law = first.law
+        left, right = (Pull(*seen) for seen in zip(law.blur, law.light, law.noise, strict=True))
         tables.pixels -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, (left, right))
     return exposure
 

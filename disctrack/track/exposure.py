@@ -23,10 +23,10 @@ the exposure.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erfc
 
 from calibration.arrays import Array, Array32, Mask
 from calibration.camera import StereoRig
@@ -201,7 +201,7 @@ def _pull_of_smear(radius_px: Array, pull: Pull) -> Array:
     """
     sigma, (level, contrast) = pull.blur_px, pull.light
     d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, RADII)  # as `_kernels` selects its pixels
-    edge = 1.0 - 0.5 * contrast * erfc(d / (np.sqrt(2.0) * sigma))
+    edge = 1.0 - 0.5 * contrast * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])
     first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
     second = -d / sigma**2 * first
     if not np.isfinite(radius_px).any():

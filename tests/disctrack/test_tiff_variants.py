@@ -14,7 +14,7 @@ from disctrack.readers import open_frames
 
 DEEP = np.random.default_rng(2).integers(0, 4096, (4, 37, 53)).astype(np.uint16)
 FRAMES = {8: (DEEP >> 4).astype(np.uint8), 16: DEEP}
-PACKINGS = [{}, {"compression": "lzw", "predictor": 2}, {"compression": "packbits"}, {"tile": (16, 16)}]
+PACKINGS = [{}, {"compression": "deflate", "predictor": 2}, {"tile": (16, 16)}]
 
 
 def read(folder):
@@ -51,6 +51,21 @@ def test_white_is_zero_as_pillow_sees_it(tmp_path):
     assert_array_equal(read(folder)[0], np.array(Image.open(folder / "0.tif")))
 
 
+@pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
+@pytest.mark.parametrize("bits", FRAMES)
+@pytest.mark.parametrize("stack", [False, True])
+def test_white_is_zero_in_what_pillow_packs(tmp_path, bits, compression, stack):
+    black, white = (struct.pack("<HHI", 262, 3, 1) + bytes([number]) for number in (1, 0))
+    pictures = [Image.fromarray(frame) for frame in FRAMES[bits]]
+    for i, picture in enumerate(pictures[:1] if stack else pictures):
+        file, rest = tmp_path / f"{i}.tif", pictures[1:] if stack else []
+        picture.save(file, save_all=stack, append_images=rest, compression=compression)
+        content = file.read_bytes()
+        assert content.count(black) == 1 + len(rest)
+        file.write_bytes(content.replace(black, white))
+    assert_array_equal(read(tmp_path), ~FRAMES[bits])
+
+
 @pytest.mark.parametrize("packing", PACKINGS, ids=str)
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orientation, packing):
@@ -68,12 +83,12 @@ def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orienta
     ("code", "name"), [(34712, "JPEG 2000"), (34933, "PNG"), (50000, "Zstandard"), (40000, "unkn")]
 )
 def test_pixels_by_an_unknown_method_are_refused_by_name_and_never_black(tmp_path, written, code, name):
-    folder = written(tmp_path / "frames", FRAMES[8], compression="packbits")
+    folder = written(tmp_path / "frames", FRAMES[8], compression="zlib")
     for file in folder.iterdir():
-        packbits, other = (struct.pack("<HHII", 259, 3, 1, number) for number in (32773, code))
+        deflate, other = (struct.pack("<HHII", 259, 3, 1, number) for number in (8, code))
         content = file.read_bytes()
-        assert packbits in content
-        file.write_bytes(content.replace(packbits, other))
+        assert deflate in content
+        file.write_bytes(content.replace(deflate, other))
     with pytest.raises(RecordingError, match=rf"compressed by a method \({code}, {name}"):
         read(folder)
 
