@@ -36,7 +36,7 @@ from disctrack.track.dots import NoiseModel
 from disctrack.track.pose import marker_pixels
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
-OF_SMEAR = 1500  # frames at most that the smear is taken from
+OF_SMEAR = 500  # frames at most that the smear is taken from
 PARTS = 10  # stretches of the recording: what the fit leaves has a memory, its sum over a stretch scatters as it does
 LEAST_PARTS = 4.0  # that the motion is spread over: (sum w)^2 / sum w^2 of what each tells
 FEWEST = 2 * PARTS  # frames
@@ -110,17 +110,16 @@ def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array32, rig: St
     """
     every = max(1, -(-len(t) // OF_SMEAR))
     chosen = np.arange(0, len(t), every)
-    rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))
+    rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))  # with their neighbours
+    own = np.searchsorted(rows, chosen)
     pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
-    velocity = _rate(pixels, time[rows])
-    velocity[~np.isin(rows, chosen)] = np.nan  # these are only there as neighbours of the chosen ones
-    smear = _smear(velocity, _affine(J, R[rows]))
-    points = disc.marker_centres_body @ np.swapaxes(R[rows], 1, 2) + t[rows, None]
+    smear = _smear(_rate(pixels, time[rows])[own], _affine(J[own], R[chosen]))
+    points = disc.marker_centres_body @ np.swapaxes(R[chosen], 1, 2) + t[chosen, None]
     value, sigma = np.full(2, np.nan), np.full(2, np.inf)
     for camera, (R_camera_world, t_camera_world) in enumerate(rig.camera_poses()):
         distance = points @ R_camera_world[2] + t_camera_world[2]
-        optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[:, camera], -1, 0))]
-        squared = np.asarray(blur_px[rows, camera], float) ** 2
+        optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0))]
+        squared = np.asarray(blur_px[chosen, camera], float) ** 2
         value[camera], sigma[camera] = _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
     return ExposureSquared(value, sigma)
 
