@@ -252,11 +252,11 @@ def _beyond_the_catalogue(
     best = min((a for a in answers if a is not None), key=lambda a: (not a.fit.converged, a.length), default=None)
     if best is None:
         return None, (), ()
-    law, system, fitted = best.law, best.system, best.fit
+    plain, law, system, fitted = system, best.law, best.system, best.fit
     law = replace(law, rivals=_rivals(best, [a for a in answers if a is not best], diagnosis, explained))
     judged = _judged(diagnosis, system)
     saved = known - best.length
-    if not (fitted.converged and saved > 0):
+    if not (fitted.converged and saved > 0) or _one_alone_does(plain, diagnosis, of_motion, best):
         return None, (), _also(diagnosis, law, fitted)
     rows = training_rows(system, diagnosis.settings.train_fraction)
     held = held_out(judged, fitted.quantities, fitted.values, rows)
@@ -273,6 +273,26 @@ def _beyond_the_catalogue(
             f"{saved:.4g}"
         )
     return Learned(law, fitted, held, gain, float(held_gain), power), best.kept, tuple(notes)
+
+
+def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequence[Found], best: _Beside) -> bool:
+    """True where a known effect alone describes what the law does, to the price of a number: it is that effect."""
+    if len(diagnosis.found) < 2:
+        return False  # which has competed by itself
+    judged = _judged(diagnosis, system)
+    most = best.fit.cost + diagnosis.noise * float(np.log(np.sum(system.weights)))
+    faults = tuple(f for f in best.kept if f.candidate.kind != "motion")
+    others = {q.name for f in diagnosis.found for q in f.candidate.quantities}
+    for found in of_motion:
+        if found in best.kept:
+            continue
+        beside = _beside_them(diagnosis.before, (*faults, found))
+        own = {q.name for q in beside.quantities}
+        start = {name: value for name, value in diagnosis.after.values.items() if name in own or name not in others}
+        alone = fit(judged, beside.quantities, start)
+        if alone.converged and alone.cost <= most:
+            return True
+    return False
 
 
 def _length(system: DiscSystem, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
