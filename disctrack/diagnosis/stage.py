@@ -35,6 +35,7 @@ from disctrack.diagnosis.engine.memory import with_memory
 from disctrack.diagnosis.engine.score import Linearisation, score_all
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings
 from disctrack.diagnosis.engine.shape import refine_shapes
+from disctrack.diagnosis.engine.significance import price_of_a_number
 from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import law_text, sentence
@@ -280,7 +281,7 @@ def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequenc
     if len(diagnosis.found) < 2:
         return False  # which has competed by itself
     judged = _judged(diagnosis, system)
-    most = best.fit.cost + diagnosis.noise * float(np.log(np.sum(system.weights)))
+    most = best.fit.cost + diagnosis.noise * price_of_a_number(system.weights)
     faults = tuple(f for f in best.kept if f.candidate.kind != "motion")
     others = {q.name for f in diagnosis.found for q in f.candidate.quantities}
     for found in of_motion:
@@ -298,7 +299,7 @@ def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequenc
 def _length(system: DiscSystem, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
     """Chi-square with the price of the fitted numbers and, where one explains all, of having picked known effects."""
     numbers = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
-    length = fitted.cost / diagnosis.noise + numbers * float(np.log(np.sum(system.weights)))
+    length = fitted.cost / diagnosis.noise + numbers * price_of_a_number(system.weights)
     if diagnosis.verdict == "found":  # both were looked for, among so many laws, and among so many effects
         length += 2.0 * float(np.log(len(diagnosis.tried))) * len(found)
     return length

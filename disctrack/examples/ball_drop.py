@@ -26,6 +26,7 @@ from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out
 from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, estimate
 from disctrack.diagnosis.engine.search import CLASS_GAIN
+from disctrack.diagnosis.engine.significance import price_of_a_number
 from disctrack.diagnosis.engine.system import Subset
 from disctrack.diagnosis.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.diagnosis.equations.system import EquationSystem
@@ -202,7 +203,7 @@ def _form(answer: Answer, effects: tuple[str, ...]) -> Form:
     new = tuple(q for c in system.candidates if c.name in effects for q in c.quantities)
     fitted = fit(system, (*system.base, *new), base.values)
     held = held_out(system, fitted.quantities, fitted.values, system.training)
-    criterion = fitted.cost + len(new) * np.log(np.sum(system.weights))
+    criterion = fitted.cost + len(new) * price_of_a_number(system.weights)
     return Form(effects, fitted, float(criterion), held.log_density)
 
 

@@ -24,7 +24,7 @@ from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, fit, prior_rows, triangle
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
 from disctrack.diagnosis.engine.shape import profiled
-from disctrack.diagnosis.engine.significance import as_sigmas
+from disctrack.diagnosis.engine.significance import as_sigmas, price_of_a_number
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
 from disctrack.rolling import Model, simulate
 from disctrack.rolling.effects import Effect, EffectParameter, effect_from_formulas
@@ -317,7 +317,7 @@ def learn(
     only one that may, to first order, come as near to the data
     """
     name = _free_name(system.model)
-    price = float(np.log(np.sum(system.weights)))
+    price = price_of_a_number(system.weights)
     rate = float(1.0 / np.median(np.diff(system.time)))
     law: LearnedLaw | None = None
     current, length, alike = base, base.cost / noise, tuple[str, ...]()
@@ -376,7 +376,7 @@ def shortest_to_first_order(system: DiscSystem, base: Fit, along: Fit, noise: fl
     scan = _Scan(system, along, base.quantities)
     rate = float(1.0 / np.median(np.diff(system.time)))
     library = list(families(scan.motion.q, scan.motion.time, rate, system.disc))
-    price, looked = float(np.log(np.sum(system.weights))), 2.0 * float(np.log(len(library)))
+    price, looked = price_of_a_number(system.weights), 2.0 * float(np.log(len(library)))
     proposals = scan.proposals(family for family in library if not family.shape)
     nearest = min((scan.chi_square - p.gain) / noise + price * p.family.n_numbers for p in proposals)
     return nearest + looked + price * sum(not np.isfinite(q.prior_sigma) for q in base.quantities)
@@ -484,7 +484,7 @@ def _stability(system: DiscSystem, law: LearnedLaw, fitted: Fit, noise: float) -
         triangle(stacked[r].reshape(-1, stacked.shape[-1])) for r in np.array_split(np.arange(len(stacked)), PARTS)
     ]
     rng = np.random.default_rng(PARTS)
-    price = float(np.log(np.sum(system.weights)))
+    price = price_of_a_number(system.weights)
     counts = np.zeros(len(law.families))
     for _ in range(RESAMPLES):
         drawn = rng.permutation(PARTS)[: PARTS // 2]

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.motion import state_of
@@ -33,7 +32,6 @@ DURATIONS = (0.5, 1.0)  # [s]
 NUTATION_SHARE = 0.05  # amplitude of the nutation oscillation over the nutation angle
 SEEN = 1e-6  # share of a column that is left after clearing, below which nothing is seen of it
 ENOUGH = 5.0  # sigmas from which on a recording answers a question
-UPPER = float(stats.norm.isf(0.025))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_ou
 from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_all, score_pairs
-from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, Values, hurried
+from disctrack.diagnosis.engine.significance import TWO_SIDED
+from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, Values, hurried, several_minima
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
@@ -30,7 +31,6 @@ MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
 SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
-TWO_SIDED = float(stats.norm.isf(0.025))
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -150,7 +150,7 @@ class _Search:
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
         self.refits: dict[str, Trial] = {}
-        self.rough = bool(getattr(system, "several_minima", False))
+        self.rough = several_minima(system)
         self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
         self.free_runs: list[tuple[Fit, HeldOut]] = []
 
@@ -538,7 +538,7 @@ def _near_enough(system: System, base: Fit) -> bool:
     Where equations jump, chi-square is rough: far above the noise no step may lead to the bottom of a rough valley.
     """
     excess = base.chi_square - base.degrees_of_freedom
-    return bool(getattr(system, "several_minima", False) and base.promised < ROUGH * excess)
+    return several_minima(system) and base.promised < ROUGH * excess
 
 
 def _refusal(base: Fit, settings: Settings) -> Diagnosis:

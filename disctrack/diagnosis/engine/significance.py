@@ -9,6 +9,7 @@ from scipy import special, stats
 
 from calibration.arrays import Array
 
+TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 LARGE = 500.0  # chi-square beyond which its tail is taken from the asymptotic series: the probability underflows
 
 
@@ -21,6 +22,11 @@ def log_tail(gain: float, n: int) -> float:
     x, a = gain / 2, n / 2  # Gamma(a, x) = x^(a-1) e^-x (1 + (a-1)/x + (a-1)(a-2)/x^2 + ...)
     series = 1 + (a - 1) / x + (a - 1) * (a - 2) / x**2 + (a - 1) * (a - 2) * (a - 3) / x**3
     return float((a - 1) * np.log(x) - x + np.log(series) - special.gammaln(a))
+
+
+def price_of_a_number(weights: Array) -> float:
+    """Chi-square that one more number has to gain, of samples with these weights (n,) (Schwarz 1978)."""
+    return float(np.log(np.sum(weights)))
 
 
 def as_sigmas(gain: float, n: int) -> float:

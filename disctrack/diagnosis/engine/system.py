@@ -107,6 +107,11 @@ def hurried(system: System, share: float = 1.0) -> System:
     return system if of is None else of(share)
 
 
+def several_minima(system: System) -> bool:
+    """May fits of the same quantities end in different minima? Not where the system does not say so."""
+    return bool(getattr(system, "several_minima", False))
+
+
 class Wrapped:
     """A system as another sees it: all as it is, but for what a subclass changes."""
 
@@ -146,7 +151,7 @@ class Wrapped:
     @property
     def several_minima(self) -> bool:
         """As the system's: may fits of the same quantities end in different minima?"""
-        return bool(getattr(self._system, "several_minima", False))
+        return several_minima(self._system)
 
     def hurried(self, share: float) -> Wrapped:
         """As the system's."""

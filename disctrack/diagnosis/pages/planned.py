@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.diagnosis.disc.plan import ENOUGH, UPPER, Plan, Question
+from disctrack.diagnosis.disc.plan import ENOUGH, Plan, Question
+from disctrack.diagnosis.engine.significance import TWO_SIDED
 from disctrack.diagnosis.pages.words import quantity_text
 from disctrack.pages.html import bullets, details, paragraph, table
 
@@ -86,7 +87,7 @@ def _sentence(plan: Plan, i: int) -> str:
 
 
 def _limit(sigma: float, unit: str) -> str:
-    return quantity_text(float(f"{UPPER * sigma:.2g}"), 0.0, unit) if np.isfinite(sigma) else "nothing"
+    return quantity_text(float(f"{TWO_SIDED * sigma:.2g}"), 0.0, unit) if np.isfinite(sigma) else "nothing"
 
 
 def as_json(plan: Plan | None) -> dict[str, Any] | None:

@@ -14,9 +14,9 @@ from disctrack.diagnosis.disc.systematic import Systematic
 from disctrack.diagnosis.engine.correlated import Correlated, correlated
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Diagnosis, Found
+from disctrack.diagnosis.engine.significance import TWO_SIDED
 from disctrack.diagnosis.engine.system import Quantity
 
-SEEN = 1.96  # standard deviations within which a number may be nought
 SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
 _PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
 _PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
@@ -72,14 +72,14 @@ def bounds(found: Found, fit: Fit) -> list[str]:
         name, value, sigma = shown(q, fit)
         if q.name.startswith("state.") or q.name == SLIP or q.null != 0.0:  # a limit is no size
             continue
-        if not sigma > 0 or abs(value) >= SEEN * sigma:
+        if not sigma > 0 or abs(value) >= TWO_SIDED * sigma:
             continue
         i = fit.names.index(q.name)
         shared = np.abs(fit.covariance[i]) / np.where(spread > 0, spread, np.inf) / spread[i]
         shared[i] = 0.0
         partner = int(np.argmax(shared))
         why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise"
-        most = quantity_text(abs(value) + SEEN * sigma, 0.0, q.unit)
+        most = quantity_text(abs(value) + TWO_SIDED * sigma, 0.0, q.unit)
         texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
     return texts
 

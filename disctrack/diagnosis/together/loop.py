@@ -19,6 +19,7 @@ from disctrack.diagnosis.disc.plan import Plan, Question
 from disctrack.diagnosis.engine.fit import Fit, triangle
 from disctrack.diagnosis.engine.score import Linearisation, cleared, score_all, span
 from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.engine.significance import TWO_SIDED
 from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses
 from disctrack.diagnosis.together.crew import Crew
@@ -31,7 +32,6 @@ from disctrack.errors import AnalysisError, DiscTrackError
 TEST_EVERY = 3  # of the recordings, every so many is foretold from the others
 ROUNDS = 3  # of leaving recordings out
 NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
-UPPER = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 OPEN = 6  # questions that further recordings are sought for
 OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
 
@@ -233,7 +233,7 @@ def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
         else:
             values, sigma = scores[c.name].values, scores[c.name].sigma
         single = len(c.names) == 1 and c.name not in found and bool(np.isfinite(sigma[0]))
-        upper = float(abs(values[0] - c.quantities[0].null) + UPPER * sigma[0]) if single else None
+        upper = float(abs(values[0] - c.quantities[0].null) + TWO_SIDED * sigma[0]) if single else None
         bounds.append(Bound(c, values, sigma, by_number, upper))
     return tuple(bounds)
 
