@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import trapezoid
 
 from disctrack.analyse.contact import analyse_contact, contact_quantities
 from disctrack.analyse.derivatives import differentiate
@@ -138,7 +139,7 @@ def test_sliding_friction_is_measured_and_its_end_found(slip_to_roll, true_motio
     contact = analyse_contact(differentiate(trajectory))
     assert abs(contact.onset.time - switch.time) < 1.5e-3  # one frame, and the tolerance's share
     assert contact.onset.high - contact.onset.low < 5e-3
-    path = np.trapezoid(np.hypot(*simulated.slip_velocity.T), simulated.time)
+    path = trapezoid(np.hypot(*simulated.slip_velocity.T), simulated.time)
     assert_allclose(contact.onset.slip_distance, path, rtol=1e-3)
     motion = differentiate(trajectory, breaks=(contact.onset.time,))
     propagated = analyse_contact(motion).propagated

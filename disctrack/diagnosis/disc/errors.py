@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.system import DiscSystem
@@ -130,8 +131,8 @@ def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
     for effect in motion.model.effects:
         if effect.law is not None:
             power = effect_power(effect, k, motion.contact_force[:, 2])
-            balance[f"by {effect.name}"] = float(-np.trapezoid(power, motion.time))
+            balance[f"by {effect.name}"] = float(-trapezoid(power, motion.time))
     if np.any(motion.slip_velocity):
         power = np.sum(motion.contact_force[:, :2] * motion.slip_velocity, axis=1)
-        balance["by slip"] = float(-np.trapezoid(power, motion.time))
+        balance["by slip"] = float(-trapezoid(power, motion.time))
     return balance
