@@ -285,6 +285,11 @@ def inverse_covariance(covariance: Array, extra: float) -> Array:
     return result
 
 
+# Of chi-square: a thousandth of a sigma. Rounding hides so much where no step is taken any more: chi-square is a sum of
+# squared differences of pixels that are a million times as large.
+ROUNDED_AWAY = 1e-6
+
+
 @dataclass(frozen=True)
 class Minimum:
     """Where Levenberg-Marquardt ended."""
@@ -313,6 +318,7 @@ def minimise(
         want the model alone
     """
     model, normal = start, problem.linearise(start) if normal is None else normal
+    to_gain = np.inf  # by the last step that was hardly damped
     if not np.isfinite(normal.cost):
         raise CalibrationError(
             "the start of the refinement puts the board behind a camera: check the order of the views"
@@ -320,6 +326,7 @@ def minimise(
     for iteration in range(1, iterations + 1):
         shared, poses = normal.solve(damping)
         gain = float(shared @ normal.gradient.sum(0) + np.sum(poses * normal.pose_gradient))
+        to_gain = gain if damping < 1e-2 else to_gain
         trial = problem.stepped(model, shared, poses)
         small = gain <= tolerance * max(normal.cost, 1.0)
         if rough and small and damping < 1e-4:
@@ -331,8 +338,8 @@ def minimise(
                 return Minimum(model, normal, iteration, True)
         else:
             if small:
-                return Minimum(model, normal, iteration, damping < 1e-2)
+                return Minimum(model, normal, iteration, damping < 1e-2 or to_gain <= ROUNDED_AWAY)
             damping *= 10.0
             if damping > 1e10:
                 break
-    return Minimum(model, normal, iterations, False)
+    return Minimum(model, normal, iterations, to_gain <= ROUNDED_AWAY)

@@ -11,7 +11,7 @@ from calibration import CalibrationError, Terms, refine_stereo
 from calibration.assessment import consistency_factor, half_set_differences
 from calibration.camera import N_RIG
 from calibration.model_choice import choose_board
-from calibration.normal_equations import Problem
+from calibration.normal_equations import Problem, minimise
 from calibration.start import start_stereo
 from calibration.stereo_model import board_basis, moved, predict
 from calibration.table_frame import rig_with_covariance, table_pose
@@ -67,6 +67,19 @@ def true_rig(scene, view, thickness):
         R_left_world=R,
         t_left_world=t,
     )
+
+
+def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(scene_maker, rng):
+    """No tolerance can be met where rounding moves chi-square by more: pixels 0.7 wide ended so, in a warning."""
+    scene = scene_maker(n_views=8)
+    found = refine_stereo(scene.observations(0.005), scene.model, scene.board.points, FULL)
+    impossible = [
+        minimise(found.problem, disturbed(scene, rng, size), tolerance=0.0, damping=1e-6, iterations=iterations)
+        for size, iterations in ((0.01, 60), (0.01, 60), (0.01, 60), (1.0, 3))
+    ]
+    assert [m.converged for m in impossible] == [True, True, True, False]
+    costs = [m.normal.cost for m in impossible]
+    assert np.ptp(costs[:3]) < 1e-6 < costs[3] - costs[0]
 
 
 def test_derivatives_agree_with_central_differences(scene_maker, rng):
