@@ -181,7 +181,8 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> _Blocks
     residual, derivative = system.linearise(fit_.values, fit_.names)
     right, matrix = prior_rows(fit_.quantities, fit_.values)
     if other is not None:
-        residual, right = residual - system.linearise(other, [])[0], np.zeros_like(right)
+        residual = residual - system.linearise(other, [])[0]
+        right = right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]  # numbers strained before may relax
     bells = np.exp(-0.5 * ((motion.time[:, None] - middles) / (WIDTH * span / k)) ** 2)
     courses = np.zeros((len(bells), len(COMPONENTS), len(AXES), k))
     for i in range(len(AXES)):

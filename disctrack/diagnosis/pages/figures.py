@@ -187,6 +187,8 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
             " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the "
             "other fitted numbers cannot take up, so that a steady part, along n0 above all, is smaller in red."
             if result.learned is not None
+            else " Blue is what was found, read in the same way: within the band it is what was missing."
+            if law is not None
             else ""
         )
     )
