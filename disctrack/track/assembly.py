@@ -90,7 +90,7 @@ def assemble(
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
-    exposure = _to_mid_exposure(tables, first, settings, taken)
+    exposure = _to_mid_exposure(tables, first, settings, taken, workers)
     _clean(tables, repeated, first.setup.rig)
     as_built, faults, outlying = _shared(tables, first.setup, settings, workers)
     fits = _fit_all(tables, as_built, settings.reject_outliers, workers)
@@ -127,10 +127,12 @@ def assemble(
     )
 
 
-def _to_mid_exposure(tables: Tables, first: Follower, settings: TrackingSettings, taken: Taken) -> Exposure:
+def _to_mid_exposure(
+    tables: Tables, first: Follower, settings: TrackingSettings, taken: Taken, workers: int
+) -> Exposure:
     """Move the dots to where they were in the middle of the exposure, and tell by which exposure."""
     where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
-    found = exposure_by_smear(*where, tables.blur_px, rig, disc)
+    found = exposure_by_smear(*where, tables.blur_px, rig, disc, workers)
     exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
     if any(exposure.seconds):
         law = first.law
@@ -173,9 +175,10 @@ def _refined(
     R, t = (np.where(outlying.reshape(-1, *[1] * (part.ndim - 1)), np.nan, part) for part in (tables.R, tables.t))
     seen = tables.pixels, tables.covariance_px2, setup.rig, setup.disc, R, t
     as_built = partial(refine_as_built, refine_markers=settings.refine_markers, refine_rig=settings.refine_rig)
-    refinements: tuple[Callable[..., Any], ...] = (without_shared_faults, as_built)  # the longer one first
-    faults, built = side_by_side(lambda refine: refine(*seen, max_frames=SHARED_FRAMES), refinements, workers)
-    return built, faults
+    faults = partial(without_shared_faults, workers=workers)
+    refinements: tuple[Callable[..., Any], ...] = (faults, as_built)  # the longer one first
+    found, built = side_by_side(lambda refine: refine(*seen, max_frames=SHARED_FRAMES), refinements, workers)
+    return built, found
 
 
 def _scattered(

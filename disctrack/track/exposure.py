@@ -33,7 +33,9 @@ from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
 from disctrack.track.dots import NoiseModel
+from disctrack.track.least_squares import inner_products
 from disctrack.track.pose import marker_pixels
+from disctrack.track.side_by_side import side_by_side
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
 OF_SMEAR = 500  # frames at most that the smear is taken from
@@ -45,6 +47,7 @@ BAND = 3.0  # blurs
 RADII, SIZES = 200, 5  # nodes across the edge, sizes of dots between which K is interpolated
 EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
+ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
 APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
 CONTRADICTS = 5.0  # sigmas between a declared exposure and the smear
@@ -101,7 +104,9 @@ def shift_by_exposure(
     return np.where(np.isfinite(shift), shift, 0.0)
 
 
-def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array32, rig: StereoRig, disc: Disc) -> ExposureSquared:
+def exposure_by_smear(
+    R: Array, t: Array, time: Array, blur_px: Array32, rig: StereoRig, disc: Disc, workers: int = 1
+) -> ExposureSquared:
     """The exposures that the dots' edges tell; arguments as of `shift_by_exposure`, blur_px (n, 2, m) sigma of an edge.
 
     The squared blur is fitted by a constant of every dot, what changes with the distance (to second order) and with
@@ -115,12 +120,15 @@ def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array32, rig: St
     pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
     smear = _smear(_rate(pixels, time[rows])[own], _affine(J[own], R[chosen]))
     points = disc.marker_centres_body @ np.swapaxes(R[chosen], 1, 2) + t[chosen, None]
-    value, sigma = np.full(2, np.nan), np.full(2, np.inf)
-    for camera, (R_camera_world, t_camera_world) in enumerate(rig.camera_poses()):
+
+    def of_camera(camera: int) -> tuple[float, float]:
+        R_camera_world, t_camera_world = rig.camera_poses()[camera]
         distance = points @ R_camera_world[2] + t_camera_world[2]
         optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0))]
         squared = np.asarray(blur_px[chosen, camera], float) ** 2
-        value[camera], sigma[camera] = _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
+        return _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
+
+    value, sigma = np.transpose(side_by_side(of_camera, (0, 1), workers))
     return ExposureSquared(value, sigma)
 
 
@@ -259,16 +267,18 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     for _ in range(4):
         told = use.copy()
         A = design[told] / scale
-        solution = np.linalg.lstsq(A, y[told], rcond=None)[0]
+        products = inner_products(A, np.column_stack([A, y[told]]))
+        inverse = np.linalg.pinv(products[:, :-1], rcond=ALIKE**2, hermitian=True)
+        solution = inverse @ products[:, -1]
         residual = y - design / scale @ solution
         size = 1.4826 * np.median(np.abs(residual[use]))
         use &= np.abs(residual) <= OUTLYING * size
     part = np.repeat(np.arange(n) * PARTS // n, m)
-    own = A[:, -1] - A[:, :-1] @ np.linalg.lstsq(A[:, :-1], A[:, -1], rcond=None)[0]
+    others_alone = np.linalg.pinv(products[:-1, :-2], rcond=ALIKE**2, hermitian=True)
+    own = A[:, -1] - A[:, :-1] @ (others_alone @ products[:-1, -2])
     told_by = np.bincount(part[told], own**2, minlength=PARTS)
     if not told_by.sum() ** 2 > LEAST_PARTS * np.sum(told_by**2):  # a sum over one or two stretches has no scatter
         return np.nan, np.inf
-    inverse = np.linalg.pinv(A.T @ A)
     score = design[use] / scale * residual[use, None]
     sums = np.stack([score[part[use] == k].sum(axis=0) for k in range(PARTS)])
     variance = (inverse @ (sums.T @ sums) @ inverse)[-1, -1]

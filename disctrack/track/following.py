@@ -342,12 +342,13 @@ def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, f
 def _digests(images: Image) -> NDArray[np.uint32]:
     """(n, 2) of rows enough of each image (n, 2, height, width) to tell noise from noise; not 0.
 
-    A weighted sum: four times as fast as a CRC.
+    A weighted sum: four times as fast as a CRC. What it costs is fetching the rows: of large images fewer will do.
     """
     digests = np.empty(images.shape[:2], np.uint32)
+    step = 16 if images.shape[2] < 512 else 32
     for first in range(0, len(images), DIGESTED_AT_ONCE):
         some = slice(first, first + DIGESTED_AT_ONCE)
-        rows = np.ascontiguousarray(images[some, :, ::16])
+        rows = np.ascontiguousarray(images[some, :, ::step])
         words = rows.reshape(*rows.shape[:2], -1).view(np.uint8)
         words = words[..., : words.shape[-1] // 8 * 8].view(np.uint64)
         digests[some] = words @ _odd_numbers(words.shape[-1]) >> np.uint64(32)

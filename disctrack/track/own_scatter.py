@@ -55,10 +55,12 @@ def without_shared_faults(
     t: Array,
     *,
     max_frames: int = 400,
+    workers: int = 1,
 ) -> SharedFaults | None:
     """Refine cameras, dots and delay together, with a free pose for each of n successive frames.
 
-    Shapes as in `pose.fit_poses`. None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
+    Shapes as in `pose.fit_poses`; workers: threads. None if fewer than MIN_FRAMES frames, with both
+    their neighbours, are complete.
     """
     seen: Mask = np.asarray(np.isfinite(markers_px).all(-1))
     steady = np.zeros(len(R), bool)
@@ -92,7 +94,7 @@ def without_shared_faults(
             break
         used = fits.used & ok[:, None, None]
         normal, gradient = shared_normal_equations(
-            observed, covariance, used, now_rig, now_disc, Rs, ts, free[:-1], by_delay[..., None]
+            observed, covariance, used, now_rig, now_disc, Rs, ts, free[:-1], by_delay[..., None], workers
         )
         noise = scatter_left(fits, normal, gradient)
         # in units of the wide sigmas, for the sake of the conditioning

@@ -45,6 +45,7 @@ from disctrack.trajectory import FrameStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
+WAITED_FOR = 160  # pairs that are followed in the time that the first stretch takes to measure noise and blur for all
 MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
@@ -93,9 +94,10 @@ def track(
             + (" on one line" if disc.n_markers > 2 else "")
             + ": a pose needs at least three dots that are not on one line"
         )
-    read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
     with ThreadPoolExecutor(2) as pool:
-        maps = list(pool.map(normalised_maps, rig.cameras))
+        drawing = pool.map(normalised_maps, rig.cameras)
+        read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
+        maps = list(drawing)
     maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
     setup = TrackingSetup(rig, disc, settings.limits, maps_x, maps_y)
     edges = stretch_edges(pairs, disc)
@@ -216,13 +218,15 @@ def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: ran
 def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     """First pairs of the stretches that a recording is followed in, and the end of the last.
 
-    They depend on the length alone, so that the result does not depend on who follows them. Where the dots leave phi
-    open by a symmetry, every new start could choose another branch: then there is one stretch.
+    They depend on the length alone, so that the result does not depend on who follows them. The first is shorter: the
+    others wait while it measures the cameras' noise. Where the dots leave phi open by a symmetry, every new start could
+    choose another branch: then there is one stretch.
     """
     n, count = len(pairs), 1
     while n >= SHORTEST_SPLIT * count**2 and count < MOST_STRETCHES and symmetry_order(disc) == 1:
         count *= 2
-    return [pairs.start + k * n // count for k in range(count + 1)]
+    share = (n + WAITED_FOR) / count
+    return [pairs.start, *(pairs.start + round(k * share) - WAITED_FOR for k in range(1, count)), pairs.stop]
 
 
 def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[str]]:
