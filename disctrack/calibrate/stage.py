@@ -15,12 +15,11 @@ from calibration import CalibrationSettings, StereoCalibration, StereoRig, corne
 from calibration.board import Board, Target
 from calibration.rig_file import read_rig, write_rig
 from calibration.stereo import Progress
-from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
+from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import whole_file
 from disctrack.progress import compiling, progress_bar
-from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import Recording
 from disctrack.track import summary
 from disctrack.trajectory.file import Provenance
@@ -80,7 +79,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
         )
     return CalibrationSource(
         recording.name,
-        find_views(views.left, views.right, recording.folder, flat_fields(recording.folder, recording.sensors)),
+        declared_views(recording, views),
         views.target,
         table.view,
         table.board_thickness,

@@ -20,7 +20,9 @@ from disctrack.readers import open_frames
 from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
 from disctrack.readers.decoding import decode
 from disctrack.readers.files import file_number, match_files
-from disctrack.readers.flat_field import FlatField, FlatFields
+from disctrack.readers.flat_field import FlatField, FlatFields, flat_fields
+from disctrack.readers.part import ImagePart, ImageParts, image_parts
+from disctrack.recording.declaration import CalibrationViews, Recording
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
 
@@ -52,6 +54,7 @@ class TargetImages:
     left: tuple[View, ...]
     right: tuple[View, ...]
     fields: FlatFields = (None, None)  # by which grey views of the frames' own size are corrected
+    parts: ImageParts = (None, None)  # that are looked at
 
     def __len__(self) -> int:
         return len(self.left)
@@ -65,9 +68,11 @@ class TargetImages:
     def sha256(self) -> str:
         """SHA-256 (hex) of all views' content, in order."""
         digest = hashlib.sha256()
-        for side, flat in zip((self.left, self.right), self.fields, strict=True):
+        for side, flat, part in zip((self.left, self.right), self.fields, self.parts, strict=True):
             if flat is not None:
                 digest.update(flat.sha256.encode())
+            if part is not None:
+                digest.update(str(part).encode())
             for view in side:
                 if not isinstance(view, FrameView):
                     digest.update(hashlib.sha256(_content(view)).digest())
@@ -76,18 +81,27 @@ class TargetImages:
         return digest.hexdigest()
 
 
-def find_views(left: str, right: str, folder: Path, fields: FlatFields = (None, None)) -> TargetImages:
+def find_views(
+    left: str, right: str, folder: Path, fields: FlatFields = (None, None), parts: ImageParts = (None, None)
+) -> TargetImages:
     """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
 
     fields : of the two cameras, where their views are to be corrected for the pixels' gains and offsets
+    parts : of the images that are the cameras'; images of a part's own size are taken whole
     Raises RecordingError if they do not pair up.
     """
     sides = [_views_of(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
-    views = TargetImages(sides[0], sides[1], fields)
+    views = TargetImages(sides[0], sides[1], fields, parts)
     numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
     if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
         _refuse_unpaired(views, numbers)
     return views
+
+
+def declared_views(recording: Recording, declared: CalibrationViews) -> TargetImages:
+    """The calibration views of a recording. Raises RecordingError if they do not pair up."""
+    fields = flat_fields(recording.folder, recording.sensors)
+    return find_views(declared.left, declared.right, recording.folder, fields, image_parts(recording.parts))
 
 
 def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
@@ -145,7 +159,7 @@ def calibrate_views(
     used, problems = [], []
     for i, pair in enumerate(zip(views.left, views.right, strict=True)):
         try:
-            left, right = (_pixels(view, str(view), flat) for view, flat in zip(pair, views.fields, strict=True))
+            left, right = map(_pixels, pair, views.fields, views.parts)
         except RecordingError as error:
             if i == table_view:
                 raise RecordingError(f"{error} It is the table view: without it there is no lab frame.") from error
@@ -175,10 +189,16 @@ def calibrate_views(
     )
 
 
-def _pixels(view: View, where: str, flat: FlatField | None) -> NDArray:
-    """Grey values or colours of a view. Raises RecordingError, which begins with `where` or names the frame."""
-    image = view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), where)
-    return flat.corrected(image) if flat is not None and flat.fits(image) else image
+def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArray:
+    """Grey values or colours of a view. Raises RecordingError, which begins with the file or names the frame."""
+    image = view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), str(view))
+    whole = flat.corrected(image) if flat is not None and flat.fits(image) else image
+    if part is None:
+        return whole
+    height, width = whole.shape[:2]
+    if (width, height) != (part.width, part.height) and not part.lies_in(width, height):
+        raise RecordingError(f"{view}: {width} x {height} px do not hold the part {part} that [cameras] declares.")
+    return part.of(whole)
 
 
 def _content(file: Path) -> bytes:

@@ -20,11 +20,10 @@ from calibration.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
 from disctrack.calibrate.targets import evenly
-from disctrack.calibrate.views import TargetImages, calibrate_views, find_views
+from disctrack.calibrate.views import calibrate_views, declared_views
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.readers.blocks import PairBlock, iter_pair_blocks
-from disctrack.readers.flat_field import flat_fields
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.doubts import LOWEST_POINT, MISFIT
@@ -152,12 +151,11 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
     assert declared is not None
     assert table is not None
     try:
-        fields = flat_fields(recording.folder, recording.sensors)
-        views = find_views(declared.left, declared.right, recording.folder, fields)
+        views = declared_views(recording, declared)
         if table.view >= len(views):
             raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
         chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table.view})
-        some = TargetImages(tuple(views.left[i] for i in chosen), tuple(views.right[i] for i in chosen), fields)
+        some = replace(views, left=tuple(views.left[i] for i in chosen), right=tuple(views.right[i] for i in chosen))
         settings = CalibrationSettings()
         found, problems = calibrate_views(
             some, declared.target, chosen.index(table.view), table.board_thickness, settings

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.chessboard import BoardNotFound, find_corners
 from calibration.rig_file import read_rig
 from disctrack.calibrate.targets import VIEWS_TRIED, board_size, evenly
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
@@ -42,6 +43,7 @@ class FolderContent:
     inner_corners: tuple[int, int] | None
     board_seen: str  # in how many of the views that were tried
     rig_file: str | None  # where there are no views
+    parts: tuple[list[int], list[int]] | None  # x, y, width, height [px] of the cameras' images in those of the files
     notes: tuple[str, ...]
 
 
@@ -75,18 +77,22 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
 def look_into(folder: Path) -> FolderContent:
     """What the frames of a folder tell. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
-    pairs = pair_cameras(sequences)
+    pairs, parts = pair_cameras(sequences), None
+    if not any(pair.named for pair in pairs) and (half := _side_by_side(folder, sequences)):
+        width, height = half
+        parts = [0, 0, width, height], [width, 0, width, height]
+        pairs = [CameraPair(sequence, sequence, named=True) for sequence in sequences]
     if not pairs:
-        seen = ", ".join(sequence.pattern for sequence in sequences[:6]) or "no file that frames are read from"
-        raise RecordingError(
-            f"{folder}: no two sequences whose names differ by the camera alone (left and right, cam1 and cam2, ...). "
-            f"It holds: {seen}. Put each camera's frames into a folder of its own, e.g. left/ and right/."
-        )
+        raise _no_two_cameras(folder, sequences)
     notes = []
-    views, inner_corners, board_seen = _views_among(folder, pairs)
+    views, inner_corners, board_seen = _views_among(folder, pairs, 1 if parts is None else 2)
     candidates = [pair for pair in pairs if pair is not views] or pairs
     lengths = {id(pair): _length(folder, pair.left) for pair in candidates}
     frames = max(candidates, key=lambda pair: lengths[id(pair)])
+    if views is None and not frames.named:
+        boards = [board_size(some_images(side.pattern, folder))[0] for side in (frames.left, frames.right)]
+        if (boards[0] is None) != (boards[1] is None):  # views and frames of one camera
+            raise _no_two_cameras(folder, sequences)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
         notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
@@ -97,6 +103,10 @@ def look_into(folder: Path) -> FolderContent:
         )
     left, right = frames.left.open(folder), frames.right.open(folder, "right")
     rate, source = _frame_rate(left, right)
+    if parts is not None:
+        notes.append(
+            "each image holds two views side by side, as the board in both halves shows: left_part, right_part"
+        )
     if not frames.named:
         notes.append(f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left")
     rig_file = None if views is not None else _rig_beside(folder)
@@ -112,17 +122,49 @@ def look_into(folder: Path) -> FolderContent:
         inner_corners,
         board_seen,
         rig_file,
+        parts,
         tuple(notes),
     )
 
 
-def _views_among(folder: Path, pairs: list[CameraPair]) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
-    """The pair that shows the chessboard: by its names, else by what is in the images, shortest first."""
+def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
+    seen = ", ".join(sequence.pattern for sequence in sequences[:6]) or "no file that frames are read from"
+    return RecordingError(
+        f"{folder}: no two sequences whose names differ by the camera alone (left and right, cam1 and cam2, ...). "
+        f"It holds: {seen}. Put each camera's frames into a folder of its own, e.g. left/ and right/."
+    )
+
+
+def _side_by_side(folder: Path, sequences: list[Sequence]) -> tuple[int, int] | None:
+    """Width and height [px] of half an image, where there are images whose two halves both show a chessboard."""
+    for sequence in sorted(sequences, key=lambda sequence: _length(folder, sequence)):
+        halves = [np.array_split(image, 2, axis=1) for image in some_images(sequence.pattern, folder)]
+        if any(left.shape != right.shape for left, right in halves):
+            continue
+        size, _ = board_size([half for both in halves for half in both])
+        if size is None:
+            continue
+        seen = [all(not isinstance(find_corners(half, size), BoardNotFound) for half in both) for both in halves]
+        if 2 * sum(seen) > len(seen):  # half of a board passes for a smaller one in some
+            height, width = halves[0][0].shape[:2]
+            return width, height
+    return None
+
+
+def _views_among(
+    folder: Path, pairs: list[CameraPair], side_by_side: int
+) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
+    """The pair that shows the chessboard: by its names, else by what is in the images, shortest first.
+
+    side_by_side : how many cameras' images stand beside each other in one
+    """
     named = [pair for pair in pairs if pair.looks_like_calibration]
     others = sorted((pair for pair in pairs if pair not in named), key=lambda pair: _length(folder, pair.left))
     tried = [*named, *(others if not named and len(pairs) > 1 else [])]
     for pair in tried:
-        images = [image for side in (pair.left, pair.right) for image in some_images(side.pattern, folder)]
+        sides = (pair.left, pair.right) if side_by_side == 1 else (pair.left,)
+        whole = [image for side in sides for image in some_images(side.pattern, folder)]
+        images = [part for image in whole for part in np.array_split(image, side_by_side, axis=1)]
         size, seen = board_size(images)
         if size is not None:
             return pair, size, f"found whole in {seen} of {len(images)} images tried"
@@ -197,6 +239,7 @@ def declaration(
         _exposure(example),
         _aligned(f"left = {toml_value(f.left.pattern)}", found.described),
         f"right = {toml_value(f.right.pattern)}",
+        *_part_lines(found),
         "",
         "[disc]",
         line("disc", "radius_mm", None, "37.5", "caliper"),
@@ -216,6 +259,13 @@ def declaration(
         line("gravity", "g_m_s2", example.get("gravity", {}).get("g_m_s2", 9.81), "9.81", "9.78 (equator) to 9.83"),
     ]  # fmt: skip
     return "\n".join(lines) + "\n", tuple(missing)
+
+
+def _part_lines(found: FolderContent) -> list[str]:
+    if found.parts is None:
+        return []
+    left, right = map(toml_value, found.parts)
+    return [_aligned(f"left_part = {left}", "x, y, width, height in px of its images"), f"right_part = {right}"]
 
 
 def _exposure(example: Mapping[str, Any]) -> str:

@@ -75,7 +75,11 @@ def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
     while waiting:
         first = waiting.pop(0)
         tokens = _TOKEN.findall(first.pattern)
-        partners = [(other, difference) for other in waiting if (difference := _difference(tokens, other, first))]
+        partners = [
+            (other, difference)
+            for other in waiting
+            if (difference := _difference(tokens, other, first)) and (_is_side(*difference) or _as_many(other, first))
+        ]
         # a known pair of words first, then numbers, then anything
         partners.sort(key=lambda item: (not _is_side(*item[1]), not item[1][0].isdigit()))
         if partners:
@@ -154,6 +158,12 @@ def _difference(tokens: list[str], other: Sequence, first: Sequence) -> tuple[st
         return None
     a, b = differing.pop()
     return (a, b) if a[0].isalnum() and b[0].isalnum() else None
+
+
+def _as_many(one: Sequence, other: Sequence) -> bool:
+    """Whether two sequences may be of one motion by their files; a few may be missing in one of them."""
+    few, many = sorted((one.files, other.files))
+    return 2 * few >= many
 
 
 def _sides(ours: str, theirs: str) -> tuple[str, str]:

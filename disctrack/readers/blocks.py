@@ -64,9 +64,10 @@ def check_pair(left: FrameReader, right: FrameReader) -> None:
         alike = ours == theirs if what == "image_size" else (ours > 8) == (theirs > 8)
         if not alike:
             shown = [f"{v[0]} x {v[1]}" if isinstance(v, tuple) else f"{v}" for v in (ours, theirs)]
+            instead = ", or declare parts of one size: [cameras] left_part and right_part" * (what == "image_size")
             raise RecordingError(
                 f"left images ({left.describe(0)}) have {shown[0]} {unit}, right images ({right.describe(0)}) have "
-                f"{shown[1]} {unit}. Export both cameras alike."
+                f"{shown[1]} {unit}. Export both cameras alike{instead}."
             )
 
 

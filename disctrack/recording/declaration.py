@@ -21,7 +21,10 @@ FILE_NAME = RECORDING_FILE
 # Every key that a recording.toml may hold, in the order of the reference example.
 KEYS: dict[str, tuple[str, ...]] = {
     "": ("name", "case", "surface"),
-    "cameras": ("frame_rate_hz", "left", "right", "exposure_us", "left_flat", "left_dark", "right_flat", "right_dark"),
+    "cameras": (
+        *("frame_rate_hz", "left", "right", "exposure_us"),
+        *("left_flat", "left_dark", "left_part", "right_flat", "right_dark", "right_part"),
+    ),
     "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm", "name"),
     "markers": ("diameter_mm", "centres_mm"),
     "calibration": (
@@ -59,7 +62,7 @@ OPTIONAL = {
     ("air", "pressure_hPa"),
     ("air", "density_kg_m3"),
     ("cameras", "exposure_us"),
-    *(("cameras", f"{camera}_{kind}") for camera in ("left", "right") for kind in ("flat", "dark")),
+    *(("cameras", f"{camera}_{kind}") for camera in ("left", "right") for kind in ("flat", "dark", "part")),
     ("disc", "name"),
     ("calibration", "target"),
     *(("calibration", key) for keys in TARGET_KEYS.values() for key in keys if key not in TARGET_KEYS["chessboard"]),
@@ -117,6 +120,8 @@ class Recording:
     declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
     air_density: float = AIR_DENSITY  # [kg/m^3] round the disc
     sensors: tuple[SensorImages, SensorImages] = (SensorImages(), SensorImages())  # left, right
+    # left, right: x, y of the upper left corner, width and height [px] where a camera's images are a part of the files'
+    parts: tuple[tuple[int, int, int, int] | None, ...] = (None, None)
 
     @property
     def file(self) -> Path:
@@ -162,6 +167,7 @@ def read_recording(path: str | Path) -> Recording:
         air_density=_air_density(_Section(file, declared, "air")) if "air" in declared else AIR_DENSITY,
         declared=declared,
         sensors=(_sensor(cameras, "left"), _sensor(cameras, "right")),
+        parts=tuple(cameras.get(key, _part) if key in cameras else None for key in ("left_part", "right_part")),
     )
 
 
@@ -296,6 +302,15 @@ def _pattern(value: Any) -> str:
     if not isinstance(value, str) or not value.strip() or "\0" in value:
         raise _Unfit('a file pattern in quotes, e.g. "left/*.png"')
     return value
+
+
+def _part(value: Any) -> tuple[int, int, int, int]:
+    if not isinstance(value, list) or len(value) != 4 or not all(type(n) is int and 0 <= n < 10**6 for n in value):
+        raise _Unfit("[x, y, width, height] in pixels, e.g. [640, 0, 640, 512]")
+    x, y, width, height = value
+    if not (width and height):
+        raise _Unfit("a width and a height above 0")
+    return x, y, width, height
 
 
 def _table_source(value: Any) -> str:

@@ -24,6 +24,7 @@ from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_
 from disctrack.readers.camera_header import check_headers, header_of, other_exposure
 from disctrack.readers.file_numbers import check_same_numbers
 from disctrack.readers.flat_field import flat_fielded, flat_fields
+from disctrack.readers.part import frames_in_parts, image_parts
 from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording.declaration import Recording
 from disctrack.track.motion_span import MotionSpan, find_motion
@@ -93,7 +94,8 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
         open_frames(pattern, recording.folder, camera)
         for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
     ]
-    left, right = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
+    readers = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
+    left, right = frames_in_parts(readers, image_parts(recording.parts), str(recording.file))
     warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
     warnings += other_exposure(left, right, recording.exposure, str(recording.file))
     check_pair(left, right)
