@@ -52,9 +52,9 @@ def plain_grey(tiff: Tiff, tags: Mapping[int, Tag], pieces: Sequence[bytes]) -> 
 
 def _from_lzw(pieces: Sequence[bytes], strip: int, size: int) -> NDArray[np.uint8] | None:
     codes = np.frombuffer(bytearray().join([*pieces, bytes(_lzw.SLACK)]), np.uint8)
-    out = np.empty(size + _lzw.SLACK, np.uint8)
+    out = np.empty(_lzw.HEAD + size, np.uint8)
     ends = np.cumsum([0, *map(len, pieces)])
-    return out[:size] if _lzw.decode_lzw(codes, ends, out, strip, size) else None
+    return out[_lzw.HEAD :] if _lzw.decode_lzw(codes, ends, out, strip, size) else None
 
 
 def _joined(pieces: Sequence[bytes], strip: int, size: int, compression: int) -> NDArray[np.uint8] | None:

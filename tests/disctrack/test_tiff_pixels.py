@@ -145,9 +145,9 @@ def test_no_codes_make_the_decoder_write_beyond_its_room(rng):
             codes[:3] = np.frombuffer(struct.pack(">I", (256 << 15 | int(codes[0]) << 6) << 8)[:3], np.uint8)
         cut = np.sort(rng.integers(0, n + 1, 2))
         ends = np.array([0, *cut, n], np.int64)
-        out = np.full(size + _lzw.SLACK + guard, 77, np.uint8)
-        _lzw.decode_lzw(codes, ends, out[: size + _lzw.SLACK], 100, size)
-        assert (out[size + _lzw.SLACK :] == 77).all()
+        out = np.full(_lzw.HEAD + size + guard, 77, np.uint8)
+        _lzw.decode_lzw(codes, ends, out[: _lzw.HEAD + size], 100, size)
+        assert (out[_lzw.HEAD + size :] == 77).all()
 
 
 def test_a_page_that_claims_more_than_its_codes_can_hold_takes_no_memory():
