@@ -23,12 +23,14 @@ from numba.core.ccallback import CFunc
 from numba.core.compiler_lock import global_compiler_lock
 
 from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, normal_equations
+from disctrack.diagnosis.equations import _ode_kernel
 from disctrack.readers import _lzw, _png
 from disctrack.rolling import equations, integrate
 from disctrack.rolling._compiled import law_types, may_call, system_types
 from disctrack.rolling.effects.base import HELPERS, catalogue
 from disctrack.track import _kernels, _pose_kernel, dots, following, pose
 
+ODE = (_ode_kernel.integrate, _ode_kernel.observe_all, _ode_kernel.rates_all)
 PREPARED = (  # function, what compiles it, for how many types
     (_corner_kernel.fit_corners, corner_fit.prepare, 1),
     (_normal_kernel.accumulate, normal_equations.prepare, 1),
@@ -38,6 +40,7 @@ PREPARED = (  # function, what compiles it, for how many types
     (_kernels.track_frames, lambda: [following.prepare(bits) for bits in (np.uint8, np.uint16)], 2),
     (_kernels.look, lambda: [dots.prepare(bits) for bits in (np.uint8, np.uint16)], 2),
     (_pose_kernel.fit, pose.prepare, 1),
+    *((function, _ode_kernel.prepare, 1) for function in ODE),
     (integrate._dop853, lambda: [integrate.prepare(scalar) for scalar in (float, complex)], 2),
     (integrate._evaluate, lambda: [integrate.prepare(scalar) for scalar in (float, complex)], 2),
 )

@@ -6,13 +6,16 @@ Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 from numba import types
 from scipy.integrate import DOP853
 
 from calibration.compiled import njit
 
-_f, _v, _m = types.float64, types.float64[::1], types.float64[:, ::1]
+_f, _v, _m, _cube = types.float64, types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in
 RHS = types.void(_f, _v, _v, _v, _v, _v, _m, _m)
 # observe(t, y, p, u, u_rate, h, H_y, H_p): what the sensors see (w,), and its derivatives (w, n), (w, n_p)
@@ -29,14 +32,39 @@ _A_EXTRA, _C_EXTRA = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(
 _SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
 
 
-@njit(types.int64(_f, _v), cache=True, error_model="numpy", nogil=True)
-def piece_at(t, knots):
+_RULES: dict[str, Any] = {"error_model": "numpy", "nogil": True}
+_entry = njit(cache=True, **_RULES)
+_part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
+
+
+@_part
+def _first_after(t, knots):
+    """Index of the first knot beyond t: what numpy.searchsorted finds, that compiles for half a second."""
+    low, high = 0, len(knots)
+    while low < high:
+        middle = (low + high) // 2
+        if knots[middle] <= t:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@_part
+def _assign(target, values):
+    """As target[:] = values, for which numba compiles the text of an error besides."""
+    for i in range(len(target)):
+        target[i] = values[i]
+
+
+@_part
+def _piece_at(t, knots):
     """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
-    return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
+    return min(max(_first_after(t, knots) - 1, 0), len(knots) - 2)
 
 
-@njit(types.void(_f, types.int64, _v, types.float64[:, :, ::1], _v, _v), cache=True, error_model="numpy", nogil=True)
-def inputs_at(t, i, knots, pieces, u, u_rate):
+@_part
+def _inputs_at(t, i, knots, pieces, u, u_rate):
     """Piecewise cubics (channels, 5, knots - 1), highest power first: the i-th piece at t.
 
     The fifth number is added to the slope: that of an input that is held, which steps.
@@ -48,19 +76,14 @@ def inputs_at(t, i, knots, pieces, u, u_rate):
         u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d + pieces[c, 4, i]
 
 
-@njit(
-    types.void(RHS_TYPE, _f, types.int64, _v, _v, types.int64[::1], _v, types.float64[:, :, ::1], _v, _v, _v, _m, _m,
-               _v),
-    error_model="numpy",
-    cache=True,
-    nogil=True,
-)  # fmt: skip
+@_part
 def _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
     """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
     n, k = len(f), len(columns)
-    inputs_at(t, piece, knots, pieces, u, u_rate)
+    _inputs_at(t, piece, knots, pieces, u, u_rate)
     rhs(t, z[:n], p, u, u_rate, f, J, P)
-    out[:n] = f
+    for i in range(n):
+        out[i] = f[i]
     for c in range(k):
         s = n * (c + 1)
         for i in range(n):
@@ -70,13 +93,7 @@ def _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, out)
             out[s + i] = total
 
 
-@njit(
-    types.UniTuple(types.int64, 2)(
-        RHS_TYPE, _v, _v, types.int64[::1], _v, types.int64, _v, types.float64[:, :, ::1], _v, _f,
-        types.int64, _m, types.float64[:, :, ::1],
-    ),
-    cache=True, error_model="numpy", nogil=True,
-)  # fmt: skip
+@_entry
 def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
     """Fill out (groups, m, len(z0)) with the solution at samples (groups, m), each group increasing.
 
@@ -97,7 +114,7 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
     largest = np.zeros(k)
     pointer = np.zeros(groups, np.int64)
     t, end = span[0], span[1]
-    piece = piece_at(t, knots)
+    piece = _piece_at(t, knots)
     _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
     speed = 0.0
     for i in range(n):
@@ -109,7 +126,7 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
         # inputs are smooth between their knots only: a step across one would be rejected more often than not
-        i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
+        i = _first_after(t + 1e-12 * max(abs(t), 1.0), knots)
         arrival = t + step
         if i < len(knots) and arrival > knots[i]:
             arrival = knots[i]  # to the bit: on the other side of it the inputs are others
@@ -178,7 +195,7 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
                 if abs(samples[g, pointer[g]] - t - step) > 1e-12 * step:
                     inside = True
                 else:  # the step ends at the sample, as at every one with an input's knot
-                    out[g, pointer[g]] = new
+                    _assign(out[g, pointer[g]], new)
                     pointer[g] += 1
         if inside:
             for e in range(3):
@@ -215,12 +232,12 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
                 largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
         steps += 1
         t = arrival
-        z[:] = new
-        before, piece = piece, piece_at(t, knots)
+        _assign(z, new)
+        before, piece = piece, _piece_at(t, knots)
         if piece != before:
             _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
         else:
-            K[0] = K[12]
+            _assign(K[0], K[12])
         grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**-0.125))
         if rejected:
             grow = min(1.0, grow)
@@ -232,27 +249,33 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
     return DONE, steps
 
 
-@njit(
-    types.void(RHS_TYPE, _v, _m, _v, _v, types.float64[:, :, ::1], _m, types.float64[:, :, ::1],
-               types.float64[:, :, ::1]),
-    cache=True, error_model="numpy", nogil=True,
-)  # fmt: skip
+@_entry
 def observe_all(observe, times, states, p, knots, pieces, seen, by_state, by_parameter):
     """What the sensors see at instants (m,) in states (m, n): seen (m, w) and derivatives (m, w, n), (m, w, n_p)."""
     u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
     for i in range(len(times)):
-        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
+        _inputs_at(times[i], _piece_at(times[i], knots), knots, pieces, u, u_rate)
         observe(times[i], states[i], p, u, u_rate, seen[i], by_state[i], by_parameter[i])
 
 
-@njit(
-    types.void(RHS_TYPE, _v, _m, _v, _v, types.float64[:, :, ::1], _m, types.float64[:, :, ::1]),
-    cache=True, error_model="numpy", nogil=True,
-)  # fmt: skip
+@_entry
 def rates_all(rhs, times, states, p, knots, pieces, rates, by_parameter):
     """Rates (m, n) and their derivatives by parameters (m, n, n_p) at instants (m,) in states (m, n)."""
     n = states.shape[1]
     u, u_rate, J = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0]), np.zeros((n, n))
     for i in range(len(times)):
-        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
+        _inputs_at(times[i], _piece_at(times[i], knots), knots, pieces, u, u_rate)
         rhs(times[i], states[i], p, u, u_rate, rates[i], J, by_parameter[i])
+
+
+@cache
+def prepare() -> None:
+    """Compile what Python calls for the arrays that it is called with, and for no others; or load it."""
+    whole = types.int64
+    for function, arguments in (
+        (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _m, _cube)),
+        (observe_all, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube)),
+        (rates_all, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube)),
+    ):
+        function.compile(arguments)
+        function.disable_compile()

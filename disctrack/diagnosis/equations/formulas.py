@@ -205,6 +205,7 @@ def _known(name: str, known: Mapping[str, Any], where: str) -> None:
 @lru_cache(maxsize=64)
 def _compiled_source(source: str, name: str) -> Any:
     """The same equations are compiled once, however many runs are asked about."""
+    kernel.prepare()
     scope = {k: getattr(math, k) for k in dir(math) if not k.startswith("_")}
     exec(source, scope)
     compiled = njit(kernel.RHS, error_model="numpy", nogil=True)(scope[name])
