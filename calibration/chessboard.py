@@ -108,6 +108,14 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
     found, corners = cv2.findChessboardCorners(grey, inner_corners, None, flags)
     if not found and thorough:
         found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
+    if not found and thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
+        finer = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+        found, corners = cv2.findChessboardCorners(finer, inner_corners, None, flags)
+        if found:
+            scale *= 2.0
+        else:
+            fine = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+            found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, fine)
     if not found or corners is None:
         return None
     points = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
