@@ -3,16 +3,17 @@
 Over an exposure T a dot is smeared, and its template finds it beside its place at mid exposure by T^2 / 24 times
 (second order of the path; the first vanishes)
 
-    c'' + A [(K/2 - 1) (G + G^T) + (K/2 + 1) tr G] A^-1 c',   G = A^-1 A',
+    c'' + p,    p bilinear in c' and A' A^-1,
 
 c the image of the dot's centre, A (2, 2) the affine map from the disc's plane to the image there, primes rates. The
 first term is the mean of the path: while the disc rolls it makes theta read low by sin(theta) (psidot T)^2 / 24 =
 g T^2 / (6 r), at every theta alike (steady precession, psidot^2 sin(theta) = 4 g / r), 0.6 mdeg at 0.5 ms and
 r = 37.5 mm. The other comes from a dot whose outline changes while it moves, which smears one side more than the other:
 the image I(d) of the edge, d the signed distance, changes by T^2 / 24 (I' d_tt + I'' v_n^2) with
-d_tt = -n.a - kappa v_t^2 + 2 v_t dv_n/ds, and of that the template takes the first harmonic about the dot. I'' looks to
-it like a shift by K kappa, as light that may slope over the paper takes up the halo of the smeared side
-(`_pull_of_smear`; K = 1/2 if it might not).
+d_tt = -n.a - kappa v_t^2 + 2 v_t dv_n/ds, and of that the template takes what looks to its normal equations like a
+shift: mostly I'', as light that may slope over the paper takes up the halo of the smeared side (`_response`). A dot
+seen obliquely is an ellipse, whose ends bend more and count less than its sides: at 70 deg from the normal, what a
+circle of the same area would be pulled by is twice too much.
 
 The smear tells T: an edge with normal n whose image moves by v T during the exposure is blurred by (v.n)^2 T^2 / 12
 more (variance of a uniform distribution), on the mean over the dot's edge. How fast a dot is changes with its place
@@ -44,7 +45,8 @@ LEAST_PARTS = 4.0  # that the motion is spread over: (sum w)^2 / sum w^2 of what
 FEWEST = 2 * PARTS  # frames
 AT_ONCE = 4096  # poses
 BAND = 3.0  # blurs
-RADII, SIZES = 200, 5  # nodes across the edge, sizes of dots between which K is interpolated
+ACROSS, AROUND = 60, 32  # nodes of an edge
+SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
 EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
 ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
@@ -191,36 +193,103 @@ def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, p
         acceleration[1:-1] = 2 * (step[1:] / after - step[:-1] / before) / (before + after)
     known = np.isfinite(affine).all(axis=(-2, -1), keepdims=True)
     affine = np.where(known, affine, np.eye(2))  # of a dot behind a camera; its rates are NaN
-    G = np.linalg.solve(affine, _rate(affine, time))
-    radius_px = 0.5 * disc.marker_diameter * np.sqrt(np.abs(np.linalg.det(affine)))
-    K = np.stack([_pull_of_smear(radius_px[:, camera], pull) for camera, pull in enumerate(pulls)], axis=1)[..., None]
-    v = np.linalg.solve(affine, velocity[..., None])[..., 0]
-    both = ((G + np.swapaxes(G, -1, -2)) @ v[..., None])[..., 0]
-    pulled = (K / 2 - 1) * both + (K / 2 + 1) * np.trace(G, axis1=-2, axis2=-1)[..., None] * v
-    return np.asarray(acceleration + (affine @ pulled[..., None])[..., 0])
+    growth = _rate(affine, time) @ np.linalg.inv(affine)
+    pulled = np.empty_like(pixels)
+    for camera, pull in enumerate(pulls):
+        of = affine[:, camera], growth[:, camera], velocity[:, camera]
+        pulled[:, camera] = _pulled(0.5 * disc.marker_diameter, *of, pull)
+    return np.asarray(acceleration + pulled)
 
 
-def _pull_of_smear(radius_px: Array, pull: Pull) -> Array:
-    """K of dots of these radii: by how much, over kappa, I'' of their edge looks like a shift to the template.
+def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, pull: Pull) -> Array:
+    """(n, m, 2) [px/s^2] p of dots of this radius [m] in one camera.
 
-    The first harmonic of the template's normal equations about a round dot, over its band of pixels and weighted by
-    their noise: of centre and slope of the light together.
+    affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
+    """
+    xx, yy = (affine[..., i, 0] ** 2 + affine[..., i, 1] ** 2 for i in range(2))
+    xy = (affine[..., 0, :] * affine[..., 1, :]).sum(axis=-1)
+    long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
+    short = np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0]) / long
+    size, shape = radius * np.sqrt(long * short), short / long
+    known = np.isfinite(size) & np.isfinite(velocity).all(axis=-1)
+    if not known.any():
+        return np.full_like(velocity, np.nan)
+    sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
+    T = _between(_response(sizes, pull), sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the long axis
+    c, s = np.cos(turn), np.sin(turn)
+    axes = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+    v = (axes @ velocity[..., None])[..., 0]
+    G = axes @ growth @ np.swapaxes(axes, -1, -2)
+    along = (T[..., 0] * G[..., 0, 0] + T[..., 1] * G[..., 1, 1]) * v[..., 0]
+    along += (T[..., 2] * G[..., 0, 1] + T[..., 3] * G[..., 1, 0]) * v[..., 1]
+    across = (T[..., 4] * G[..., 0, 0] + T[..., 5] * G[..., 1, 1]) * v[..., 1]
+    across += (T[..., 6] * G[..., 0, 1] + T[..., 7] * G[..., 1, 0]) * v[..., 0]
+    return np.asarray(c[..., None] * np.stack([along, across], -1) + s[..., None] * np.stack([-across, along], -1))
+
+
+def _response(sizes: Array, pull: Pull) -> Array:
+    """(sizes, SHAPES, 8) what the template takes for a shift, over T^2 / 24 and products of velocity v and growth G.
+
+    sizes : [px] root of the half axes' product. Axes 1, 2 are the dot's long and short one. The first four numbers are
+    of a shift along axis 1, by v1 G11, v1 G22, v2 G12, v2 G21; the others along axis 2, by v2 G11, v2 G22, v1 G12,
+    v1 G21: the others vanish by symmetry. Least squares over the template's band of pixels, weighted by their noise, of
+    centre and slope of the light together; what else is fitted (size, blur, grey values) is even about the centre.
     """
     sigma, (level, contrast) = pull.blur_px, pull.light
-    d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, RADII)  # as `_kernels` selects its pixels
+    d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, ACROSS)  # as `_kernels` selects its pixels
     edge = 1.0 - 0.5 * contrast * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])
     first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
     second = -d / sigma**2 * first
-    if not np.isfinite(radius_px).any():
-        return radius_px
-    sizes = np.linspace(np.nanmin(radius_px), np.nanmax(radius_px), SIZES)
-    K = np.empty(len(sizes))
-    for k, size in enumerate(sizes):
-        around = np.clip(size + d, 0.0, None)  # circumference over 2 pi
-        weight = around / pull.noise.variance(level * edge)
-        design = np.stack([first, around * edge])
-        K[k] = -np.linalg.solve(design * weight @ design.T, design @ (weight * second))[0] * size
-    return np.asarray(np.interp(radius_px, sizes, K))
+    angle = 2 * np.pi * (np.arange(AROUND) + 0.5) / AROUND
+    cos, sin = np.cos(angle), np.sin(angle)
+    a, b = (sizes[:, None, None] * SHAPES[:, None] ** power for power in (-0.5, 0.5))  # (sizes, shapes, angles)
+    speed = np.hypot(b * cos, a * sin)  # of the outline with the angle
+    n1, n2, bend = b * cos / speed, a * sin / speed, a * b / speed**3
+    # products of v and G as listed: n.v, t.v and n.Gu, t.Gu, with how they change along the edge
+    t1, t2, u1, u2 = -n2, n1, a * cos, b * sin
+    of_v = {1: (n1, t1, bend * t1), 2: (n2, t2, bend * t2)}
+    of_G = {}
+    for i, j in ((1, 1), (2, 2), (1, 2), (2, 1)):
+        u, tangent = (u1, t1) if j == 1 else (u2, t2)
+        n, t = (n1, t1) if i == 1 else (n2, t2)
+        of_G[i, j] = n * u, t * u, bend * t * u + n * tangent
+    terms = []
+    for v, (i, j) in (
+        (1, (1, 1)),
+        (1, (2, 2)),
+        (2, (1, 2)),
+        (2, (2, 1)),
+        (2, (1, 1)),
+        (2, (2, 2)),
+        (1, (1, 2)),
+        (1, (2, 1)),
+    ):
+        (vn, vt, dvn), (gn, gt, dgn) = of_v[v], of_G[i, j]
+        terms.append((2 * (vt * dgn + gt * dvn) - 2 * bend * vt * gt, 2 * vn * gn))
+    weight = np.clip(1 + bend[..., None] * d, 0.0, None) * speed[..., None] / pull.noise.variance(level * edge)
+    found = []
+    for half in range(2):
+        n, u = ((n1, u1), (n2, u2))[half]
+        design = np.stack([-first * n[..., None], (u[..., None] + n[..., None] * d) * edge])
+        weighted = (design * weight).reshape(2, *a.shape[:2], -1)
+        flat = design.reshape(2, *a.shape[:2], -1)
+        normal = np.einsum("ixyk,jxyk->xyij", weighted, flat)
+        data = np.stack([first * at[..., None] + second * squared[..., None] for at, squared in terms[4 * half :][:4]])
+        rhs = np.einsum("ixyk,jxyk->xyij", weighted, data.reshape(4, *a.shape[:2], -1))
+        found.append(np.linalg.solve(normal, rhs)[..., 0, :])
+    return np.concatenate(found, axis=-1)
+
+
+def _between(table: Array, sizes: Array, size: Array, shape: Array) -> Array:
+    """The table (sizes, SHAPES, k) at dots of any number: linear in the size and in the logarithm of the shape."""
+    width = max(sizes[-1] - sizes[0], 1e-9 * sizes[0])
+    x = np.clip((size - sizes[0]) / width, 0.0, 1.0) * (len(sizes) - 1)
+    y = np.clip(np.log(shape / SHAPES[0]) / np.log(SHAPES[-1] / SHAPES[0]), 0.0, 1.0) * (len(SHAPES) - 1)
+    i, j = np.minimum(x.astype(int), len(sizes) - 2), np.minimum(y.astype(int), len(SHAPES) - 2)
+    x, y = (x - i)[..., None], (y - j)[..., None]
+    low, high = ((1 - y) * table[k, j] + y * table[k, j + 1] for k in (i, i + 1))
+    return np.asarray((1 - x) * low + x * high)
 
 
 def _affine(J: Array, R: Array) -> Array:

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from disctrack import frames, measure_pairs, read_recording, rolling
 from disctrack.errors import RecordingError
 from disctrack.render import render_disc
+from disctrack.track import exposure as smears
 from disctrack.track.dots import NoiseModel, locate_on_plane
 from disctrack.track.exposure import Pull, shift_by_exposure
 from disctrack.track.tracking import TrackingSettings
@@ -19,15 +20,19 @@ N = 40
 SIMPSON = np.array([1, 4, 2, 4, 2, 4, 2, 4, 1]) / 24
 
 
-@pytest.fixture(scope="module")
-def motion(rendered_pairs):
-    """A disc rolling at 10 deg of nutation: its poses at nine instants of the exposure of each frame, (N, 9, 6)."""
-    disc = rendered_pairs.disc
-    start = rolling.steady_precession(np.radians(10), disc, 9.81)
-    solution = rolling.simulate(rolling.Model(disc, 9.81), start, times=np.arange(8 * N + 1) / (8 * RATE))
+def rolled(disc, theta_deg, rate=RATE):
+    """A disc rolling at this nutation [deg]: its poses at nine instants of the exposure of each frame, (N, 9, 6)."""
+    start = rolling.steady_precession(np.radians(theta_deg), disc, 9.81)
+    solution = rolling.simulate(rolling.Model(disc, 9.81), start, times=np.arange(8 * N + 1) / (8 * rate))
     q = solution.q[8 * np.arange(N)[:, None] + np.arange(9)]
     q[..., :2] += np.array([0.032, 0.02]) - q[..., :2].mean(axis=(0, 1))
     return q, solution.qdot[4::8]
+
+
+@pytest.fixture(scope="module")
+def motion(rendered_pairs):
+    """At 10 deg."""
+    return rolled(rendered_pairs.disc, 10)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +66,32 @@ def _seen(centres, affine, dark, blur_px):
     return np.round(50000 - (50000 - dark) * smooth).astype(np.uint16)
 
 
+def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
+    """Shifts of the template by the smear, by dots drawn along the motion; by the mean of their path; as `found`."""
+    expected, by_path, given = [], [], []
+    turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    edge = 0.5 * disc.marker_diameter * np.column_stack([circle, np.zeros(16)])
+    for frame, dot, cameras in chosen:
+        points = np.concatenate([disc.marker_centres_body[[dot]], disc.marker_centres_body[dot] + edge])
+        outlines = rig.project(points @ np.swapaxes(R[frame], -1, -2) + q[frame, :, None, :3])  # (9, 2, 17, 2)
+        for camera in cameras:
+            centres, edges = outlines[:, camera, 0], outlines[:, camera, 1:]
+            affine = np.swapaxes(edges - centres[:, None], 1, 2) @ circle / 8
+            window = np.round(centres[4]) - 31
+            H = np.eye(3)
+            H[:2, :2], H[:2, 2] = affine[4], centres[4] - window
+            seen = [_seen(centres[k] - window, affine[k], dark, 0.6) for k in (np.arange(9), [4] * 9)]
+            smeared, still = (
+                locate_on_plane(image, H, np.zeros((1, 2)), 1.0, noise=noise, blur_px=blur_px).pixels[0]
+                for image in seen
+            )
+            expected.append(smeared - still)
+            by_path.append(SIMPSON @ centres - centres[4])
+            given.append(found[frame, camera, dot])
+    return np.array(expected), np.array(by_path), np.array(given)
+
+
 @pytest.mark.parametrize(("dark", "noise"), [(10000, NoiseModel(4e5, 0.0)), (5000, NoiseModel(1e4, 8.0))])
 def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     """Against dots drawn along the simulated motion (no renderer, no formula), found by their template."""
@@ -73,31 +104,43 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     found = shift_by_exposure(known, where, np.arange(N) / RATE, exposures, rig, disc, (pull, pull))
     assert not found[20].any()
 
-    turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    edge = 0.5 * disc.marker_diameter * np.column_stack([circle, np.zeros(16)])
-    expected, by_path, given = [], [], []
-    for frame, dot in ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4)):
-        points = np.concatenate([disc.marker_centres_body[[dot]], disc.marker_centres_body[dot] + edge])
-        outlines = rig.project(points @ np.swapaxes(R[frame], -1, -2) + q[frame, :, None, :3])  # (9, 2, 17, 2)
-        for camera in range(2):
-            centres, edges = outlines[:, camera, 0], outlines[:, camera, 1:]
-            affine = np.swapaxes(edges - centres[:, None], 1, 2) @ circle / 8
-            window = np.round(centres[4]) - 31
-            H = np.eye(3)
-            H[:2, :2], H[:2, 2] = affine[4], centres[4] - window
-            seen = [_seen(centres[k] - window, affine[k], dark, 0.6) for k in (np.arange(9), [4] * 9)]
-            smeared, still = (
-                locate_on_plane(image, H, np.zeros((1, 2)), 1.0, noise=noise, blur_px=0.65).pixels[0] for image in seen
-            )
-            expected.append(smeared - still)
-            by_path.append(SIMPSON @ centres - centres[4])
-            given.append(found[frame, camera, dot])
-    expected, by_path, given = np.array(expected), np.array(by_path), np.array(given)
+    dots = ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4))
+    chosen = [(*dot, (0, 1)) for dot in dots]
+    expected, by_path, given = _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, 0.65)
     size = np.sqrt(np.mean(expected**2))
     assert size > 0.002  # px
     assert np.sqrt(np.mean((given - expected) ** 2)) < 0.25 * size
     assert np.sqrt(np.mean((by_path - expected) ** 2)) > 0.4 * size  # the mean of the path alone is not what is found
+
+
+def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs, monkeypatch):
+    """At 55 deg of nutation, dots up to 75 deg off their normal; negative control: as circles of the same area."""
+    rig, disc, noise = rendered_pairs.rig, rendered_pairs.disc, NoiseModel(4e5, 0.0)
+    rate = 2500.0  # a millisecond would smear them by more than a blur
+    q = rolled(disc, 55, rate)[0]
+    R_cw, t_cw = rig.camera_poses()[0]
+    to_camera = -t_cw @ R_cw - q[N // 2, 4, :3]
+    towards, now = np.arctan2(to_camera[1], to_camera[0]), q[N // 2, 4, 3] - np.pi / 2  # of the camera, of the normal
+    q[..., 3] += towards + np.radians(98) - now
+    R = frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
+    line = q[:, 4, :3] @ R_cw.T + t_cw
+    cosine = -((R_cw @ R[:, 4])[..., 2] * line).sum(-1) / np.linalg.norm(line, axis=-1)
+    oblique = [(int(frame), 0, (0,)) for frame in np.flatnonzero((cosine > 0.27) & (cosine < 0.5))[1:-1:2]]
+    assert len(oblique) >= 4
+    pull = Pull(0.7, (50000.0, 0.8), noise)
+    given = R[:, 4], q[:, 4, :3], np.arange(N) / rate, np.array([1, 1]) / rate, rig, disc, (pull, pull)
+    found = smears.shift_by_exposure(*given)
+    expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, 10000, noise, 0.7)
+    of_ellipses = smears._response
+    monkeypatch.setattr(smears, "_response", lambda *of: np.repeat(of_ellipses(*of)[:, -1:], len(smears.SHAPES), 1))
+    round_dots = smears.shift_by_exposure(*given)
+    circles = np.array([round_dots[frame, camera, dot] for frame, dot, (camera,) in oblique])
+    size = np.sqrt(np.mean(expected**2))
+    assert size > 0.002  # px
+    # single dots scatter by 7e-4 px, with the place of their edge among the pixels that they are drawn with
+    assert np.sum(expected * ellipses) / np.sum(ellipses**2) == pytest.approx(1.0, abs=0.12)
+    assert np.sqrt(np.mean((ellipses - expected) ** 2)) < 0.35 * size
+    assert np.sqrt(np.mean((circles - expected) ** 2)) > 0.5 * size
 
 
 def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
