@@ -67,7 +67,9 @@ _NODES = 64  # at most, over the length of an ellipse
 # vector of the long axis in the image, semi-axes over the radius.
 _EX, _EY, _I00, _I01, _I10, _I11, _AXIS_X, _AXIS_Y, _LONG, _SHORT = range(10)
 _ELLIPSE = 10
-_ATTITUDE_TOLERANCE = 1.5e-3  # [rad] farther from the expected attitude a pair is looked at once more
+# [rad] farther from the expected attitude a pair is looked at once more: 3e-3 move centres by 4e-4 to 1e-3 px, in every
+# frame alike where the prediction lags
+_ATTITUDE_TOLERANCE = 6e-4
 
 # numba takes a literal for double precision, and with it all that it touches
 _f = np.float32
@@ -845,17 +847,31 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
 
 
 @_part
-def _predict(R_last, t_last, R_before, t_before, R, t):
-    """The next pose if the last turn and the last shift are made once more: R = (R_last R_before^T) R_last."""
+def _predict(last, before, older, t_last, t_before, t_older, R, t):
+    """The next pose if turn and shift change once more as they did: turn D1 D0^T D1 after D0 and then D1.
+
+    A disc that rolls is as far beside it as its third differences, not its second: what a prediction is off by follows
+    the acceleration, and so does what it leaves of itself in the centres (band and shape of the template), 1e-4 px.
+    """
+    D = np.empty((3, 3))
     for i in range(3):
-        t[i] = 2.0 * t_last[i] - t_before[i]
-        for j in range(3):
-            R[i, j] = 0.0
-            for k in range(3):
-                turn = 0.0
-                for q in range(3):
-                    turn += R_last[i, q] * R_before[k, q]
-                R[i, j] += turn * R_last[k, j]
+        t[i] = 3.0 * (t_last[i] - t_before[i]) + t_older[i]
+        for j in range(3):  # D1
+            D[i, j] = last[i, 0] * before[j, 0] + last[i, 1] * before[j, 1] + last[i, 2] * before[j, 2]
+    for j in range(3):  # one column after the other: D1 D0^T D1 R_last, D0^T = R_older R_before^T
+        for k in range(3):
+            R[k, j] = last[k, j]
+        for step in range(3):
+            x, y, z = R[0, j], R[1, j], R[2, j]
+            if step == 1:
+                a = before[0, 0] * x + before[1, 0] * y + before[2, 0] * z
+                b = before[0, 1] * x + before[1, 1] * y + before[2, 1] * z
+                c = before[0, 2] * x + before[1, 2] * y + before[2, 2] * z
+                for k in range(3):
+                    R[k, j] = older[k, 0] * a + older[k, 1] * b + older[k, 2] * c
+            else:
+                for k in range(3):
+                    R[k, j] = D[k, 0] * x + D[k, 1] * y + D[k, 2] * z
 
 
 @_part
@@ -887,18 +903,19 @@ def _settle(results, status, cameras, R_cw, t_cw, centres, R, t):
 
 @_entry
 def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
-                 R_last, t_last, R_before, t_before, results, status, R_out, t_out, max_rms):  # fmt: skip
-    """Follow the disc through a block of pairs, each predicted from the two before by constant velocity and turn.
+                 R_last, t_last, R_before, t_before, R_older, t_older, results, status, R_out, t_out,
+                 max_rms):  # fmt: skip
+    """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
     images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 3), limits (5,)
-    for `judge_dot`. R_last ... t_before hold the last two poses and are updated. Filled: results (n, 2, m, 12), status
+    for `judge_dot`. R_last ... t_older hold the last three poses and are updated. Filled: results (n, 2, m, 12), status
     (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was
     lost at that frame.
     """
     pixels, work = np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
-        _predict(R_last, t_last, R_before, t_before, R, t)
+        _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
@@ -909,16 +926,16 @@ def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, r
             for i in range(3):
                 for j in range(3):
                     turned += (R[i, j] - R_expected[i, j]) * (R[i, j] - R_expected[i, j])
-            # the template's shape follows the expected attitude: an error of 3 mrad moves centres by 1e-3 px
             if rms < 0.0 or turned < 2.0 * _ATTITUDE_TOLERANCE * _ATTITUDE_TOLERANCE:
                 break
         if not 0.0 <= rms < max_rms:
             return f
+        _copy(R_older, R_before)
         _copy(R_before, R_last)
         _copy(R_last, R)
         _copy(R_out[f], R)
         for i in range(3):
-            t_before[i], t_last[i], t_out[f, i] = t_last[i], t[i], t[i]
+            t_older[i], t_before[i], t_last[i], t_out[f, i] = t_before[i], t_last[i], t[i], t[i]
     return images.shape[0]
 
 

@@ -64,10 +64,17 @@ class Law:
 
 @dataclass(frozen=True)
 class Heading:
-    """The last two poses; the next is predicted by making their turn and shift once more."""
+    """The last three poses, from which the next is predicted (`_kernels.track_frames`)."""
 
     last: Pose
     before: Pose
+    older: Pose
+
+    @classmethod
+    def steady(cls, last: Pose, before: Pose) -> Heading:
+        """The next prediction makes their turn and shift once more, as if they had been made before, too."""
+        turn = last[0] @ before[0].T
+        return cls(last, before, (turn.T @ before[0], 2 * before[1] - last[1]))
 
     @classmethod
     def leading_to(cls, pose: Pose, following: Pose | None) -> Heading:
@@ -77,7 +84,7 @@ class Heading:
         if following is not None:
             turn, shift = following[0] @ R.T, following[1] - t
         last = (turn.T @ R, t - shift)
-        return cls(last, (turn.T @ last[0], t - 2 * shift))
+        return cls.steady(last, (turn.T @ last[0], t - 2 * shift))
 
     def carried_on(self, steps: int) -> Heading:
         """As after so many more frames of the same motion."""
@@ -85,7 +92,7 @@ class Heading:
         last, before = self.last, self.before
         for _ in range(steps):
             last, before = (turn @ last[0], last[1] + shift), last
-        return Heading(last, before)
+        return Heading.steady(last, before)
 
 
 @dataclass(frozen=True)
@@ -205,7 +212,7 @@ def run(
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
     poses = setup.rig.camera_poses()
     # the loop moves them on
-    R_last, t_last, R_before, t_before = (np.array(part, float, order="C") for part in (*heading.last, *heading.before))
+    known = [np.array(part, float, order="C") for part in (*heading.last, *heading.before, *heading.older)]
     done = kernels.track_frames(
         images,
         readable,
@@ -220,17 +227,15 @@ def run(
         np.array(law.blur),
         np.stack([noise.parameters for noise in law.noise]),
         law.limits(setup.limits).array(),
-        R_last,
-        t_last,
-        R_before,
-        t_before,
+        *known,
         rows.results,
         rows.status,
         rows.R,
         rows.t,
         MAX_PREDICTION_RMS_PX,
     )
-    return int(done), Heading((R_last, t_last), (R_before, t_before))
+    R_last, t_last, R_before, t_before, R_older, t_older = known
+    return int(done), Heading((R_last, t_last), (R_before, t_before), (R_older, t_older))
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
@@ -250,7 +255,7 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
         zeros(2),
         zeros((2, 3)),
         zeros(5),
-        *(np.eye(3), zeros(3), np.eye(3), zeros(3)),
+        *(np.eye(3), zeros(3)) * 3,
         zeros((0, 2, 1, kernels.N_RESULT)),
         zeros((0, 2, 1), np.uint8),
         zeros((0, 3, 3)),
@@ -372,10 +377,10 @@ def repeats(digest: NDArray[np.uint32]) -> Mask:
 def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     """Set a heading that leads to the disc in the first of the pairs; False where it is not found.
 
-    First its last motion is carried on, which costs no more than any other frame; then, now and then, it is searched
-    for in the whole images.
+    First its last motion is carried on, with no acceleration, which one bad pose would have spoilt: that costs no more
+    than any other frame; then, now and then, it is searched for in the whole images.
     """
-    if follower.heading is not None and follower.lost and follower.lost <= MOST_CARRIED:
+    if follower.heading is not None and follower.lost is not None and follower.lost <= MOST_CARRIED:
         carried = follower.heading.carried_on(follower.lost)
         if _holds(follower, carried, images, readable):
             follower.heading = carried
@@ -421,7 +426,7 @@ def _go_back(
         return
     back = slice(first, found)
     trial = empty_rows(found - first, follower.setup.disc.n_markers)
-    heading = Heading((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
+    heading = Heading.steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
     pairs: Image = np.ascontiguousarray(images[back][::-1])  # type: ignore[assignment]  # the stubs forget the depth
     usable = np.ascontiguousarray(readable[back][::-1])
     done, _ = run(follower.setup, follower.law, heading, pairs, usable, trial)

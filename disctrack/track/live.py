@@ -123,7 +123,7 @@ class Tracker:
             return 0
         if before is not None and follower.heading is not None:
             (R, t), (R_now, t_now) = before, follower.heading.last
-            follower.heading = Heading((R, t), (R @ R_now.T @ R, 2 * t - t_now))
+            follower.heading = Heading.steady((R, t), (R @ R_now.T @ R, 2 * t - t_now))
         done = self._run(images, rows)
         if done:
             self._found = (rows.R[0].copy(), rows.t[0].copy())

@@ -10,6 +10,7 @@ from calibration.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.render import render_disc
+from disctrack.track import _kernels as kernels
 from disctrack.track.tracking import STUCK_FRAMES, TrackingSettings, _as_one_sensor, track
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
@@ -73,6 +74,32 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     assert np.abs(np.diff(trajectory.q[:, 3:], axis=0)).max() < 0.3
     R = frames.rotation_from_quaternion(trajectory.quaternion)
     assert np.allclose(R, frames.rotation_from_euler(*trajectory.q[:, 3:].T), atol=1e-9)
+
+
+def _predicted(R, t, i):
+    R_next, t_next = np.empty((3, 3)), np.empty(3)
+    kernels._predict.py_func(R[i - 1], R[i - 2], R[i - 3], t[i - 1], t[i - 2], t[i - 3], R_next, t_next)
+    return frames.vector_from_rotation(R[i] @ R_next.T), t[i] - t_next
+
+
+def test_a_prediction_lacks_what_the_acceleration_changes_by(rolling, rng):
+    """What it lacks leaves a trace in the centres, in the direction of the acceleration: in all frames alike."""
+    k = np.arange(6.0)[:, None]
+    axis = np.array([0.36, 0.48, 0.8])
+    R = frames.rotation_from_vector((0.3 + 0.2 * k + 0.05 * k**2) * axis) @ frames.rotation_from_vector(
+        rng.normal(size=3)
+    )
+    t = rng.normal(size=3) + k * rng.normal(size=3) + k**2 * rng.normal(size=3)
+    turn, shift = _predicted(R, t, 4)  # of a steady acceleration, nothing
+    assert np.abs(turn).max() < 1e-12
+    assert np.abs(shift).max() < 1e-12
+    q = rolling[1]
+    R, t = frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
+    lacks = np.array([np.linalg.norm(_predicted(R, t, i)[0]) for i in range(3, N)])
+    steady = [frames.vector_from_rotation(R[i] @ (R[i - 1] @ R[i - 2].T @ R[i - 1]).T) for i in range(3, N)]
+    assert lacks.max() < 0.15 * np.linalg.norm(steady, axis=1).min()  # psidot over the frame rate: 0.08
+    # so it stays below where the template's shape would have to follow
+    assert lacks.max() < kernels._ATTITUDE_TOLERANCE
 
 
 def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pairs, monkeypatch):
