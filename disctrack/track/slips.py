@@ -7,7 +7,8 @@ makes up for is no sign of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from disctrack.track.pose import PoseFits, marker_pixels, whitening
 SHORTEST = 4  # frames: a gleam or a hand is told by the frames' own status
 LEFT_OUT = "it left out"
 REFUSED = "are refused: the dots of the two cameras contradict each other"
-EXPLAINED = 0.9  # of the square of the misfit
+EXPLAINED, TOLD = 0.9, 0.5  # of the square of the misfit: by a slip; or by no delay at all, below
 
 
 def slips_in_words(
@@ -34,24 +35,49 @@ def slips_in_words(
     pairs: range,
 ) -> tuple[str, ...]:
     """Sentences on long stretches of frames refused (n,) for their dots; the other arguments as in `fit_poses`."""
-    said: list[str] = []
+    delay_of = partial(delay_of_right, fits, markers_px, covariance_px2, rig, centres)
+    slips: list[tuple[list[int], int, list[float]]] = []  # rows of each, the images left out, the delays that say so
     unexplained: list[int] = []
     edges = np.flatnonzero(np.diff(np.r_[False, refused, False].astype(int))).reshape(-1, 2)
     for first, end in edges[edges[:, 1] - edges[:, 0] >= SHORTEST]:
-        delay, explained = delay_of_right(fits, markers_px, covariance_px2, rig, centres, np.arange(first, end))
-        ahead = round(abs(delay)) if explained > EXPLAINED else 0
+        delay, explained = delay_of(np.arange(first, end))
+        ahead = round(delay) if explained > EXPLAINED else 0
         if not ahead:
             unexplained += pairs[first:end]
-            continue
-        camera, other = CAMERAS[::-1] if delay > 0 else CAMERAS
+        elif (
+            slips and ahead == slips[-1][1] and _as_late(delay_of, np.arange(slips[-1][0][-1] + 1, first), ahead, fits)
+        ):
+            slips[-1][0].extend(range(first, end))
+            slips[-1][2].append(delay)
+        else:
+            slips.append((list(range(first, end)), ahead, [delay]))
+    said = []
+    for k, (rows, ahead, delays) in enumerate(slips):
+        camera, other = CAMERAS[::-1] if ahead > 0 else CAMERAS
+        always = k == 0 and (
+            rows[0] == 0 or (rows[0] >= SHORTEST and _as_late(delay_of, np.arange(rows[0]), ahead, fits))
+        )
         said.append(
-            f"frames {pairs[first]}-{pairs[end - 1]} {REFUSED}, as if the {camera} camera were {abs(delay):.2f} frames "
-            f"ahead of the {other}: {LEFT_OUT} {ahead} image(s) at frame {pairs[first]}. "
-            f"Number its images from there on higher by {ahead}"
+            f"frames {ranges([pairs[i] for i in rows])} {REFUSED}, as if the {camera} camera were "
+            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}: {LEFT_OUT} {abs(ahead)} image(s) "
+            f"{'before' if always else 'at'} frame {pairs[0] if always else pairs[rows[0]]}. "
+            f"Number its images from there on higher by {abs(ahead)}"
         )
     if unexplained:
         said.append(f"frames {ranges(unexplained)} {REFUSED}")
     return tuple(said)
+
+
+def _as_late(
+    delay_of: Callable[[NDArray[np.intp]], tuple[float, float]], between: NDArray[np.intp], ahead: int, fits: PoseFits
+) -> bool:
+    """Are the frames between two refused stretches, in which the disc may turn about a camera's line, as late as these?
+
+    So are those that say nothing of it, measured by one camera if at all, but for a few.
+    """
+    delay, explained = delay_of(between)
+    by_both = np.isfinite(fits.residuals_px[between]).all(axis=-1).any(axis=-1).all(axis=-1)
+    return round(delay) == ahead if explained > TOLD else bool(by_both.sum() < SHORTEST)
 
 
 def delay_of_right(

@@ -124,7 +124,7 @@ def track(
     status = tracking.trajectory.frame_status
     one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)
     left_out = any(LEFT_OUT in doubt for doubt in tracking.doubts)  # which makes cameras contradict each other
-    if one_sided or (np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY and not left_out):
+    if (one_sided or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY) and not left_out:
         first = np.flatnonzero((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))[0]
         if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
             told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"

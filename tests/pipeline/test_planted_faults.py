@@ -249,6 +249,17 @@ def test_a_camera_that_left_out_an_image_is_named_with_the_frame(clip):
     assert "left out 1 image(s) at frame 9" in found.doubts[0]
 
 
+def test_a_camera_that_stays_ahead_is_told_once(clip):
+    """Although its frames are refused in pieces: two images between them show nothing."""
+    images = clip.images.copy()
+    images[9:-2, 1] = images[11:, 1]
+    images[25:27, 0] = 0
+    found = measure(images[:-2], clip.rig, clip.disc)
+    (told,) = [doubt for doubt in found.doubts if "ahead of" in doubt]
+    assert "frames 9-24, 27-45 are refused" in told
+    assert "left out 2 image(s) at frame 9." in told
+
+
 def test_exchanged_frames_of_both_cameras_lie_on_no_motion(clip):
     images = clip.images.copy()
     images[[20, 22]] = images[[22, 20]]
