@@ -1,6 +1,6 @@
 """Inner corners of a ChArUco board in one image: OpenCV reads the markers, `corner_fit` locates the corners.
 
-The board may be partly out of view or covered: every marker says where it belongs.
+The board may be partly out of view or covered, or printed as a negative: every marker says where it belongs.
 """
 
 from __future__ import annotations
@@ -28,6 +28,11 @@ def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFo
     step = level_step(grey)
     values = grey // step if step > 1 else grey
     corners, ids = _detected(as_8_bit(values), board)
+    if len(ids) < LEAST_CORNERS:  # prints with light and dark exchanged are about, too: their markers say so
+        negative = np.asarray(values.max() - values, values.dtype)
+        found, numbers = _detected(as_8_bit(negative), board)
+        if len(numbers) > len(ids):
+            values, corners, ids = negative, found, numbers
     columns, rows = board.inner_corners
     if len(ids) < LEAST_CORNERS:
         return BoardNotFound(

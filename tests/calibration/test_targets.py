@@ -106,6 +106,15 @@ def test_charuco_corners_are_located_several_times_better_than_opencvs(rng):
     assert np.sqrt(np.mean(theirs**2)) > 0.02
 
 
+def test_a_charuco_board_printed_as_a_negative_is_found_where_it_is(rng):
+    R, t = pose(CHARUCO, (20, -15, 10), distance=0.28)
+    image, truth = photograph(print_of(CHARUCO), R, t, rng=rng), pixels_of(CHARUCO, R, t)
+    view = find_charuco(255 - image, CHARUCO)
+    assert isinstance(view, CornerView), view
+    assert view.accepted.all()
+    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.006
+
+
 def test_a_charuco_board_may_reach_out_of_the_image(rng):
     R, t = pose(CHARUCO, (-10, 20, 170), aside=(0.07, 0.04))
     truth = pixels_of(CHARUCO, R, t)
