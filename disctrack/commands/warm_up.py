@@ -12,6 +12,7 @@ from disctrack.commands import DONE
 from disctrack.progress import compiling
 from disctrack.readers import _lzw as lzw
 from disctrack.readers import _png as png
+from disctrack.render import board_raster, disc_raster
 from disctrack.rolling import _assembly as assembly
 from disctrack.rolling import integrate
 from disctrack.track import _kernels as kernels
@@ -20,7 +21,7 @@ from disctrack.track.tracking import prepare
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile what reading, calibrating, tracking and simulating use; returns the exit code."""
+    """Compile what reading, calibrating, tracking, simulating and rendering use; returns the exit code."""
     compiled: list[None] = []
     with when_compiling(lambda: compiled.append(None)):
         with compiling("readers", 1):
@@ -37,6 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
             for scalar in (float, complex):
                 integrate.prepare(scalar)
                 assembly.prepare(scalar)
+        with compiling("rendering", 10):
+            disc_raster.prepare()
+            board_raster.prepare()
     where = f"kept in {kernels.track_frames.stats.cache_path}" if compiled else "those that ship fit this machine"
     print(f"inner loops are compiled: {where}")
     return DONE

@@ -7,11 +7,20 @@ second order.
 
 from __future__ import annotations
 
+from typing import Any
+
+from numba import types
+
 from calibration.arrays import Array, Array32
 from calibration.compiled import njit
 
+Point = tuple[float, float, float]
+RAYS = types.Array(types.float64, 3, "C", readonly=True)  # `rays.corner_rays`
+RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **RULES)  # called by compiled functions only
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+@part
 def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
     """Area and first moments (in x, in y) of the part of the square [-1/2, 1/2]^2 on which f0 + a x + b y > 0.
 
@@ -41,14 +50,14 @@ def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
     return area, m if a > 0.0 else -m, n if b > 0.0 else -n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def cell_part(c: float, f00: float, f01: float, f10: float, f11: float) -> tuple[float, float, float]:
     """`half_plane` of the cell with f > 0 from f at its centre and corners [row][column]; curvature in second order."""
     mean = 0.25 * (f00 + f01 + f10 + f11)
     return half_plane(c + (mean - c) / 3.0, 0.5 * (f01 + f11 - f00 - f10), 0.5 * (f10 + f11 - f00 - f01))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, moment_y: float) -> None:
     """Add light to a cell, its first moments to the neighbours: else an edge would lie on the cells' lattice.
 
@@ -63,8 +72,17 @@ def deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, momen
         cells[y + 1, x] += 0.5 * moment_y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def plane_point(eye: Array, dx: float, dy: float, dz: float, height: float) -> tuple[float, float, bool]:
+@part
+def seen_from(R: Array, t: Array) -> Point:
+    """The camera's centre in body axes, -R^T t, of R_camera_body, t_camera_body."""
+    x = R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2]
+    y = R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2]
+    z = R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2]
+    return -x, -y, -z
+
+
+@part
+def plane_point(eye: Point, dx: float, dy: float, dz: float, height: float) -> tuple[float, float, bool]:
     """Point (x, y) of the ray eye + t d in the plane z = height, and whether it lies ahead."""
     if dz == 0.0:
         return 0.0, 0.0, False
@@ -72,7 +90,7 @@ def plane_point(eye: Array, dx: float, dy: float, dz: float, height: float) -> t
     return eye[0] + t * dx, eye[1] + t * dy, t > 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def between(rays: Array, v: int, u: int, p: float, q: float) -> tuple[float, float]:
     """Bilinear interpolation at row fraction p, column fraction q of directions at the corners of pixel (v, u)."""
     a, b, c, d = (1 - p) * (1 - q), (1 - p) * q, p * (1 - q), p * q
@@ -82,7 +100,7 @@ def between(rays: Array, v: int, u: int, p: float, q: float) -> tuple[float, flo
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def ray_in_body(R: Array, rx: float, ry: float) -> tuple[float, float, float]:
     """Direction R^T (rx, ry, 1) in the axes of a body, R = R_camera_body."""
     return (

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import types
 
 from calibration.arrays import Array, Array32
 from calibration.compiled import njit
-from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
+from disctrack.render.areas import (
+    RAYS,
+    RULES,
+    Point,
+    between,
+    cell_part,
+    deposit,
+    part,
+    plane_point,
+    ray_in_body,
+    seen_from,
+)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _board_colour(x: float, y: float, n_x: int, n_y: int, margin: float) -> int:
     """0 outside the board, 1 white, 2 black, at (x, y) in squares from the lower left inner corner."""
     if x < -1.0 - margin or x > n_x + margin or y < -1.0 - margin or y > n_y + margin:
@@ -20,7 +32,7 @@ def _board_colour(x: float, y: float, n_x: int, n_y: int, margin: float) -> int:
     return 2 if (i + j) % 2 == 0 else 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _nearest_line(x: float, n: int, margin: float) -> float:
     """The board's straight edge nearest to coordinate x: a line between squares or the paper's edge."""
     line = min(max(np.round(x), -1.0), float(n))
@@ -30,9 +42,9 @@ def _nearest_line(x: float, n: int, margin: float) -> float:
     return line
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _board_grid(
-    grid: Array, p0: float, q0: float, size: float, rays: Array, row: int, column: int, R: Array, eye: Array,
+    grid: Array, p0: float, q0: float, size: float, rays: Array, row: int, column: int, R: Array, eye: Point,
     bent: Array,
 ) -> bool:  # fmt: skip
     """Board coordinates of 3 x 3 points of a cell (size: of the pixel), and whether the rays all meet the board.
@@ -57,7 +69,7 @@ def _board_grid(
     return ahead
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _beyond(grid: Array, k: int, line: float) -> tuple[float, float, float]:
     """`cell_part` of what lies beyond a line of coordinate k."""
     return cell_part(
@@ -65,13 +77,13 @@ def _beyond(grid: Array, k: int, line: float) -> tuple[float, float, float]:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _within(grid: Array, k: int, p: float, q: float) -> float:
     """Coordinate k at row fraction p and column fraction q of a cell."""
     return (1 - p) * ((1 - q) * grid[0, 0, k] + q * grid[0, 2, k]) + p * ((1 - q) * grid[2, 0, k] + q * grid[2, 2, k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) -> tuple[float, float, float]:
     """Mean grey of one cell that lines may cross, and its first moments."""
     x, y = grid[1, 1, 0], grid[1, 1, 1]
@@ -101,7 +113,7 @@ def _board_cell(grid: Array, colours: Array, n_x: int, n_y: int, margin: float) 
     return low + step * part[0], step * part[1], step * part[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, **RULES)
 def draw_board(
     cells: Array32, background: Array32, rays: Array, s: int, R: Array, t: Array, square: float, n_x: int, n_y: int,
     margin: float, white: float, black: float, bent: Array,
@@ -111,7 +123,8 @@ def draw_board(
     R, t     : R_camera_board, t_camera_board; the board's origin is its lower left inner corner
     n_x, n_y : inner corners along the long and the short side; `margin` in squares; bent: see `_board_grid`
     """
-    eye = -R.T @ t / square
+    x, y, z = seen_from(R, t)
+    eye = (x / square, y / square, z / square)
     colours = np.array([0.0, white, black])
     grid = np.empty((3, 3, 2))
     for row in range(cells.shape[0] // s):
@@ -142,3 +155,10 @@ def draw_board(
                     colours[0] = background[y0 + i, x0 + j]
                     value, m_x, m_y = _board_cell(grid, colours, n_x, n_y, margin)
                     deposit(cells, y0 + i, x0 + j, value, m_x, m_y)
+
+
+def prepare() -> None:
+    """Compile what draws the chessboard, or load it."""
+    cells, number, row, rows = types.float32[:, ::1], types.float64, types.float64[::1], types.float64[:, ::1]
+    draw_board.compile((cells, cells, RAYS, types.int64, rows, row, number, types.int64,
+                        types.int64, number, number, number, row))  # fmt: skip

@@ -8,18 +8,30 @@ cells are many: 20 ms for a disc that fills a third of 512 x 512 with s = 5.
 from __future__ import annotations
 
 import numpy as np
+from numba import types
 
 from calibration.arrays import Array, Array32
 from calibration.compiled import njit
-from disctrack.render.areas import between, cell_part, deposit, plane_point, ray_in_body
+from disctrack.render.areas import (
+    RAYS,
+    RULES,
+    Point,
+    between,
+    cell_part,
+    deposit,
+    part,
+    plane_point,
+    ray_in_body,
+    seen_from,
+)
 
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane ahead of the camera
 _N_FIELDS = 11
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _disc_fields(
-    rx: float, ry: float, R: Array, eye: Array, radius: float, h: float, cap: float, paper: Array, dots: Array,
+    rx: float, ry: float, R: Array, eye: Point, radius: float, h: float, cap: float, paper: Array, dots: Array,
     dot_radius: float, fields: Array, row: int, column: int,
 ) -> None:  # fmt: skip
     """Signed distances [m] at one ray, positive inside, into fields[row, column].
@@ -51,7 +63,7 @@ def _disc_fields(
         fields[row, column, 5] = 1.0 if -h <= z <= h else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _diagonal(edge: Array, column: int, k: int) -> float:
     """The longer diagonal of the quadrilateral of the feet (k, k + 1) at a pixel's corners, and a fifth for safety."""
     last = column + 1
@@ -61,7 +73,7 @@ def _diagonal(edge: Array, column: int, k: int) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _uncut(edge: Array, column: int, k: int, slack: float) -> bool:
     """No edge of surface k passes between four corners of one sign, but for a bulge of less than `slack`."""
     a, b, c, d = edge[0, column, k], edge[0, column + 1, k], edge[1, column, k], edge[1, column + 1, k]
@@ -69,9 +81,9 @@ def _uncut(edge: Array, column: int, k: int, slack: float) -> bool:
     return low > slack or high < -slack
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _fill_circle(
-    cells: Array32, y0: int, x0: int, s: int, weight: float, rays: Array, v: int, u: int, R: Array, eye: Array,
+    cells: Array32, y0: int, x0: int, s: int, weight: float, rays: Array, v: int, u: int, R: Array, eye: Point,
     cap: float, circle: tuple[float, float, float], inner: float, outer: float, f: Array,
 ) -> None:  # fmt: skip
     """Add a pixel of the cap that only the circle (x, y, radius) crosses; f is (2, s + 1) of workspace."""
@@ -88,9 +100,9 @@ def _fill_circle(
             deposit(cells, y0 + i - 1, x0 + j, weight * outer + step * area, step * m_x, step * m_y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _circle_distance(
-    rays: Array, v: int, u: int, p: float, q: float, R: Array, eye: Array, cap: float,
+    rays: Array, v: int, u: int, p: float, q: float, R: Array, eye: Point, cap: float,
     circle: tuple[float, float, float],
 ) -> float:  # fmt: skip
     rx, ry = between(rays, v, u, p, q)
@@ -100,7 +112,7 @@ def _circle_distance(
     return circle[2] - np.sqrt(x * x + y * y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, **RULES)
 def draw_disc(
     cells: Array32, background: Array32, corner: tuple[int, int], rays: Array, s: int, weight: float, R: Array,
     t: Array, radius: float, h: float, paper: Array, dots: Array, dot_radius: float, grey: Array,
@@ -114,7 +126,7 @@ def draw_disc(
     dots              : (m, 2) true centres on the upper face [m]
     grey              : paper, dot, rim, side, underside
     """
-    eye = -R.T @ t
+    eye = seen_from(R, t)
     cap = -h if eye[2] < 0.0 else h  # the plane of the cap that looks to the camera
     cap_visible, upper = abs(eye[2]) > h, eye[2] > 0.0
     ring, side = (grey[2] if upper else grey[4]), grey[3]
@@ -180,18 +192,18 @@ def draw_disc(
                     deposit(cells, y0 + i, x0 + j, weight * value, weight * m_x, weight * m_y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _larger(first: tuple[float, float, float], second: tuple[float, float, float]) -> tuple[float, float, float]:
     return first if first[0] >= second[0] else second
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _part(centre: Array, f: Array, i: int, j: int, k: int) -> tuple[float, float, float]:
     """`cell_part` of surface k."""
     return cell_part(centre[0, 0, k], f[i, j, k], f[i, j + 1, k], f[i + 1, j, k], f[i + 1, j + 1, k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part
 def _disc_cell(
     centre: Array, f: Array, i: int, j: int, back: float, grey: Array, ring: float, upper: bool, cap_visible: bool,
 ) -> tuple[float, float, float]:  # fmt: skip
@@ -217,3 +229,11 @@ def _disc_cell(
     dot = _part(centre, f, i, j, 2)
     step = grey[1] - grey[0]
     return value + step * min(dot[0], paper[0], cap[0]), m_x + step * dot[1], m_y + step * dot[2]
+
+
+def prepare() -> None:
+    """Compile what draws the disc, or load it."""
+    cells, number, row, rows = types.float32[:, ::1], types.float64, types.float64[::1], types.float64[:, ::1]
+    corner = types.UniTuple(types.int64, 2)
+    draw_disc.compile((cells, cells, corner, RAYS, types.int64, number, rows, row, number, number,
+                       row, rows, number, row))  # fmt: skip

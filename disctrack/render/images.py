@@ -142,7 +142,7 @@ def expected_disc_image(
     if x0 < x1 and y0 < y1:
         # the window in cells, with the reach of the blur on each side; padded coordinates start `pad` before the image
         box = (slice(y0 * s, (y1 + 2 * pad) * s), slice(x0 * s, (x1 + 2 * pad) * s))
-        background = stage.cells[box]
+        background = np.ascontiguousarray(stage.cells[box])
         cells = np.zeros_like(background)
         disc = true_disc.disc
         dots = disc.marker_centres_body[:, :2] if visible is None else disc.marker_centres_body[visible, :2]

@@ -69,7 +69,9 @@ def bent_rays(rays: Array, pad: int, field: Callable[[Array], Array]) -> Array:
     rows, columns = np.mgrid[: rays.shape[0], : rays.shape[1]]
     off = field(np.stack([columns, rows], axis=-1) - pad - 0.5)
     by_row, by_column = np.gradient(rays, axis=(0, 1))
-    return np.asarray(rays - by_column * off[..., :1] - by_row * off[..., 1:])
+    bent = np.asarray(rays - by_column * off[..., :1] - by_row * off[..., 1:])
+    bent.flags.writeable = False  # as those that they are made of: what draws is compiled for such
+    return bent
 
 
 def table_points(view: View, pad: int) -> Array:

@@ -177,7 +177,9 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
 
 
 def test_area_and_moments_of_a_half_plane_in_a_cell(rng):
-    from disctrack.render.areas import half_plane
+    from disctrack.render import areas
+
+    half_plane = areas.half_plane.py_func
 
     grid = (np.arange(500) + 0.5) / 500 - 0.5
     x, y = np.meshgrid(grid, grid)
