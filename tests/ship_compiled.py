@@ -23,7 +23,7 @@ from numba.core.ccallback import CFunc
 from numba.core.compiler_lock import global_compiler_lock
 
 from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, normal_equations
-from disctrack.diagnosis.equations import _ode_kernel
+from disctrack.diagnosis.equations import _ode_kernel, _stiff_kernel
 from disctrack.readers import _lzw, _png
 from disctrack.render import board_raster, disc_raster
 from disctrack.rolling import equations, integrate
@@ -44,6 +44,7 @@ PREPARED = (  # function, what compiles it, for how many types
     *((function, _ode_kernel.prepare, 1) for function in ODE),
     (disc_raster.draw_disc, disc_raster.prepare, 1),
     (board_raster.draw_board, board_raster.prepare, 1),
+    (_stiff_kernel.integrate, _stiff_kernel.prepare, 1),
     (integrate._dop853, lambda: [integrate.prepare(scalar) for scalar in (float, complex)], 2),
     (integrate._evaluate, lambda: [integrate.prepare(scalar) for scalar in (float, complex)], 2),
 )

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import disctrack
-from disctrack.diagnosis.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, terms
+from disctrack.diagnosis.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, loop, terms
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import checked
 from disctrack.diagnosis.equations.formulas import formulas
@@ -532,8 +532,9 @@ def test_an_input_held_for_an_hour_costs_a_step_a_sample(rng):
     assert np.abs(residual).max() * 1e-3 < 1e-9
     p, out = system.numbers({}, samples), np.empty((1, 3000, 1))
     done, steps = kernel.integrate(
-        system.formulas.rhs, np.array([0.3]), p, np.zeros(0, np.int64), samples.time[[0, -1]], 1, samples.knots,
-        samples.pieces, system.sizes, 1e-10, 400_000, samples.time[None].copy(), out,
+        system.formulas.rhs, np.array([0.3]), p, np.zeros(0, np.int64), np.array([*samples.time[[0, -1]], 0.0]), 1,
+        samples.knots, samples.pieces, system.sizes, 1e-10, 400_000, np.zeros(0), np.zeros(1, np.int64),
+        samples.time[None].copy(), out,
     )  # fmt: skip
     assert done == kernel.DONE
     assert steps < 1.1 * 3000  # 45 000 when the end of a step looked into the next piece
@@ -571,6 +572,100 @@ def test_a_noisy_sensor_of_an_arm_at_rest_loses_nothing(rng):
     assert answer.found == ("quadratic_v",)
     assert within(answer, "quadratic_v.c", 0.8)
     assert not any("stretches" in note for note in answer.notes)
+
+
+def pushed(time):
+    """Nothing for three seconds, then pushes that come and go."""
+    return np.where(time > 3, np.sin(2 * (time - 3)) ** 2, 0.0)
+
+
+def held_arm(friction, time):
+    """An arm that its friction holds until it is pushed, and again between the pushes; by SciPy's implicit method."""
+    push = CubicSpline(time, pushed(time))
+
+    def rates(t, y):
+        return [y[1], 9 * float(push(t)) - 2 * y[1] - friction * np.tanh(y[1] / 1e-6) - 9 * np.sin(y[0])]
+
+    return solve_ivp(rates, (0, time[-1]), [0.02, 0.0], t_eval=time, rtol=1e-9, atol=1e-12, method="Radau").y[0]
+
+
+def test_a_friction_that_holds_is_integrated_with_its_sensitivities():
+    """The explicit method would take 400 000 steps for each second at rest; the implicit one takes over and back."""
+    time = 0.01 * np.arange(1200)
+    numbers = {"g": 9.0, "b": 2.0, "k": 9.0, "c": 0.8}
+    arm = Equations({"x": "v", "v": "g*u - b*v - k*sin(x) - c*sign(v)"}, numbers, inputs=["u"])
+    run = Run(time, {"x": np.zeros(1200)}, 1.0, inputs={"u": pushed(time)})
+    (samples,) = checked(arm, [run])
+    compiled = formulas(arm, [], arm.channels(run))
+    (width,) = (w.name for w in compiled.widths.values())
+    system = EquationSystem(compiled, [samples], np.ones(2), {width: 1e-6})
+    values = {"state.x[run1]": 0.02, "state.v[run1]": 0.0} | numbers
+    names = ["state.x[run1]", *numbers]
+    began = clock.process_time()
+    residual, derivative = system.linearise(values, names)
+    assert clock.process_time() - began < 20.0  # half a minute more by the explicit method alone; compilation counts
+    assert_allclose(-residual[:1200, 0], held_arm(0.8, time), atol=1e-6)
+    assert np.ptp(residual[:250, 0]) < 1e-5 < 0.01 < np.ptp(residual[:, 0])  # at rest, and later it moves
+    for i, name in enumerate(names):
+        moved = [system.linearise(values | {name: values[name] + h}, [])[0] for h in (1e-5, -1e-5)]
+        expected = (moved[1] - moved[0]) / 2e-5
+        assert_allclose(derivative[..., i], expected, atol=0.01 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("friction", [0.8, 0.0])
+def test_friction_that_holds_an_arm_at_rest_is_found(rng, friction):
+    """It sticks for half of the record: 100 s and no answer by the explicit method alone."""
+    time = 0.01 * np.arange(1200)
+    x = held_arm(friction, time) + 1e-3 * rng.standard_normal(1200)
+    arm = Equations({"x": "v", "v": "g*u - b*v - k*sin(x)"}, {"g": 7.5, "b": 1.5, "k": 8.0}, inputs=["u"])
+    offered = [terms.coulomb("v"), terms.quadratic("v"), terms.constant("v")]
+    answer = diagnose(arm, Run(time, {"x": x}, inputs={"u": pushed(time)}), offered)
+    assert answer.found == (("coulomb_v",) if friction else ())
+    assert within(answer, "k", 9.0)
+    if friction:
+        assert within(answer, "coulomb_v.c", friction)
+
+
+def test_a_motion_that_runs_away_is_given_up_early():
+    """Negative friction winds a pendulum up: it takes more steps than any motion of so few samples."""
+    time = 0.02 * np.arange(110)
+    rod = Equations({"th": "w", "w": "-k*sin(th) - c*w"}, {"k": 8.0, "c": 2.0})
+    run = Run(time, {"th": np.cos(time)}, 1.0)
+    (samples,) = checked(rod, [run])
+    system = EquationSystem(formulas(rod, [], rod.channels(run)), [samples], np.ones(2), {})
+    begin = {"state.th[run1]": 0.5, "state.w[run1]": 0.0}
+    assert np.isfinite(system.linearise(begin, [])[0]).all()
+    began = clock.process_time()
+    assert np.isnan(system.linearise(begin | {"c": -9.0}, [])[0]).all()
+    assert clock.process_time() - began < 0.5
+
+
+def test_terms_that_do_not_stand_out_leave_the_fit_that_was_before_them(with_friction, monkeypatch):
+    """Their refit may begin far off; that they describe the data best is told all the same."""
+    asked = with_friction.asked
+    monkeypatch.setattr(loop, "_wald", lambda names, fitted: 0.0)
+    found = loop._certain(asked.system, asked.diagnosis, 0.5)
+    assert not found.found
+    assert found.after.values == asked.diagnosis.before.values
+    assert [c.name for c in found.partial] == ["coulomb_v"]
+    assert found.nearest.cost == asked.diagnosis.after.cost
+
+
+@pytest.mark.parametrize("friction", [True, False])
+def test_a_term_that_only_showed_the_way_is_not_named(rng, monkeypatch, friction):
+    """Growing windows lose a motion that the equations follow by themselves, once a term has led to it."""
+    real = loop.led
+
+    def loses_without_a_term(system, values, begin=None):
+        found = real(system, values, begin)
+        return found if system.promoted else replace(found, followed=0.01)
+
+    monkeypatch.setattr(loop, "led", loses_without_a_term)
+    x = swinging(hidden_friction if friction else lambda x, v: 0.0) + SIGMA * rng.standard_normal(870)
+    answer = diagnose(OSCILLATOR, Run(TIME, {"x": x}, sigma=SIGMA), FIVE)
+    assert answer.found == (("coulomb_v",) if friction else ())
+    assert within(answer, "omega", 12.0)
+    assert ("by way of" in " ".join(answer.notes)) is not friction
 
 
 def test_what_would_help_most_is_told_where_nothing_is_named(rng):

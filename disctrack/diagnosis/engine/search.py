@@ -111,17 +111,21 @@ class Diagnosis:
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
 
-def diagnose(system: System, start: Values, settings: Settings | None = None, rows: Mask | None = None) -> Diagnosis:
+def diagnose(
+    system: System, start: Values, settings: Settings | None = None, rows: Mask | None = None,
+    former: Diagnosis | None = None,
+) -> Diagnosis:  # fmt: skip
     """Fit the base model, look for what it lacks, and say how sure that is.
 
     start : values of the base quantities from which Gauss-Newton converges
     rows : (n,) samples of the fits that are judged by the others; the first part of the time, if not given
+    former : of nearly the same system: the fits of the effects that it found begin where its fits ended, too
     """
     settings = settings or Settings()
     base = fit(system, system.base, start)
     if not (base.converged or _near_enough(system, base)):
         return _refusal(base, settings)
-    answer = _Search(system, settings, rows).run(base)
+    answer = _Search(system, settings, rows, former).run(base)
     if settings.noise is not None or answer.verdict == "unexplained":
         return answer
     # looked for only here: what a large effect does from frame to frame would pass for scatter
@@ -129,7 +133,7 @@ def diagnose(system: System, start: Values, settings: Settings | None = None, ro
     if modes is None:
         return answer
     judged = whitened(system, modes)
-    return replace(_Search(judged, settings, rows).run(base), judged=judged)
+    return replace(_Search(judged, settings, rows, former).run(base), judged=judged)
 
 
 def noise_variance(system: System, fit_: Fit) -> float:
@@ -144,8 +148,15 @@ def noise_variance(system: System, fit_: Fit) -> float:
 
 
 class _Search:
-    def __init__(self, system: System, settings: Settings, rows: Mask | None = None) -> None:
+    def __init__(
+        self, system: System, settings: Settings, rows: Mask | None = None, former: Diagnosis | None = None
+    ) -> None:
         self.system, self.settings = system, settings
+        self.former: dict[frozenset[str], Values] = {}  # by the effects fitted: where their fits ended
+        if former is not None:
+            self.former[frozenset(f.candidate.name for f in former.found)] = former.after.values
+            if former.nearest is not None:
+                self.former[frozenset(c.name for c in former.partial)] = former.nearest.values
         self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
@@ -261,6 +272,8 @@ class _Search:
         ):  # a refit beyond a threshold is long: only where it leads somewhere
             starts = [s for s in starts if self._promising(current, together, s)]
         fits = [self._fit(together, current.fit.values | start) for start in starts]
+        if (ended := self.former.get(frozenset(c.name for c in together))) is not None:
+            fits.append(self._fit(together, ended))
         declared = {q.name: q.declared for q in self.system.base if q.declared is not None}
         if declared and fits and not any(f.converged for f in fits):
             # without the effect the others may have gone so far to make up for it that no step leads back

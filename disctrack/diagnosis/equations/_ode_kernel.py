@@ -22,7 +22,9 @@ RHS = types.void(_f, _v, _v, _v, _v, _v, _m, _m)
 OBSERVE = RHS
 RHS_TYPE = types.FunctionType(RHS)
 
-DONE, NOT_FINITE, TOO_MANY_STEPS = 0, 1, 2
+DONE, NOT_FINITE, TOO_MANY_STEPS, STIFF_CHANGES = 0, 1, 2, 3
+_STABLE = 6.1  # step times the fastest rate, up to which the method is stable (Hairer's code DOP853)
+_OFTEN = 15  # steps in a row at that limit, from which on it is the limit and not the error that holds them back
 
 _A = np.ascontiguousarray(DOP853.A)  # (12, 12)
 _B, _C = np.ascontiguousarray(DOP853.B), np.ascontiguousarray(DOP853.C)
@@ -33,12 +35,12 @@ _SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit 
 
 
 _RULES: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-_entry = njit(cache=True, **_RULES)
-_part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
+entry = njit(cache=True, **_RULES)
+part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
 
 
-@_part
-def _first_after(t, knots):
+@part
+def first_after(t, knots):
     """Index of the first knot beyond t: what numpy.searchsorted finds, that compiles for half a second."""
     low, high = 0, len(knots)
     while low < high:
@@ -50,21 +52,21 @@ def _first_after(t, knots):
     return low
 
 
-@_part
+@part
 def _assign(target, values):
     """As target[:] = values, for which numba compiles the text of an error besides."""
     for i in range(len(target)):
         target[i] = values[i]
 
 
-@_part
-def _piece_at(t, knots):
+@part
+def piece_at(t, knots):
     """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
-    return min(max(_first_after(t, knots) - 1, 0), len(knots) - 2)
+    return min(max(first_after(t, knots) - 1, 0), len(knots) - 2)
 
 
-@_part
-def _inputs_at(t, i, knots, pieces, u, u_rate):
+@part
+def inputs_at(t, i, knots, pieces, u, u_rate):
     """Piecewise cubics (channels, 5, knots - 1), highest power first: the i-th piece at t.
 
     The fifth number is added to the slope: that of an input that is held, which steps.
@@ -76,11 +78,11 @@ def _inputs_at(t, i, knots, pieces, u, u_rate):
         u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d + pieces[c, 4, i]
 
 
-@_part
+@part
 def _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
     """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
     n, k = len(f), len(columns)
-    _inputs_at(t, piece, knots, pieces, u, u_rate)
+    inputs_at(t, piece, knots, pieces, u, u_rate)
     rhs(t, z[:n], p, u, u_rate, f, J, P)
     for i in range(n):
         out[i] = f[i]
@@ -93,40 +95,43 @@ def _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, out)
             out[s + i] = total
 
 
-@_entry
-def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
-    """Fill out (groups, m, len(z0)) with the solution at samples (groups, m), each group increasing.
+@entry
+def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_steps, largest, pointer, samples, out):
+    """Fill out (groups, m, len(z)) with the solution at samples (groups, m), each group increasing.
 
-    z0 : (n (1 + k),) states and their derivatives by k quantities at span[0]
+    z : (n (1 + k),) states and their derivatives by k quantities at span[0]
     columns : (k,) index in p of each quantity; -1 for an initial state
-    span : (2,) first and last instant
+    span : (3,) first and last instant, and the step to begin with (0: as the slope says)
     size : (n,) of the states, to which the tolerance is relative
-    returns : DONE, or why not; number of steps
+    largest : (k,) size of each derivative so far, 0 at first
+    pointer : (groups,) how many samples are filled in
+    returns : DONE, or why not; number of steps. Where the equations have become stiff it stops (STIFF_CHANGES), with z,
+        span, largest and pointer as they are there: `_stiff_kernel.integrate` goes on from these, and this from its.
     """
-    N, n_p = len(z0), len(p)
+    N, n_p = len(z), len(p)
     k = len(columns)
     groups, m = samples.shape
     K = np.zeros((16, N))
     F = np.zeros((7, N))
     f, J, P = np.zeros(n), np.zeros((n, n)), np.zeros((n, n_p))
     u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
-    z, new, work = z0.copy(), np.zeros(N), np.zeros(N)
-    largest = np.zeros(k)
-    pointer = np.zeros(groups, np.int64)
+    new, work, last_stage = np.zeros(N), np.zeros(N), np.zeros(n)
     t, end = span[0], span[1]
-    piece = _piece_at(t, knots)
+    piece = piece_at(t, knots)
     _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
     speed = 0.0
     for i in range(n):
         speed = max(speed, abs(K[0, i]) / size[i])
     h = min(end - t, 0.01 / speed) if speed > 0 else 0.01 * (end - t)
-    steps, rejected, attempts = 0, False, 0
+    if span[2] > 0.0:
+        h = min(end - t, span[2])
+    steps, rejected, attempts, at_limit, calm = 0, False, 0, 0, 0
     while True:
         remaining = end - t
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
         # inputs are smooth between their knots only: a step across one would be rejected more often than not
-        i = _first_after(t + 1e-12 * max(abs(t), 1.0), knots)
+        i = first_after(t + 1e-12 * max(abs(t), 1.0), knots)
         arrival = t + step
         if i < len(knots) and arrival > knots[i]:
             arrival = knots[i]  # to the bit: on the other side of it the inputs are others
@@ -143,6 +148,8 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
                     total += _A[s, j] * K[j, i]
                 work[i] = z[i] + step * total
             _slope(rhs, t + _C[s] * step, piece, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
+        for i in range(n):
+            last_stage[i] = work[i]
         for i in range(N):
             total = 0.0
             for j in range(12):
@@ -230,10 +237,21 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
         for c in range(k):
             for i in range(n):
                 largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
+        # how fast nearby motions part or meet, from two estimates of the state at the end of the step
+        apart, together = 0.0, 0.0
+        for i in range(n):
+            apart += ((K[12, i] - K[11, i]) / size[i]) ** 2
+            together += ((new[i] - last_stage[i]) / size[i]) ** 2
+        if together > 0.0 and step * np.sqrt(apart / together) > _STABLE:
+            at_limit, calm = at_limit + 1, 0
+        else:
+            calm += 1
+            if calm == 6:
+                at_limit = 0
         steps += 1
         t = arrival
         _assign(z, new)
-        before, piece = piece, _piece_at(t, knots)
+        before, piece = piece, piece_at(t, knots)
         if piece != before:
             _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
         else:
@@ -246,36 +264,44 @@ def integrate(rhs, z0, p, columns, span, n, knots, pieces, size, tolerance, max_
         h = h * grow if step >= h * 0.999 else max(h, step * grow)
         if last:
             break
+        if at_limit >= _OFTEN:
+            span[0], span[2] = t, step
+            return STIFF_CHANGES, steps
     return DONE, steps
 
 
-@_entry
+@entry
 def observe_all(observe, times, states, p, knots, pieces, seen, by_state, by_parameter):
     """What the sensors see at instants (m,) in states (m, n): seen (m, w) and derivatives (m, w, n), (m, w, n_p)."""
     u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
     for i in range(len(times)):
-        _inputs_at(times[i], _piece_at(times[i], knots), knots, pieces, u, u_rate)
+        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
         observe(times[i], states[i], p, u, u_rate, seen[i], by_state[i], by_parameter[i])
 
 
-@_entry
+@entry
 def rates_all(rhs, times, states, p, knots, pieces, rates, by_parameter):
     """Rates (m, n) and their derivatives by parameters (m, n, n_p) at instants (m,) in states (m, n)."""
     n = states.shape[1]
     u, u_rate, J = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0]), np.zeros((n, n))
     for i in range(len(times)):
-        _inputs_at(times[i], _piece_at(times[i], knots), knots, pieces, u, u_rate)
+        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
         rhs(times[i], states[i], p, u, u_rate, rates[i], J, by_parameter[i])
+
+
+def compile_for(*wanted: tuple[Any, tuple[Any, ...]]) -> None:
+    """Compile functions for these types of arguments, and for no others; or load them."""
+    for function, arguments in wanted:
+        function.compile(arguments)
+        function.disable_compile()
 
 
 @cache
 def prepare() -> None:
-    """Compile what Python calls for the arrays that it is called with, and for no others; or load it."""
+    """Compile what Python calls for the arrays that it is called with; or load it."""
     whole = types.int64
-    for function, arguments in (
-        (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _m, _cube)),
+    compile_for(
+        (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, whole[::1], _m, _cube)),
         (observe_all, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube)),
         (rates_all, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube)),
-    ):
-        function.compile(arguments)
-        function.disable_compile()
+    )

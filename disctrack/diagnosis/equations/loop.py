@@ -95,7 +95,12 @@ def ask(
     if leading:
         term, way = next(iter(leading.items()))
         system, diagnosis = _whole(system.with_(promoted=(term,)), (term,), way.values, settings)
-        diagnosis = _with_equals(system, diagnosis, leading)
+        if diagnosis.found[0].gain > diagnosis.found[0].threshold:
+            diagnosis = _with_equals(system, diagnosis, leading)
+        else:  # it showed the way, no more: from where it leads the equations follow by themselves
+            notes[-1] = f"the fit goes by way of {term}: without it, growing windows lose the data on the way"
+            values = diagnosis.before.values
+            system, diagnosis = _searched(_sized(system, values), values, settings)
     else:
         system, diagnosis, more = _as_far_as_followed(system, declared, start, settings, stretch)
         notes += more
@@ -149,7 +154,7 @@ def _searched(
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
-    return sharper, diagnose(sharper, diagnosis.before.values, settings, sharper.training)
+    return sharper, diagnose(sharper, diagnosis.before.values, settings, sharper.training, diagnosis)
 
 
 def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
@@ -432,7 +437,7 @@ def _with_memory(
     if not base.converged:
         return None, None, ""
     noise = float(share * size**2)
-    again = diagnose(remembering, base.values, replace(settings, noise=noise), system.training)
+    again = diagnose(remembering, base.values, replace(settings, noise=noise), system.training, diagnosis)
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or remembering), coefficients, text
@@ -459,10 +464,17 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diag
             break
         found = certain
         kept = {n for f in found for n in f.candidate.names}
+        if not found:  # what the others made of themselves beside terms that are gone again leads nowhere
+            after = robust(system, diagnosis.before, block)
+            break
         start = {k: v for k, v in after.values.items() if k in kept or "." not in k or k.startswith("state.")}
         quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
-        after = robust(system, fit(system, quantities, start), block)
+        fits = [fit(system, quantities, values) for values in (start, diagnosis.before.values)]
+        after = robust(system, min(fits, key=lambda f: f.cost), block)
     names = {f.candidate.name for f in found}
+    if diagnosis.found and not found:  # none of them is certain, but it is they that describe the data best
+        partial = tuple(f.candidate for f in diagnosis.found)
+        diagnosis = replace(diagnosis, partial=partial, nearest=robust(system, diagnosis.after, block))
     tried = tuple(
         replace(t, reason="does not stand out from what is left")
         if t.reason == "chosen" and t.candidate.name not in names

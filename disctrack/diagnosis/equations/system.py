@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.diagnosis.equations import _ode_kernel as kernel
+from disctrack.diagnosis.equations import _stiff_kernel
 from disctrack.diagnosis.equations.declared import Parameter, Samples, Term
 from disctrack.diagnosis.equations.formulas import Formulas
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
-MAX_STEPS = 400_000
+LEAST_STEPS, STEPS_PER_SAMPLE, MAX_STEPS = 20_000, 50, 400_000  # after which a motion is given up: mostly it ran away
 FIRST_SHARE = 0.65  # of every stretch: what is fitted to it is judged on the rest
 
 
@@ -196,13 +199,9 @@ class EquationSystem:
                 z0[n * (1 + c) + (-1 - which)] = 1.0
         columns = np.array([max(which, -1) for which in own], np.int64)
         by_number, group_of, times = self._instants(s, p)
-        span = np.array([s.time[0], max(float(times.max()), s.time[0] + 1e-9)])
-        out = np.empty((len(times), m, n * (1 + k)))
-        with np.errstate(all="ignore"):
-            done, _ = kernel.integrate(
-                f.rhs, z0, p, columns, span, n, s.knots, s.pieces, self.sizes, TOLERANCE, MAX_STEPS, times, out,
-            )  # fmt: skip
-        if done != kernel.DONE:
+        out = followed(f.rhs, z0, p, columns, (s.time[0], max(float(times.max()), s.time[0] + 1e-9)), s.knots, s.pieces,
+                       self.sizes, times)  # fmt: skip
+        if out is None:
             return None
         seen, derivative = np.zeros((m, self._w)), np.zeros((m, self._w, k))
         h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, n)), np.zeros((m, self._w, len(p)))
@@ -266,6 +265,34 @@ class EquationSystem:
         rates, by_number = np.zeros(states.shape), np.zeros((*states.shape, len(p)))
         kernel.rates_all(self.formulas.rhs, times, np.ascontiguousarray(states), p, s.knots, s.pieces, rates, by_number)
         return rates, by_number
+
+
+def followed(
+    rhs: Any, z: Array, p: Array, columns: NDArray[np.int64], span: tuple[float, float], knots: Array, pieces: Array,
+    sizes: Array, times: Array,
+) -> Array | None:  # fmt: skip
+    """Motion with its sensitivities (groups, m, len(z)) at times (groups, m); None where it has no end.
+
+    By an explicit method, and by an implicit one for as long as the equations are stiff: a friction that holds.
+    """
+    n, k = len(sizes), len(columns)
+    out = np.empty((*times.shape, len(z)))
+    at, largest, pointer = np.array([*span, 0.0]), np.zeros(k), np.zeros(len(times), np.int64)
+    left = min(max(LEAST_STEPS, STEPS_PER_SAMPLE * times.shape[1]), MAX_STEPS)
+    with np.errstate(all="ignore"):
+        while True:
+            done, steps = kernel.integrate(
+                rhs, z, p, columns, at, n, knots, pieces, sizes, TOLERANCE, left, largest, pointer, times, out
+            )
+            left -= steps
+            if done == kernel.STIFF_CHANGES:
+                _stiff_kernel.prepare()
+                done, steps = _stiff_kernel.integrate(
+                    rhs, z, p, columns, at, n, knots, pieces, sizes, left, pointer, times, out
+                )
+                left -= steps
+            if done != kernel.STIFF_CHANGES:
+                return out if done == kernel.DONE else None
 
 
 def fitted_rows(s: Samples) -> Mask:
