@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose_trajectory
+from disctrack.diagnosis import DiscSystem, diagnose_trajectory, stage
 from disctrack.diagnosis.disc.law_library import Family, families
 from disctrack.diagnosis.disc.learned_law import (
     _busy,
@@ -23,7 +23,7 @@ from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.rolling.effects import effect_from_formulas
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import Unseen, measured
 from tests.oracles.unknown_laws import recording
 
 
@@ -166,3 +166,24 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     assert fitted.reduced_chi_square < 1.1
     strength = law.candidate.names[0]
     assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", [True, False])
+def test_a_law_that_a_found_effect_describes_alone_is_that_effect(monkeypatch, asked):
+    """A table tilted about one axis beside a wrong frame rate: a constant force is the tilt in one number less.
+
+    Control: where no found effect is fitted alone, the law takes the tilt's place.
+    """
+    made = measured(
+        {"table_tilt.tilt_x": 2e-3}, unseen=Unseen(clock=1e-4), seed=3, n=250, theta_deg=11.0, declared_rate=500.0
+    )
+    if not asked:
+        monkeypatch.setattr(stage, "_one_alone_does", lambda *_: False)
+    result = diagnose_trajectory(made, separate=False)
+    assert (result.learned is None) == asked
+    assert [found.candidate.name for found in result.diagnosis.found] == ["table_tilt", "frame_rate"][1 - asked :]
+    assert result.after.reduced_chi_square < 1.05
+    if asked:
+        fit_ = result.after_fit
+        assert abs(fit_.values["table_tilt.tilt_x"] - 2e-3) < 3 * fit_.sigma("table_tilt.tilt_x")
