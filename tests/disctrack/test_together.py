@@ -69,6 +69,16 @@ def test_a_run_of_another_disc_among_them_is_named(rng):
     assert apart(system, found.after, 0.005) == []
 
 
+def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
+    """With a third of their kind the one that is wrong is known."""
+    heavy = {"mass": 2.0, "rate": 0.5}
+    two = {"run_6": heavy, "run_7": {**heavy, "rate": 0.6}}
+    system, found = answer(runs(rng, 9, **two))
+    assert sorted(apart(system, found.after, 0.005)) == [6, 7]
+    system, found = answer(runs(rng, 9, run_5=heavy, **two))
+    assert apart(system, found.after, 0.005) == [7]
+
+
 def test_difference_to_the_others_is_a_chi_square(rng):
     judged = []
     for _ in range(15):
@@ -126,6 +136,25 @@ def test_hypotheses_of_exact_values():
     assert by_text["in proportion to a power of the radius"].numbers["exponent of the radius"][0] == pytest.approx(1.5)
     assert not by_text["the same for all"].holds
     assert len(tested) == 2  # nothing is said of a mass that does not differ
+
+
+def test_the_sigma_of_an_exponent_is_its_scatter_however_small_the_law_s_constant(rng):
+    """Friction of 4e-8 m s^2 by the power 0.6 of the mass, each known to 1 %: 300 draws."""
+    mass = np.array([0.5, 1.0, 1.6, 2.5])
+    values = 4e-8 * mass**0.6
+    sigma = 0.01 * values
+    drawn = [
+        hypotheses(values + sigma * rng.standard_normal(4), np.diag(sigma**2), {"mass": mass.tolist()})
+        for _ in range(300)
+    ]
+    numbers = np.array([
+        next(h for h in of if "power" in h.text).numbers["exponent of the mass"] for of in drawn
+    ])  # fmt: skip
+    # of 300 draws a standard deviation is known to 4 %
+    assert np.std(numbers[:, 0]) == pytest.approx(np.mean(numbers[:, 1]), rel=0.15)
+    assert np.mean(numbers[:, 0]) == pytest.approx(0.6, abs=4 * np.std(numbers[:, 0]) / np.sqrt(300))
+    constant = np.array([next(h for h in of if "power" in h.text).numbers["constant"] for of in drawn])
+    assert np.std(constant[:, 0]) == pytest.approx(np.mean(constant[:, 1]), rel=0.15)
 
 
 @pytest.mark.slow

@@ -43,7 +43,8 @@ def hypotheses(values: Array, covariance: Array, covariates: Mapping[str, Sequen
     Generalised least squares, exact to first order of the groups' uncertainties.
     """
     n = len(values)
-    root = np.linalg.cholesky(covariance)
+    unit = float(np.mean(np.abs(values))) or 1.0  # a friction of 1e-8 m s^2 beside an exponent: numbers of one size
+    root = np.linalg.cholesky(covariance / unit**2)
 
     def tested(text: str, shape: Mapping[str, Array | float]) -> Hypothesis:
         """Shape : covariate over its geometric mean, by its exponent's name, or with a given exponent."""
@@ -51,13 +52,15 @@ def hypotheses(values: Array, covariance: Array, covariates: Mapping[str, Sequen
 
         def misfit(x: Array) -> Array:
             model = x[0] * np.exp(sum((a * np.log(f) for a, f in zip(x[1:], free.values(), strict=True)), np.zeros(n)))
-            return np.asarray(np.linalg.solve(root, values - model), float)
+            return np.asarray(np.linalg.solve(root, values / unit - model), float)
 
-        scale = float(np.mean(np.abs(values))) or 1.0
-        start = np.array([float(np.mean(values)), *np.zeros(len(free))])
-        found = least_squares(misfit, start, x_scale=[scale, *np.ones(len(free))])
-        spread = np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
-        numbers = {k: (float(v), float(s)) for k, v, s in zip(["constant", *free], found.x, spread, strict=True)}
+        start = np.array([float(np.mean(values)) / unit, *np.zeros(len(free))])
+        found = least_squares(misfit, start)
+        units = np.array([unit, *np.ones(len(free))])
+        spread = units * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
+        numbers = {
+            k: (float(v), float(s)) for k, v, s in zip(["constant", *free], units * found.x, spread, strict=True)
+        }
         chi_square = float(2 * found.cost)
         return Hypothesis(text, numbers, chi_square, n - len(start), chi_square + len(start) * float(np.log(n)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from disctrack.diagnosis.engine.fit import Fit, prior_rows, triangle
 from disctrack.diagnosis.together.joint import JointSystem
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
+SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit
+TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
 DETERMINED = 3.0  # sigmas that a prior's sigma makes in a recording, from which the recording itself tells of it
 
 
@@ -78,16 +81,33 @@ def apart(system: JointSystem, fit: Fit, level: float, most: int | None = None) 
 
     level : probability that one recording of many that do fit is named
     most : that may be taken away; a third of them, if not given
-    Each is judged by those that are left.
+    Each is judged by those that are left, to first order about a fit that the first one has moved: those that stand out
+    by far less than it did have to be judged after another fit. Of two either of which fits without the other, as where
+    nobody else has their disc, nobody knows which is wrong: both are named.
     """
     n = len(system.time)
     blocks = Blocks(system, fit)
-    kept, named = list(range(n)), list[int]()
-    while len(kept) > 2 and len(named) < (n // 3 if most is None else most):
+    kept, named, first = list(range(n)), list[int](), 0.0
+    most = n // 3 if most is None else most
+    while len(kept) > 2 and len(named) < most:
         judged = {i: blocks.fits_in(i, kept) for i in kept}
         worst = max(judged, key=lambda i: (-judged[i].p_value, judged[i].statistic / max(judged[i].degrees, 1)))
-        if judged[worst].p_value * n > level:
+        statistic = judged[worst].statistic
+        if judged[worst].p_value * n > level or statistic < SPOILT * first:
             break
-        kept.remove(worst)
-        named.append(worst)
+        first = first or statistic
+        alike = [i for i in kept if i != worst and judged[i].statistic > TWIN * statistic]
+        twins = [i for i in alike if _either_fits(blocks, (i, worst), kept, level / n, SPOILT * first)]
+        for i in (worst, *twins[:1])[: most - len(named)]:
+            kept.remove(i)
+            named.append(i)
     return named
+
+
+def _either_fits(blocks: Blocks, pair: tuple[int, int], kept: Sequence[int], level: float, small: float) -> bool:
+    """Does each of the two fit those of `kept` but the other?   small : a statistic that tells nothing"""
+    for i, other in (pair, pair[::-1]):
+        judged = blocks.fits_in(i, [k for k in kept if k != other])
+        if judged.p_value <= level and judged.statistic >= small:
+            return False
+    return True
