@@ -235,6 +235,37 @@ def test_a_model_without_quantities_is_diagnosed_and_rows_are_judged_as_asked(rn
     assert not diagnose(Line(SIGMA * rng.standard_normal(90), time), {}, Settings(noise=1.0), rows).found
 
 
+class Struck(Line):
+    """A blow in the part of the time that is fitted, or something that stays after it."""
+
+    def __init__(self, observed, time, *names):
+        super().__init__(observed, time)
+        one = lambda name: Candidate(name, name, "motion", name, "", (Quantity(name, "1", 0.1),))  # noqa: E731
+        self.candidates = tuple(one(name) for name in names)
+
+    def linearise(self, values, names):
+        columns = {"blow": np.exp(-(((self.time - 0.3) / 0.1) ** 2)), "stays": np.exp(-((self.time / 0.6) ** 4))}
+        columns["stays"][self.time > 0.65] = 1.0
+        left = self.observed - sum((values.get(n, 0.0) * c for n, c in columns.items()), np.zeros(len(self.time)))
+        J = np.stack([columns[n] for n in names], axis=-1) if names else np.zeros((len(left), 0))
+        return left[:, None] / SIGMA, J[:, None] / SIGMA
+
+
+def test_what_acts_in_the_fitted_part_alone_is_claimed_if_it_is_obvious(rng):
+    """A blow of 15 sigma before what is held out, which says nothing of it. What would stay after it is refused."""
+    time = np.linspace(0, 1, 900)
+    observed = 0.014 * np.exp(-(((time - 0.3) / 0.1) ** 2)) + SIGMA * rng.standard_normal(900)
+    rows = time <= 0.65
+    answer = diagnose(Struck(observed, time, "blow"), {}, Settings(noise=1.0), rows)
+    assert [f.candidate.name for f in answer.found] == ["blow"]
+    assert abs(answer.after.values["blow"] - 0.014) < 4 * answer.after.sigma("blow")
+    wrong = diagnose(Struck(observed, time, "stays"), {}, Settings(noise=1.0), rows)
+    (tried,) = wrong.tried
+    assert tried.gain > 20
+    assert tried.held_out_gain < -20
+    assert not wrong.found
+
+
 def test_a_quantity_that_the_data_do_not_see_is_open_and_its_neighbour_is_not(rng):
     time = np.linspace(0, 1, 50)
     system = Line(SIGMA * rng.standard_normal(50), time)

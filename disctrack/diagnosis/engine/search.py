@@ -25,6 +25,7 @@ from disctrack.diagnosis.engine.significance import TWO_SIDED
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, Values, hurried, several_minima
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
+OBVIOUS = 5.0  # times the gain that noise alone does not reach
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
@@ -318,9 +319,20 @@ class _Search:
             judged = self._judged(current, trial)
             if len(extra) == 1 and self.refits[extra[0].name] is trial:
                 self.refits[extra[0].name] = judged
-            if chosen is None and judged.held_out_gain is not None and judged.held_out_gain > 0:
+            if chosen is None and self._foretells(judged, extra):
                 chosen = judged
         return chosen
+
+    def _foretells(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
+        """Are samples that were not fitted more probable with it?
+
+        Of what noise does not reach by far the fitted part may know all: then they need only not speak against it.
+        """
+        held = trial.held_out_gain
+        if held is None:
+            return False
+        k = len({n for c in extra for n in c.names})
+        return held > 0 or (held > -CLASS_GAIN and trial.gain > OBVIOUS * self.threshold(k))
 
     def _nearly_all(self, before: Trial, after: Trial) -> bool:
         """Does the enlargement remove nine tenths of what exceeds the noise?"""
