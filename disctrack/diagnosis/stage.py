@@ -15,6 +15,7 @@ from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc.errors import energy_balance, errors
 from disctrack.diagnosis.disc.form_misfit import with_form
 from disctrack.diagnosis.disc.learned_law import (
+    ALIKE,
     UNLIKELY,
     LearnedLaw,
     in_two_steps,
@@ -31,11 +32,11 @@ from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
-from disctrack.diagnosis.engine.memory import with_memory
+from disctrack.diagnosis.engine.memory import inflation, with_memory
 from disctrack.diagnosis.engine.score import Linearisation, score_all
 from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings
 from disctrack.diagnosis.engine.shape import refine_shapes
-from disctrack.diagnosis.engine.significance import price_of_a_number
+from disctrack.diagnosis.engine.significance import price_of_a_number, wald
 from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import law_text, sentence
@@ -108,6 +109,8 @@ def diagnose_trajectory(
         not_noise = left is not None and not left.white
         wider, course = with_form(system, remembering, learned.law, diagnosis.noise, not_noise)
         learned = replace(learned, fit=wider, course=course)
+        diagnosis, doubted = _beside_any_form(diagnosis, kept, wider)
+        also = (*also, *doubted)
     else:
         diagnosis = replace(diagnosis, after=with_memory(_judged(diagnosis, system), diagnosis.after))
     fit_ = learned.fit if learned else diagnosis.after
@@ -250,7 +253,7 @@ def _beyond_the_catalogue(
     elif of_motion and not explained:  # they describe most of it, and the law may be what is left
         sets.append(diagnosis.found)
     answers = [_law_beside(system, diagnosis, kept) for kept in sets]
-    best = min((a for a in answers if a is not None), key=lambda a: (not a.fit.converged, a.length), default=None)
+    best = _with_fewest_claims([a for a in answers if a is not None])
     if best is None:
         return None, (), ()
     plain, law, system, fitted = system, best.law, best.system, best.fit
@@ -265,7 +268,8 @@ def _beyond_the_catalogue(
     gain = (base.cost - fitted.cost) / diagnosis.noise
     work = energy_balance(system, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(system.time[-1] - system.time[0])
-    notes = [f"{other} describes what is missing as well" for other in law.alike]
+    alike = [*law.alike, *(_words(a) for a in answers if a is not None and a is not best and _as_good(a, best))]
+    notes = [f"{other} describes what is missing as well" for other in alike]
     if diagnosis.found and diagnosis.after.reduced_chi_square <= diagnosis.settings.at_noise * diagnosis.noise:
         known_ones = ", ".join(f.candidate.name for f in diagnosis.found)
         notes.append(
@@ -274,6 +278,27 @@ def _beyond_the_catalogue(
             f"{saved:.4g}"
         )
     return Learned(law, fitted, held, gain, float(held_gain), power), best.kept, tuple(notes)
+
+
+def _with_fewest_claims(answers: Sequence[_Beside]) -> _Beside | None:
+    """Of the laws that describe the data as well as the shortest, the one beside the fewest known effects.
+
+    An effect is claimed beside a law where without it all laws are longer.
+    """
+    if not answers:
+        return None
+    shortest = min(answers, key=lambda a: (not a.fit.converged, a.length))
+    as_good = [a for a in answers if _as_good(a, shortest)]
+    return min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length), default=shortest)
+
+
+def _as_good(answer: _Beside, best: _Beside) -> bool:
+    return answer.fit.converged and answer.length - best.length < ALIKE
+
+
+def _words(answer: _Beside) -> str:
+    known = ", ".join(f.candidate.name for f in answer.kept)
+    return f"{answer.law.title}, beside {known}," if known else answer.law.title
 
 
 def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequence[Found], best: _Beside) -> bool:
@@ -297,12 +322,10 @@ def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequenc
 
 
 def _length(system: DiscSystem, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
-    """Chi-square with the price of the fitted numbers and, where one explains all, of having picked known effects."""
+    """Chi-square with the price of the fitted numbers, and of having picked known effects among so many."""
     numbers = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
-    length = fitted.cost / diagnosis.noise + numbers * price_of_a_number(system.weights)
-    if diagnosis.verdict == "found":  # both were looked for, among so many laws, and among so many effects
-        length += 2.0 * float(np.log(len(diagnosis.tried))) * len(found)
-    return length
+    picked = 2.0 * float(np.log(max(len(diagnosis.tried), 1))) * len(found)
+    return fitted.cost / diagnosis.noise + numbers * price_of_a_number(system.weights) + picked
 
 
 def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> _Beside | None:
@@ -310,7 +333,8 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     explained = diagnosis.verdict == "found"
     base = _beside_them(diagnosis.before, kept)
     along = diagnosis.after if diagnosis.found else diagnosis.nearest
-    law = learn(system, base, diagnosis.noise, along, along.cost / diagnosis.noise if explained and along else np.inf)
+    rival = along.cost / diagnosis.noise if explained and along else np.inf
+    law = learn(system, base, diagnosis.noise, along, rival, competes=bool(diagnosis.found))
     if law is None:
         return None
     known = system.knowing(law.effect)
@@ -324,17 +348,45 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
     again = list(kept)
     for found in kept:  # in what the law leaves, is it still an effect?
         rest = [f for f in again if f is not found]
+        enough = found.threshold * _as_noise_with_memory(judged, fitted, found.candidate.names, diagnosis.noise)
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
         without = in_two_steps(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / diagnosis.noise
-        if without.converged and gain < found.threshold:
+        if without.converged and gain < enough:
             again, fitted = rest, without
         else:
             again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
-    length = _length(system, diagnosis, fitted, again)
-    if explained:
-        length += law.looked * len(law.families)
+    length = _length(system, diagnosis, fitted, again) + law.looked * len(law.families)
     return _Beside(law, known, fitted, tuple(again), length)
+
+
+def _as_noise_with_memory(system: System, fitted: Fit, names: Sequence[str], noise: float) -> float:
+    """By how much more than white noise what is left, with its memory, lets these numbers gain."""
+    factors = dict(zip(fitted.names, inflation(system, fitted), strict=True))
+    return max(1.0, fitted.reduced_chi_square / noise) * max(factors[name] for name in names) ** 2
+
+
+def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -> tuple[Diagnosis, tuple[str, ...]]:
+    """Without effects beside a law that stand out no longer once the law's form may be another; and a note of each.
+
+    They stay in the fit: with the law they describe the data.
+    kept : effects beside the law.   fitted : with sigmas that know of the form's misfit
+    """
+    doubted, notes = list[Found](), list[str]()
+    for found in kept:
+        candidate = found.candidate
+        index = [fitted.names.index(name) for name in candidate.names]
+        amounts = np.array([fitted.values[q.name] - q.null for q in candidate.quantities])
+        gain = wald(amounts, fitted.covariance[np.ix_(index, index)])
+        if gain > found.threshold:
+            continue
+        doubted.append(found)
+        notes.append(
+            f"{candidate.title} [{candidate.name}] helps the law to describe the data, and is not claimed: with what "
+            f"the law's form may be off by it stands out by {np.sqrt(gain):.2g} sigma"
+        )
+    established = tuple(found for found in diagnosis.found if found not in doubted)
+    return replace(diagnosis, found=established), tuple(notes)
 
 
 def _rivals(

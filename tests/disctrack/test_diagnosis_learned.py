@@ -8,9 +8,11 @@ import pytest
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory, stage
 from disctrack.diagnosis.disc.law_library import Family, families
 from disctrack.diagnosis.disc.learned_law import (
+    GainOfFamily,
     _busy,
     _law,
     _Scan,
+    _various,
     learn,
     learned_moment,
     missing_moment,
@@ -20,7 +22,8 @@ from disctrack.diagnosis.disc.learned_law import (
 )
 from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.system import Quantity
+from disctrack.diagnosis.engine.search import Diagnosis, Found
+from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import Unseen, measured
@@ -138,6 +141,37 @@ def test_of_terms_that_move_together_those_stay_that_do_for_all(rng):
     assert amount == pytest.approx(A[:, which] @ y / (A[:, which] @ A[:, which]), rel=1e-6)
     silent = replace(fitted, values=dict(zip(names, 0.1 * values, strict=True)))
     assert _busy(silent, names) == {}
+
+
+def test_near_the_data_the_law_that_leaves_least_is_fitted_and_far_from_them_the_shortest():
+    """Friction by time: two numbers leave 400 of chi-square too much, which far from the data is within the error."""
+    drifts = [Family(f"degree {n}", ({"load_m": "1.0"},) * (n + 1), kind="drift M") for n in (1, 2, 3, 4)]
+    chi_square, left = 7e5, (8400.0, 8050.0, 8000.0, 7998.0)
+    proposals = [
+        GainOfFamily(family, chi_square - rest, np.zeros(len(family.terms)))
+        for family, rest in zip(drifts, left, strict=True)
+    ]
+    chosen = [[p.family.title for p in _various(proposals, chi_square, of, 1.0, 9.0)] for of in (8100.0, chi_square)]
+    assert chosen == [["degree 3", "degree 4"], ["degree 1", "degree 2"]]
+
+
+def test_an_effect_beside_a_law_is_claimed_only_if_no_form_of_the_law_may_do_as_much():
+    """Two numbers that move together, each open: what both say is judged, with the covariance that is handed over."""
+    quantities = tuple(Quantity(f"spring.{name}", "1", 1.0) for name in ("k", "F"))
+    candidate = Candidate("spring", "spring", "motion", "a spring", "", quantities)
+    values = {"spring.k": -0.6, "spring.F": 0.3}
+    nearly = np.array([[0.2, -0.199], [-0.199, 0.2]])  # what the sum may err by is a fraction of either
+    fitted = Fit(quantities, values, nearly, 1.0, 0.0, 100, True, 3)
+    found = Found(candidate, 300.0, 10.0, 21.6, ())
+    diagnosis = Diagnosis("unexplained", "", (found,), fitted, fitted, None, None, 1.0, ())
+    kept, notes = stage._beside_any_form(diagnosis, [found], fitted)
+    assert kept.found == (found,)
+    assert notes == ()
+    wider = replace(fitted, covariance=4.0 * nearly)
+    kept, (note,) = stage._beside_any_form(diagnosis, [found], wider)
+    assert kept.found == ()
+    assert "[spring]" in note
+    assert "not claimed" in note
 
 
 def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():

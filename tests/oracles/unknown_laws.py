@@ -181,6 +181,43 @@ def nail(strength, place):
     return law
 
 
+def both(*laws):
+    """Two laws at once."""
+
+    def law(disc, now):
+        parts = [one(disc, now) for one in laws]
+        return tuple(sum(part[i] for part in parts) for i in range(3))
+
+    return law
+
+
+def dipole(strength, place):
+    """A magnet along the axis in the field of an upright one below the table; its force by differences of energy."""
+
+    def field(r):
+        away = r / np.linalg.norm(r)
+        return strength * (3 * away * away[2] - K) / np.linalg.norm(r) ** 3
+
+    def law(disc, now):
+        r, step = now.O - np.array(place), 1e-6
+        by_place = [field(r + step * axis) - field(r - step * axis) for axis in np.eye(3)]
+        return np.cross(now.d, field(r)), ZERO, np.array(by_place) @ now.d / (2 * step)
+
+    return law
+
+
+def jet(size, speed, width, middle, angle):
+    """Air blown along a direction in a beam, by the square of the speed past it and the area that stands in its way."""
+    towards, aside = level(angle), level(angle + 0.5 * np.pi)
+
+    def of(disc, now):
+        off = (now.O @ aside - middle) / width
+        past = speed * np.exp(-off * off) - now.v @ towards
+        return size * (abs(now.d @ towards) + 0.1) * past * abs(past) * towards
+
+    return force(of)
+
+
 def azimuth(now):
     return np.arctan2(now.n0[1], now.n0[0])
 
@@ -266,6 +303,52 @@ UNKNOWN: dict[str, Unknown] = {
     ),
     "cross_drag": Unknown(force(lambda d, n: 6e-4 * n.psidot * n.sine * n.n0)),
     "nail": Unknown(nail(3e-10, (0.05, 0.01, -0.02))),
+    "warming": Unknown(  # friction that falls with the heat of what it has dissipated, which cools
+        by_load(lambda d, n: -2e-4 / (1 + d.memory / 2e-4) * rolling(n)),
+        rate_of_memory=lambda d, n, z: (
+            2e-4 * d.m * 9.81 / (1 + z / 2e-4) * np.linalg.norm(n.omega - n.omega[2] * K) - z / 0.3
+        ),
+        remembered=lambda n: 0.0,
+    ),
+    "slipping_thread": Unknown(  # which holds up to a moment, and slips
+        moment(lambda d, n: -6e-5 * d.memory * K),
+        omega3=1.5,
+        rate_of_memory=lambda d, n, z: n.omega[2] - abs(n.omega[2]) * z / 0.25,
+        remembered=lambda n: 0.0,
+    ),
+    "presliding": Unknown(  # friction that builds up over a way, by Dahl
+        by_load(lambda d, n: -1.5e-4 * d.memory * n.m0),
+        rate_of_memory=lambda d, n, z: n.psidot * n.sine * (1 - z * np.sign(n.psidot) * abs(z)) / 0.3,
+        remembered=lambda n: -0.5,
+    ),
+    "loose_ball": Unknown(  # in a tube of the face, in oil
+        lambda d, n: (np.cross(d.memory * n.R[:, 0], -0.0981 * K), ZERO, ZERO),
+        rate_of_memory=lambda d, n, z: (-3e-3 * n.R[2, 0] - z) / 0.02,
+        remembered=lambda n: 0.0,
+    ),
+    "two_materials": Unknown(
+        both(
+            uneven(seam(0.9, 0.045, 6e-6, 4e-3)),
+            by_load(lambda d, n: -1e-4 * smooth((contact(n) @ level(0.9) - 0.045) / 1e-3) * rolling(n)),
+        )
+    ),
+    "dipole_below": Unknown(dipole(4e-9, (0.06, 0.05, -0.05))),
+    "jet": Unknown(jet(2e-2, 1.0, 0.01, 0.02, 0.3)),
+    "force_and_rim": Unknown(
+        both(
+            force(lambda d, n: d.t * np.array([1.2e-3, -3.8e-3, 0.0])),
+            by_load(lambda d, n: -2e-4 * smooth((np.cos(n.phi - 1.0) - 0.5) / 0.1) * rolling(n)),
+        )
+    ),
+    "drag_and_steps": Unknown(
+        both(
+            force(lambda d, n: -0.012 * (n.v @ level(0.5)) * level(0.5)),
+            by_load(lambda d, n: -1.5e-4 * smooth((d.t - 0.35) / 0.005) * rolling(n)),
+        )
+    ),
+    "pad": Unknown(  # a table that leans, as far as it gives way, to where the contact is
+        force(lambda d, n: d.m * 9.81 * 2e-3 * np.tanh((contact(n)[0] - 0.03) / 0.02) * np.array([1.0, 0.0, 0.0]))
+    ),
 }
 
 

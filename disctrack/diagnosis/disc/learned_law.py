@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.errors import simulated
 from disctrack.diagnosis.disc.law_library import Family, families
+from disctrack.diagnosis.disc.left_over import left_over
 from disctrack.diagnosis.disc.motion import STATE_SCALES, state_of
 from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, fit, prior_rows, triangle
@@ -46,7 +47,7 @@ COMES_NEAR = 1.5  # chi-square per degree of freedom, from which on a fit that d
 WIDTHS = ("width", "softness", "length")  # shapes of a law that go with its amount
 IDLE = 1e-12  # share of an amount's variance that is none
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
-EXACT = 0.02  # of chi-square: what a first-order gain may err by where the residual is large
+EXACT = 0.02  # of chi-square: what a first-order gain may err by where the motion is far from the data
 UNLIKELY = 1e-3  # odds below which a law does not count
 ALIKE = 10.0  # chi-square with its price, by which two laws differ that both describe the residual
 NEARLY = 20.0  # chi-square by which a refit may be better than the first order ...
@@ -306,7 +307,12 @@ def _proposal(family: Family, gram: Array, before: Array, right: Array) -> GainO
 
 
 def learn(
-    system: DiscSystem, base: Fit, noise: float, along: Fit | None = None, rival: float = np.inf
+    system: DiscSystem,
+    base: Fit,
+    noise: float,
+    along: Fit | None = None,
+    rival: float = np.inf,
+    competes: bool = False,
 ) -> LearnedLaw | None:
     """The law of few terms that describes what is missing; None if none survives, or where the disc slips.
 
@@ -316,6 +322,8 @@ def learn(
     motion, in the place of what it has beyond the base
     rival : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
     only one that may, to first order, come as near to the data
+    competes : with laws beside known effects: terms are added as long as each gains more than its price, and not only
+    until noise is left
     """
     name = _free_name(system.model)
     price = price_of_a_number(system.weights)
@@ -328,8 +336,12 @@ def learn(
     at_noise = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
     looked = 0.0
     most_terms = 1 if np.isfinite(rival) else MAX_TERMS
-    while law is None or (len(law.families) < most_terms and current.reduced_chi_square > at_noise):
+    while law is None or len(law.families) < most_terms:
         known = system if law is None else system.knowing(law.effect)
+        if law is not None and current.reduced_chi_square <= at_noise and not competes:
+            remains = left_over(known, current, noise)
+            if remains is None or not remains.of_the_motion:
+                break
         if responding(known, current) is None:
             break
         scan = _Scan(known, current) if law is not None or along is None else _Scan(known, along, base.quantities)
@@ -342,7 +354,9 @@ def learn(
             left = [(scan.chi_square - p.gain) / noise for p in worth]
             worth = [p for p, it in zip(worth, left, strict=True) if it < to_beat[bool(p.family.shape)]]
         begin = current if law is not None or along is None else _with_base_only(base, along)
-        chosen = _various(worth, scan.chi_square, noise, price)
+        # to first order gains are exact to how near the two descriptions are, where there is another
+        inexact = scan.chi_square if law is not None or along is None else along.cost
+        chosen = _various(worth, scan.chi_square, inexact, noise, price)
         if np.isfinite(rival):
             # what fits as well in more numbers is not named, but counts in what is known of the force
             kinds = {p.family.kind for p in chosen}
@@ -393,12 +407,17 @@ def _numbers(law: LearnedLaw) -> int:
     return sum(family.n_numbers for family in law.families)
 
 
-def _various(proposals: Sequence[GainOfFamily], chi_square: float, noise: float, price: float) -> list[GainOfFamily]:
-    """The best ones, not more than some of a kind: to first order many of a kind are alike."""
+def _various(
+    proposals: Sequence[GainOfFamily], chi_square: float, inexact: float, noise: float, price: float
+) -> list[GainOfFamily]:
+    """The best ones, not more than some of a kind: to first order many of a kind are alike.
+
+    inexact : chi-square of the motion along which they were looked for
+    """
 
     def rank(p: GainOfFamily) -> tuple[float, float]:
         left = (chi_square - p.gain) / noise
-        return price * p.family.n_numbers + max(left, EXACT * chi_square / noise), left
+        return price * p.family.n_numbers + max(left, EXACT * inexact / noise), left
 
     ranked = sorted(proposals, key=rank)
     found, kinds = list[GainOfFamily](), list[str]()
