@@ -225,8 +225,9 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     n, count = len(pairs), 1
     while n >= SHORTEST_SPLIT * count**2 and count < MOST_STRETCHES and symmetry_order(disc) == 1:
         count *= 2
-    share = (n + WAITED_FOR) / count
-    return [pairs.start, *(pairs.start + round(k * share) - WAITED_FOR for k in range(1, count)), pairs.stop]
+    waited = min(WAITED_FOR, n // (2 * count))
+    share = (n + waited) / count
+    return [pairs.start, *(pairs.start + round(k * share) - waited for k in range(1, count)), pairs.stop]
 
 
 def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[str]]:

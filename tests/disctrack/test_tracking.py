@@ -106,6 +106,7 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
     monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 20)
+    monkeypatch.setattr("disctrack.track.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     one, two = (
         track(blocks_of(images, size=15), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=workers)
         for workers in (1, 2)
@@ -124,6 +125,7 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
 
 def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
     monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 4)
+    monkeypatch.setattr("disctrack.track.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     images = rolling[0].copy()
     images[:20] = 85  # no disc in the first of four stretches of 15 pairs, nor at the start of the second
     runs = [
@@ -144,6 +146,7 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
     monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 20)
+    monkeypatch.setattr("disctrack.track.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     found, third = following.acquire, np.array([[-0.5, -np.sqrt(0.75), 0], [np.sqrt(0.75), -0.5, 0], [0, 0, 1.0]])
     starts = {images[k, 0].tobytes() for k in (30, 31)}
 
