@@ -18,6 +18,7 @@ from calibration.robust_corners import LEAST_SIGMA, WINDOW, saddle_points, smoot
 
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
 MIN_WINDOW = 0.3
+FIRST_REACH = 85.0  # px, of the first fit's window: what it is to tell, blur and noise and places, it tells as well
 EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
 MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of two crossing edges
 BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
@@ -77,8 +78,8 @@ def fit_view(
     points, ok = rough, seen
     axes = local_axes(points, ok, inner_corners)
     starts = _starts(grey, points, axes, blur, 0.7 * min(plain, 0.57))
-    for iterations, tolerance in ((12, 1e-2), (30, 1e-5)):
-        windows = _windows(points, axes, blur, grey.shape, -plain * np.sign(starts[:, 6]))
+    for iterations, tolerance, most in ((12, 1e-2, FIRST_REACH), (30, 1e-5, np.inf)):
+        windows = _windows(points, axes, blur, grey.shape, -plain * np.sign(starts[:, 6]), most)
         fit = _Fit(*fit_corners(grey, windows, starts, curvature, noise, iterations, tolerance))
         displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
         ok = fit.converged & (displaced < MAX_DISPLACEMENT) & seen
@@ -152,14 +153,18 @@ def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array
     return np.stack([(H[:2, axis] - image * H[2, axis]) / w[:, None] for axis in (0, 1)], axis=1)
 
 
-def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array) -> Array:
-    """Window of every corner as the kernel wants it (n, 14); plain (n,) with the sign of the light quadrants."""
+def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array, most: float) -> Array:
+    """Window of every corner as the kernel wants it (n, 14); plain (n,) with the sign of the light quadrants.
+
+    most : [px] half width across an edge, at most
+    """
     A = np.swapaxes(axes, 1, 2)  # columns are the images of i and j
     inverse = np.linalg.inv(A)
     area = np.abs(np.linalg.det(A))
     lengths = np.linalg.norm(axes, axis=-1)
     between = area[:, None] / lengths[:, ::-1]  # distance of neighbouring parallel edges, across them [px]
     half = np.clip(1.0 - (EDGE_MARGIN * blur + 0.7) / between, MIN_WINDOW, MAX_WINDOW)
+    half = np.minimum(half, most / between)
     reach = np.abs(A * half[:, None, :]).sum(-1)
     low, high = np.ceil(points - reach), np.floor(points + reach)
     size = np.array([shape[1], shape[0]])

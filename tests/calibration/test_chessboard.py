@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
+from calibration import Board, BoardNotFound, Camera, CornerView, corner_fit, find_corners
+from calibration._corner_kernel import fit_corners
 from calibration.camera import project, rotation_from_vector
 from calibration.chessboard import grey_values
 from calibration.corner_fit import local_axes
@@ -193,6 +194,27 @@ def test_an_image_too_large_for_the_rough_search_loses_nothing(board_drawer):
     large[700:940, 1500:1820] = image
     offset = np.array([1500, 700])
     assert_allclose(find_corners(large, (9, 6)).points - offset, find_corners(image, (9, 6)).points, atol=1e-4)
+
+
+def test_squares_of_150_px_are_as_well_located_by_a_small_first_window(board_drawer, monkeypatch):
+    board, camera = Board((4, 3), 8e-3), Camera(2400.0, 2410.0, 519.0, 403.0, (0.0,) * 5, (1040, 800))
+    R, t = pose(board, (12.0, 9.0, 7.0), distance=0.13)
+    image = board_drawer(camera, R, t, board, sub=3, rng=np.random.default_rng(8))
+    reaches = []
+
+    def counted(image, windows, *others):
+        reaches.append((windows[:, 1] - windows[:, 0]).max())
+        return fit_corners(image, windows, *others)
+
+    monkeypatch.setattr(corner_fit, "fit_corners", counted)
+    view = find_corners(image, (4, 3))
+    assert reaches[0] < 0.8 * reaches[1]  # the premise
+    monkeypatch.setattr(corner_fit, "FIRST_REACH", np.inf)
+    whole = find_corners(image, (4, 3))
+    sigma = np.sqrt(np.diagonal(view.covariance, axis1=1, axis2=2))
+    assert np.abs((view.points - whole.points) / sigma).max() < 0.2  # the lines' bend is measured a little less well
+    pull = (view.points - project(board.points @ R.T + t, camera)) / sigma
+    assert np.sqrt(np.mean(pull**2)) < 1.6  # 24 numbers
 
 
 def test_squares_of_seven_pixels_are_found_where_opencv_stops(sample_clip):
