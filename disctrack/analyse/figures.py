@@ -123,7 +123,7 @@ def centre_and_contact_path(analysis: Analysis) -> Drawn | None:
             axes.plot(*contact[part[low]], ".", color=INK, markersize=6)
     axes.set(xlabel="x (mm)", ylabel="y (mm)")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.0)
     marks = "; P marks the minima of the nutation." if 0 < len(lows) <= 12 else "."
     caption = f"Seen from above, {motion.time[part[0]]:.3f} to {motion.time[part[-1]]:.3f} s{marks}"
     return Drawn("06_centre_and_contact", "Centre and contact point", caption, figure)
@@ -223,7 +223,7 @@ def axial_rates(analysis: Analysis) -> Drawn | None:
     if _nothing(w3.value):
         return None
     figure, (upper, lower) = panels(7.2, 4.4, 2, margins=NO_TITLE, sharex=True)
-    for axes, series, name in ((upper, w3, "ω₃ (rad/s)"), (lower, wz, "ω_z (rad/s)")):
+    for axes, series, name in ((upper, w3, "ω along e3 (rad/s)"), (lower, wz, "ω along k (rad/s)")):
         _band(axes, time, series, 1.0, BLUE, name)
         axes.axhline(0, color=MUTED, linewidth=0.7)
         axes.set_ylabel(name)
@@ -300,7 +300,11 @@ def contact_forces(analysis: Analysis) -> Drawn | None:
     if _nothing(analysis.series("force_z").value):
         return None
     figure, (upper, lower) = panels(7.2, 5.0, 2, margins=NO_TITLE, sharex=True, height_ratios=(3, 2))
-    for name, colour, label in (("force_z", INK, "F_z"), ("force_n", BLUE, "F_n"), ("force_m", RED, "F_m")):
+    for name, colour, label in (
+        ("force_z", INK, "vertical"),
+        ("force_n", BLUE, "along n0"),
+        ("force_m", RED, "along m0"),
+    ):
         _band(upper, time, analysis.series(name), 1.0, colour, label)
     upper.set_ylabel("force (N)")
     upper.legend(frameon=False, fontsize=9, ncols=3)
@@ -379,9 +383,9 @@ def exponents_against_window(analysis: Analysis) -> Drawn | None:
         return None
     figure, axes = _axes()
     for name, colour, label, sign in (
-        ("n_theta", BLUE, "n_θ", 1),
-        ("n_energy", RED, "n_E", 1),
-        ("n_psidot", GREEN, "-2 n_ψ̇", -2),
+        ("n_theta", BLUE, "nutation", 1),
+        ("n_energy", RED, "energy", 1),
+        ("n_psidot", GREEN, "-2 × precession rate", -2),
     ):
         exponents = [getattr(fit, name) for fit in fits]
         value = sign * np.array([e.value for e in exponents])[good]

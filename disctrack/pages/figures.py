@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from disctrack.files.whole import whole_file, write_whole
-from disctrack.pages.html import Markup
+from disctrack.pages.html import Markup, text
 from disctrack.pages.palette import GRID, INK, MUTED
 
 DPI = 150
@@ -48,6 +49,15 @@ def dress(axes: Axes) -> None:
     axes.tick_params(colors=INK, labelsize=9)
     axes.xaxis.label.set_color(INK)
     axes.yaxis.label.set_color(INK)
+
+
+def plain_powers(axis: Axis) -> None:
+    """Numbers on a logarithmic axis: 3 and 20, not 3 × 10⁰ and 2 × 10¹; powers of ten where it spans many."""
+    low, high = sorted(axis.get_view_interval())
+    if low > 1e-3 and high < 1e5 and high < 1e3 * low:
+        axis.set_major_formatter("{x:g}")
+        digits = "2357" if high < 12 * low else "25" if high < 40 * low else ""
+        axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in digits else "")
 
 
 def panels(
@@ -151,7 +161,7 @@ def gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> Markup:
     """Figures with their captions; `pictures` holds a data URI per figure's name."""
     items = "".join(
         f'<figure><img src="{pictures[drawn.name]}" alt="{escape(drawn.title)}">'
-        f"<figcaption><b>{escape(drawn.title)}.</b> {escape(drawn.caption)}</figcaption></figure>"
+        f"<figcaption><b>{escape(drawn.title)}.</b> {text(drawn.caption)}</figcaption></figure>"
         for drawn in figures
     )
     return Markup(f"<div class=gallery>{items}</div>" if items else "")

@@ -22,9 +22,29 @@ def text(item: str) -> Markup:
 
 
 def typeset(said: str) -> str:
-    """Signs in place of what stands for them in plain text; units only after a number, a bracket or a space."""
+    """Signs in place of what stands for them in plain text; units only after a number, a bracket or a space.
+
+    Angles are Greek where they are words of a sentence or formula; in the name of a key (state.theta) they stay.
+    """
     said = said.replace(" +- ", " ± ").replace("^2", "²").replace("^3", "³").replace(" -> ", " → ")
-    return re.sub(r"(?<=[\d \[(])u(?=(?:m|rad|s|N m)\b)", "µ", said)
+    said = re.sub(r"(?<=[\d \[(])u(?=(?:m|rad|s|N m)\b)", "µ", said)
+    said = re.sub(r"(?<![\w.+])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?![\w…])", _power, said)
+    return re.sub(r"(?<![\w./-])(psi|theta|phi)(dot)?(?![\w/-]|\.\w)", _angle, said)
+
+
+def _power(found: re.Match[str]) -> str:
+    """Of ten: 2.6e-07 is 2.6 × 10⁻⁷."""
+    number, sign, digits = found.groups()
+    return number + "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10" + (sign.replace("+", "") + digits).translate(_RAISED)
+
+
+def _angle(found: re.Match[str]) -> str:
+    name, dot = found.groups()
+    return _GREEK[name] + ("\N{COMBINING DOT ABOVE}" if dot else "")
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_GREEK = {"psi": "ψ", "theta": "θ", "phi": "φ"}
 
 
 def page(title: str, parts: Iterable[str], *, head: str = "") -> str:
@@ -68,16 +88,26 @@ def tiles(named: Iterable[tuple[str, str]]) -> Markup:
 def table(
     caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], classes: Sequence[str] | None = None
 ) -> Markup:
-    """A table that scrolls by itself where the screen is narrow. classes : CSS class of each row"""
+    """A table that scrolls by itself where the screen is narrow; what is said in sentences wraps.
+
+    classes : CSS class of each row
+    """
     rows = list(rows)
     kinds = [f" class={escape(kind, quote=True)}" for kind in classes] if classes else [""] * len(rows)
     top = "".join(f"<th>{text(cell)}</th>" for cell in header)
     body = "".join(
-        f"<tr{kind}>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>"
+        f"<tr{kind}>" + "".join(f"<td{_wraps(cell)}>{text(cell)}</td>" for cell in row) + "</tr>"
         for kind, row in zip(kinds, rows, strict=True)
     )
-    said = f"<caption>{text(caption)}</caption>" if caption else ""
+    said = f"<caption><span>{text(caption)}</span></caption>" if caption else ""
     return Markup(f"<div class=scroll><table>{said}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>")
+
+
+SENTENCE = 48  # characters of a cell from which on it is no number, name or link
+
+
+def _wraps(cell: str) -> str:
+    return " class=said" if len(cell) > SENTENCE and not isinstance(cell, Markup) else ""
 
 
 def details(title: str, parts: Iterable[str]) -> Markup:
@@ -87,9 +117,9 @@ def details(title: str, parts: Iterable[str]) -> Markup:
 
 STYLE = f"""
 :root{{color-scheme:light dark;--ink:{INK};--soft:#4d5a67;--back:#f5f7f9;--card:#fff;--line:{GRID};--mark:{BLUE};
---warn:#fff6e5;--edge:{AMBER};--bad:{RED}}}
+--warn:#fff6e5;--edge:{AMBER};--bad:{RED};--shade:#0003}}
 @media (prefers-color-scheme:dark){{:root{{--ink:#e6ebf0;--soft:#aab5c0;--back:#14191f;--card:#1c232b;--line:#323c47;
---mark:#6db9e8;--warn:#33290f;--bad:#ff9a5c}}}}
+--mark:#6db9e8;--warn:#33290f;--bad:#ff9a5c;--shade:#000a}}}}
 html{{color:var(--ink);background:var(--back);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}}
 body{{margin:0}}main{{max-width:1180px;margin:0 auto;padding:2rem 1.5rem 4rem}}
 h1{{font-size:1.7rem;line-height:1.25;margin:.2rem 0 1rem}}h2{{font-size:1.25rem;margin:0 0 .8rem}}
@@ -105,17 +135,27 @@ section{{background:var(--card);border:1px solid var(--line);border-radius:10px;
 figure{{margin:0 0 1.3rem;break-inside:avoid}}
 figure img{{width:100%;height:auto;display:block;background:#fff;border-radius:4px}}
 figcaption{{color:var(--soft);font-size:.88rem;line-height:1.45;margin-top:.35rem}}
-.scroll{{overflow-x:auto}}table{{border-collapse:collapse;font-size:.85rem;margin:.6rem 0 1rem}}
+.scroll{{overflow-x:auto;background:linear-gradient(90deg,var(--card) 30%,transparent) 0/2rem 100% no-repeat local,
+linear-gradient(270deg,var(--card) 30%,transparent) 100%/2rem 100% no-repeat local,
+linear-gradient(90deg,var(--shade),transparent) 0/.7rem 100% no-repeat scroll,
+linear-gradient(270deg,var(--shade),transparent) 100%/.7rem 100% no-repeat scroll}}
+table{{border-collapse:collapse;font-size:.85rem;margin:.6rem 0 1rem}}
 caption{{text-align:left;color:var(--soft);padding-bottom:.35rem}}
+caption span{{position:sticky;left:0;display:inline-block;max-width:min(100%,calc(100vw - 4rem))}}
 th,td{{text-align:left;padding:.28rem .9rem .28rem 0;border-bottom:1px solid var(--line);white-space:nowrap;
 font-variant-numeric:tabular-nums}}
-td:first-child{{white-space:normal;min-width:14em}}
+td:first-child{{white-space:normal;min-width:9em}}td.said{{white-space:normal;min-width:22em}}
 th{{color:var(--soft);font-weight:600;white-space:normal;vertical-align:bottom}}
 tr.failed td,tr.not td{{color:var(--bad)}}
 details{{margin:.6rem 0}}summary{{cursor:pointer;color:var(--mark)}}
 @media (max-width:40rem){{main{{padding:1rem .8rem 3rem}}section{{padding:1rem .9rem}}h1{{font-size:1.35rem}}
-.gallery{{columns:1}}}}
+.gallery{{columns:1}}td:first-child{{min-width:8em}}td.said{{min-width:16em}}}}
+@page{{margin:14mm 15mm}}
 @media print{{:root{{color-scheme:light;--ink:#000;--soft:#333;--back:#fff;--card:#fff;--line:#ccc;--warn:#fff;
---mark:#000;--bad:#000}}main{{max-width:none;padding:0}}section{{border:0;padding:0}}.scroll{{overflow:visible}}
-td,th{{white-space:normal}}details>*{{display:block}}}}
+--mark:#000;--bad:#000;--shade:transparent}}html{{font-size:11.5px}}main{{max-width:none;padding:0}}
+section{{border:0;padding:0}}.scroll{{overflow:visible;background:none}}.gallery{{columns:auto}}
+figure img{{width:auto;max-width:100%;max-height:98mm}}h1,h2,summary,caption{{break-after:avoid}}
+tr{{break-inside:avoid}}.tiles{{grid-template-columns:repeat(4,1fr)}}td,th{{white-space:normal}}td:first-child{{min-width:11em}}
+td.said{{min-width:20em}}details>*{{display:block}}
+details::details-content{{content-visibility:visible;block-size:auto}}}}
 """

@@ -112,7 +112,8 @@ def _deviations(group: RepeatGroup, found: Spread, stem: str) -> Drawn:
         _lines(axes, found.time, deviation, group.runs)
         axes.set_ylabel(f"{quantity.symbol} - mean ({quantity.unit})")
         reach = float(np.nanpercentile(np.abs(deviation), 99.5)) if np.isfinite(deviation).any() else 1.0
-        axes.set_ylim(-1.3 * reach, 1.3 * reach)
+        if reach > 0:  # or they are copies of each other
+            axes.set_ylim(-1.3 * reach, 1.3 * reach)
     rows[0].legend(frameon=False, fontsize=8, ncols=3)
     rows[-1].set_xlabel(f"time from {group.alignment.zero} (s)")
     caption = "Each run minus the mean of all. What leaves the band is no noise of the cameras."
@@ -140,6 +141,7 @@ def fitted_figure(table: ExponentTable, number: int) -> Drawn | None:
                 color=_colour(groups.index(group)), markerfacecolor=face, linewidth=1.1,
             )  # fmt: skip
         axes.xaxis.set_major_locator(MaxNLocator(3))
+        axes.ticklabel_format(axis="x", useOffset=False)
         axes.set_title(f"{FITTED_LABELS[name]}\n{plus_minus(mean, scale)}", fontsize=9, color=INK)
     grid[0].set_yticks(height, [f"{run.name}" for _, _, run in table.rows], fontsize=8)
     caption = "Fitted to each run, ± 1 σ; band: mean with its σ, weighted where runs agree. Open: away from all others."

@@ -2,15 +2,17 @@
 
 import json
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from disctrack.diagnosis.pages.figures import candidates
 from disctrack.files.json_text import json_file, json_text, plain
 from disctrack.pages import palette
-from disctrack.pages.figures import Drawn, draw, gallery
-from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, warning
+from disctrack.pages.figures import Drawn, draw, gallery, plain_powers
+from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, typeset, warning
 
 
 class Tree(HTMLParser):
@@ -98,3 +100,52 @@ def test_json_holds_no_number_that_json_does_not_know():
     expected = {"a": [None, None, [1, 2]], "b": {"3": [[1.0, None]], "t": True}, "c": "ψ"}
     assert json.loads(json_text(document)) == expected == plain(document)
     assert json_file(document).endswith(b"}\n")
+
+
+def test_numbers_and_angles_are_set_as_people_write_them():
+    assert typeset("k < 2.6e-07 m, -5e+10, 3e5").replace("\xa0", " ") == "k < 2.6 × 10⁻⁷ m, -5 × 10¹⁰, 3 × 10⁵"
+    assert typeset("M = k psidot / sin theta, phi") == "M = k ψ̇ / sin θ, φ"
+    assert typeset("psi + phi. Then theta.") == "ψ + φ. Then θ."
+    for kept in ("state.theta", "theta_deg", "figures/theta.png", "theta.png", "1e", "case1e5", "0.2.0+1e5", "12e45…"):
+        assert typeset(kept) == kept
+
+
+def test_sentences_in_cells_wrap_and_numbers_do_not():
+    said = "gains 4.57, noise alone reaches 21.6; only bounded: translation_x"
+    made = table("", ["a", "b"], [("1.234 ± 0.001", said)])
+    assert made.count("class=said") == 1
+    assert f"<td class=said>{said}" in made
+
+
+def test_a_logarithmic_axis_shows_plain_numbers():
+    for span, few in (
+        ((2.2, 14.0), {"3", "5", "7", "10"}),
+        ((0.3, 5.0), {"0.5", "1", "2", "5"}),
+        ((10.0, 900.0), {"10", "100"}),
+    ):
+        axes = Figure().add_subplot()
+        axes.set_yscale("log")
+        axes.set_ylim(*span)
+        plain_powers(axes.yaxis)
+        shown = {t.get_text() for t in (*axes.get_yticklabels(), *axes.get_yticklabels(minor=True))} - {""}
+        assert few <= shown
+        assert not any("10^" in text for text in shown)
+
+
+def test_a_candidate_without_which_nothing_fits_has_the_longest_bar():
+    def tried(name, score, gain):
+        return SimpleNamespace(candidate=SimpleNamespace(name=name), score=score, gain=gain)
+
+    found = SimpleNamespace(candidate=SimpleNamespace(name="frame_rate"), cannot_be_told_from=())
+    diagnosis = SimpleNamespace(
+        tried=(tried("frame_rate", np.inf, np.inf), tried("kz", 4.0, None), tried("tilt", 900.0, 800.0)),
+        found=(found,),
+        settings=SimpleNamespace(false_alarm=0.005),
+    )
+    drawn = candidates(SimpleNamespace(diagnosis=diagnosis, system=SimpleNamespace(candidates=range(50))))
+    (axes,) = drawn.figure.axes
+    lengths = [bar.get_width() for bar in axes.patches]
+    assert lengths[1:] == [4.0, 800.0]
+    assert np.isfinite(lengths[0])
+    assert lengths[0] > 5 * max(lengths[1:])
+    assert "without it nothing fits" in [text.get_text() for text in axes.texts]

@@ -19,7 +19,7 @@ from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForce
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
 from disctrack.diagnosis.engine.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
-from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels
+from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels, plain_powers
 from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -66,16 +66,16 @@ def superposed(result: DiscDiagnosis, beside: ModelFreeEvidence) -> Drawn:
         theta.plot(instants, np.degrees(motion.q[:, 4]), **style)
         rate.plot(instants, motion.qdot[:, 3], **style)
         path.plot(1e3 * motion.q[:, 0], 1e3 * motion.q[:, 1], **style)
-    labels = ((theta, "nutation angle [deg]"), (rate, "precession rate [rad/s]"), (path, "y [mm]"))
+    labels = ((theta, "nutation angle (deg)"), (rate, "precession rate (rad/s)"), (path, "y (mm)"))
     for axes, label in labels:
         dress(axes)
-        axes.set_xlabel("time [s]")
+        axes.set_xlabel("time (s)")
         axes.set_ylabel(label)
     _frame(theta, np.degrees(q[:, 4]))
     if beside.measured is not None:
         _frame(rate, beside.measured.psidot)
     path.set_aspect("equal")
-    path.set_xlabel("x [mm]")
+    path.set_xlabel("x (mm)")
     theta.legend(frameon=False, fontsize=9, loc="upper right", ncols=3)
     caption = (
         "Nutation angle, precession rate and path of the centre: measured, and the model fitted to the measurement. "
@@ -96,7 +96,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
     """Measured minus fitted pose, before and after, with the band of the noise."""
     system, diagnosis = result.system, result.diagnosis
     figure, grid = panels(9.5, 6.2, 4, 2, (0.95, 0.15, 0.55, 0.3), sharex=True)
-    rows = [("x", 1e6, "um"), ("y", 1e6, "um"), ("z", 1e6, "um"), ("theta", 1e3 * np.degrees(1), "mdeg")]
+    rows = [("x", 1e6, "µm"), ("y", 1e6, "µm"), ("z", 1e6, "µm"), ("θ", 1e3 * np.degrees(1), "mdeg")]
     for column, (fit, name, colour) in enumerate(
         ((diagnosis.before, "before", RED), (result.after_fit, "after", BLUE))
     ):
@@ -108,9 +108,9 @@ def residuals(result: DiscDiagnosis) -> Drawn:
             axes = grid[2 * row + column]
             axes.fill_between(system.time, -2 * scale * noise, 2 * scale * noise, color=GRID, lw=0)
             axes.plot(system.time, scale * value, lw=0.7, color=colour)
-            axes.set_ylabel(f"{label} [{unit}]")
+            axes.set_ylabel(f"{label} ({unit})")
         grid[column].set_title(name, fontsize=10, color=INK)
-        grid[column - 2].set_xlabel("time [s]")
+        grid[column - 2].set_xlabel("time (s)")
     caption = "Measured minus fitted pose. The grey band is two standard deviations of a frame's noise."
     return Drawn("residuals", "Residual before and after", caption, figure)
 
@@ -129,9 +129,9 @@ def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
     noise = np.sqrt(np.sum(e1**2 * sigma[:, 3:] ** 2, axis=1))
     left.semilogy(system.time, 1e3 * np.linalg.norm(sigma[:, :3], axis=1), lw=1, color=MUTED, label="noise")
     right.semilogy(system.time, np.degrees(noise), lw=1, color=MUTED, label="noise")
-    for axes, label in ((left, "error of the position [mm]"), (right, "error of the nutation [deg]")):
+    for axes, label in ((left, "error of the position (mm)"), (right, "error of the nutation (deg)")):
         axes.axvline(last, color=AMBER, lw=1)
-        axes.set_xlabel("time [s]")
+        axes.set_xlabel("time (s)")
         axes.set_ylabel(label)
     left.legend(frameon=False, fontsize=9)
     caption = (
@@ -145,7 +145,9 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     diagnosis = result.diagnosis
     tried = diagnosis.tried[:N_TRIED]
     figure, (axes,) = panels(9.5, 0.6 + 0.28 * max(len(tried), 3))
-    gains = [max(t.gain if t.gain is not None else t.score, 1e-2) for t in tried]
+    gains = np.array([max(t.gain if t.gain is not None else t.score, 1e-2) for t in tried])
+    beyond = ~np.isfinite(gains)  # without it nothing fits: its bar ends beyond all others
+    gains[beyond] = 10.0 * max([100.0, *gains[~beyond]])
     named = {f.candidate.name for f in diagnosis.found}
     alike = {r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from}
     colours = [BLUE if t.candidate.name in named else AMBER if t.candidate.name in alike else MUTED for t in tried]
@@ -155,7 +157,11 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     axes.set_xscale("log")
     level = diagnosis.settings.false_alarm / max(len(result.system.candidates), 1)
     axes.axvline(float(chi2.isf(level, 1)), color=RED, lw=1)
+    plain_powers(axes.xaxis)
     axes.set_xlabel("decrease of chi-square when it is added to the model (red: what noise can do with one number)")
+    for row in np.flatnonzero(beyond):
+        axes.annotate("without it nothing fits", (gains[row], row), (-4, 0), textcoords="offset points", fontsize=8,
+                      ha="right", va="center", color="white")  # fmt: skip
     caption = "The candidates that gain most. Blue: chosen; amber: cannot be told from it."
     return Drawn("candidates", "What was tried", caption, figure)
 
@@ -163,7 +169,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
 def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment | None) -> Drawn:
     """Moment that the model fails to supply, with its two-sigma band, and what the effects found add to it."""
     figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
-    law = None if of_law is None else (of_law.time, of_law.moment)
+    law = None if of_law is None or not result.diagnosis.found else (of_law.time, of_law.moment)
     if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
         law = result.system.time, learned_moment(result.system, result.learned.fit, result.learned.law)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
@@ -177,8 +183,8 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
         _frame(axes, np.concatenate([value - 2 * sigma, value + 2 * sigma, inner]))
         axes.axhline(0.0, color=MUTED, lw=0.7)
         axes.set_ylabel(f"along {name} (µN m)")
-    grid[0].legend(frameon=False, fontsize=9, ncols=2, loc="upper right")
-    grid[-1].set_xlabel("time [s]")
+    grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
+    grid[-1].set_xlabel("time (s)")
     caption = (
         "Contact moment M_n, M_m, M_z that the model before fails to supply, with two standard deviations: what short "
         "moments would have to be for the dots to fall where they did. A missing force, inertia or an error of the "
@@ -204,7 +210,7 @@ def course(known: LawCourse) -> Drawn:
         axes.plot(known.time, value, lw=0.8, marker=".", ms=5, color=BLUE)
         axes.axhline(0.0, color=MUTED, lw=0.7)
         axes.set_ylabel(f"along {name} (µN m)")
-    grid[-1].set_xlabel("time [s]")
+    grid[-1].set_xlabel("time (s)")
     caption = (
         "Moment about the contact of all laws of the model and of the law outside the catalogue, a force at the centre "
         "included as the moment that it has about the contact, at the points shown. The band is two standard "
@@ -223,14 +229,14 @@ def force(result: DiscDiagnosis, measured: ModelFreeForces) -> Drawn:
         value, sigma = 1e3 * (measured.force - before)[:, i], 1e3 * measured.force_sigma[:, i]
         axes.fill_between(system.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
         axes.plot(system.time, value, lw=1.1, color=RED, label="missing")
-        if result.after_fit is not result.diagnosis.before:
+        if result.diagnosis.found or result.learned is not None:
             axes.plot(system.time, 1e3 * (after - before)[:, i], lw=1.0, color=BLUE, label="added by what was found")
         axes.axhline(0.0, color=MUTED, lw=0.7)
-        axes.set_ylabel(f"along {name} [mN]")
+        axes.set_ylabel(f"along {name} (mN)")
         inner = slice(len(value) // 20, -(len(value) // 20) or None)  # derivatives at the ends of a film are poor
         _frame(axes, np.concatenate([value[inner], 1e3 * (after - before)[:, i]]))
-    grid[0].legend(frameon=False, fontsize=9, ncols=2, loc="upper right")
-    grid[-1].set_xlabel("time [s]")
+    grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
+    grid[-1].set_xlabel("time (s)")
     caption = (
         "Force on the disc, measured minus that of the model before, with two standard deviations: mass times the "
         "acceleration of the centre, from the poses alone."
@@ -257,10 +263,12 @@ def spectrum(result: DiscDiagnosis) -> Drawn:
         axes.axvline(f, color=AMBER, lw=0.8)
     for names, f in _joined(lines, 0.02 * top):
         axes.annotate(names, (f, 1.0), (2, -2), xycoords=("data", "axes fraction"), textcoords="offset points",
-                      rotation=90, va="top", fontsize=7, color=MUTED)  # fmt: skip
+                      rotation=90, va="top", fontsize=8, color=INK,
+                      bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5})  # fmt: skip
     axes.set_xlim(0, top)
-    axes.set_xlabel("frequency [Hz]")
+    axes.set_xlabel("frequency (Hz)")
     axes.set_ylabel("power over that of noise")
+    plain_powers(axes.yaxis)
     axes.legend(frameon=False, fontsize=9, loc="upper right")
     caption = "Mean periodogram of the six whitened numbers of the pose residual; white noise lies at 1."
     return Drawn("spectrum", "Spectrum of the residual", caption, figure)

@@ -14,7 +14,7 @@ from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.search import Found, Tried
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.pages.words import shown, together
+from disctrack.diagnosis.pages.words import UNFOLLOWED, shown, together
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
@@ -255,8 +255,13 @@ def lines(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> lis
     if before is None or after is None:
         return found
     found += [
-        f"{'significance':<13} {f.candidate.name}: chi-square rises by {f.gain:.4g} without it (noise alone: "
-        f"{f.threshold:.3g}); gain on held-out data {f.held_out_gain:.4g}"
+        f"{'significance':<13} {f.candidate.name}: "
+        + (
+            f"chi-square rises by {f.gain:.4g} without it (noise alone: {f.threshold:.3g}); gain on held-out data "
+            f"{f.held_out_gain:.4g}"
+            if np.isfinite(f.gain)
+            else UNFOLLOWED
+        )
         for f in result.diagnosis.found
     ]
     if (by_chance := result.diagnosis.chance) is not None:

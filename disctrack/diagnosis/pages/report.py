@@ -10,11 +10,12 @@ import numpy as np
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
+from disctrack.diagnosis.disc.model_file import NONE, PAPER
 from disctrack.diagnosis.engine.search import Found, Tried
 from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.figures import all_figures
-from disctrack.diagnosis.pages.words import effect_text, law_text, quantity_text
+from disctrack.diagnosis.pages.words import UNFOLLOWED, effect_text, law_text, quantity_text
 from disctrack.files.whole import write_whole
 from disctrack.pages.figures import draw, gallery
 from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, text
@@ -32,7 +33,9 @@ def write_report(
 
 
 def _page(result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: str, figures: str) -> str:
-    verdict = f"Verdict: <b>{text(result.diagnosis.verdict)}</b>. Model: {text(result.model)}. "
+    verdict = (
+        f"Verdict: <b>{text(result.diagnosis.verdict)}</b>. Model: {text(MODELS.get(result.model, result.model))}. "
+    )
     parts = [
         paragraph(result.sentence, "lead"),
         paragraph(Markup(verdict + text(_said(result.diagnosis.reason)))),
@@ -46,15 +49,23 @@ def _page(result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: st
     return page(f"{recording}: what does the model lack?", parts)
 
 
+MODELS = {PAPER: "rolling with the losses of Ma et al. 2014 (paper)", NONE: "rolling without losses (none)"}
+WORDS = (
+    "Reduced chi-square: mean square of what is left over that of the noise, 1 where only noise is left. rms: "
+    "root mean square, over dots and both image axes, or over the three axes of the position. Ljung-Box: where it "
+    "is small, errors of neighbouring frames are alike, as those of noise are not. Free run: the model, fitted to "
+    "the first part of the recording, goes on alone over the rest, the held-out data; its noise floor is what it "
+    "would err by if it lacked nothing."
+)
+
+
 def _said(note: str) -> str:
     return f"{note[:1].upper()}{note[1:]}."
 
 
 def _effects(result: DiscDiagnosis) -> str:
     items = [
-        f"{effect_text(f, result.diagnosis)}. Without it chi-square rises by {f.gain:.5g}, "
-        f"{as_sigmas(f.gain, len(f.candidate.quantities)):.4g} sigmas (noise alone: {f.threshold:.3g}); "
-        f"on held-out data it gains {f.held_out_gain:.4g}. {_class_text(f, result)}"
+        f"{effect_text(f, result.diagnosis)}. {_significance(f)}. {_class_text(f, result)}"
         for f in result.diagnosis.found
     ]
     if result.learned is not None:
@@ -64,6 +75,16 @@ def _effects(result: DiscDiagnosis) -> str:
             f"{100 * min(learned.law.share):.0f} % of the resamples; chi-square falls by {learned.gain:.5g}."
         )
     return bullets(items)
+
+
+def _significance(found: Found) -> str:
+    if not np.isfinite(found.gain):
+        return f"{UNFOLLOWED[:1].upper()}{UNFOLLOWED[1:]}"
+    return (
+        f"Without it chi-square rises by {found.gain:.5g}, "
+        f"{as_sigmas(found.gain, len(found.candidate.quantities)):.4g} sigmas (noise alone: {found.threshold:.3g}); "
+        f"on held-out data it gains {found.held_out_gain:.4g}"
+    )
 
 
 DISTINCT = 5.0  # sigmas from which on a recording tells two effects apart
@@ -105,8 +126,11 @@ def _before_after(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> li
     ]
     reached = {a.horizon for a in after.ahead} | {a.horizon for _, a in beside.ahead}
     short = [f"{h:g}" for h in HORIZONS if h not in reached]
+    if not result.diagnosis.found and result.learned is None:  # nothing was added: one column says it
+        rows = [(row[0], row[1]) for row in rows if not row[0].startswith("change of ")]
     remark = f"The recording is too short for free runs of {' and '.join(short)} s." if short else ""
-    return [table("", ("", "before", "after"), rows), paragraph(remark)]
+    header = ("", "before", "after") if len(rows[0]) > 2 else ("", "model")
+    return [table("", header, rows), paragraph(WORDS), paragraph(remark)]
 
 
 def _line(errors: Errors) -> str:
@@ -162,4 +186,9 @@ def tried_table(tried: Sequence[Tried]) -> str:
         for t in tried
     ]
     header = ("candidate", "name", "score", "gain, refitted", "gain, held out", "outcome")
-    return table("", header, rows) if rows else ""
+    filled = [i for i in range(len(header)) if any(row[i] for row in rows)]
+    said = (
+        "Score: by how much chi-square would fall if the candidate were added, to first order; gain: after a fit; "
+        "held out: over data that the fit has not seen."
+    )
+    return table(said, [header[i] for i in filled], [[row[i] for i in filled] for row in rows]) if rows else ""

@@ -18,6 +18,7 @@ from disctrack.diagnosis.engine.significance import TWO_SIDED
 from disctrack.diagnosis.engine.system import Quantity
 
 SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
+UNFOLLOWED = "without it the model follows no part of the recording"  # so that there is no chi-square to compare
 _PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
 _PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
 
