@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
+from enum import Enum
 from html import escape
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,3 +36,30 @@ class Brief:
     def _repr_html_(self) -> str:
         rows = "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in self.facts().items())
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
+
+
+class Outline(Brief):
+    """A dataclass shown by its fields: numbers and words as they are, arrays by their shape, parts by their name."""
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`); fields that hold nothing are left out."""
+        shown = {f.name: _outlined(getattr(self, f.name)) for f in fields(self) if f.repr}  # type: ignore[arg-type]
+        return {name: text for name, text in shown.items() if text}
+
+
+LONGEST = 60  # characters of a word that is shown whole
+
+
+def _outlined(value: Any) -> str:
+    if value is None or (isinstance(value, (str, tuple, list, Mapping)) and not value):
+        return ""
+    if isinstance(value, np.ndarray):
+        return " x ".join(map(str, value.shape)) if value.ndim else f"{value:.6g}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, (tuple, list, Mapping)):
+        return str(len(value))
+    if isinstance(value, (str, Path, Enum, bool, int)):
+        text = value.name if isinstance(value, Enum) else str(value)
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return type(value).__name__

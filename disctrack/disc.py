@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.arrays import Array
+from calibration.brief import Brief
 from disctrack.errors import ModelError
 
 AIR_DENSITY = 1.2  # [kg/m^3] where no other is declared: at 1013.25 hPa and 20 degC
 STANDARD_PRESSURE = 1013.25  # [hPa]
 
 
-@dataclass(frozen=True)
-class Disc:
+@dataclass(frozen=True, repr=False)
+class Disc(Brief):
     """A homogeneous disc of radius r and thickness 2h with round dots on its upper face.
 
     Body frame: origin at the centre of mass, third axis e3 out of the upper face.
@@ -35,6 +36,11 @@ class Disc:
     # Standard deviations of radius and thickness 2h as declared [m]; None: not declared
     radius_tolerance: float | None = None
     thickness_tolerance: float | None = None
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        size = f"{2e3 * self.radius:g} mm, thickness {2e3 * self.half_thickness:g} mm"
+        return {"diameter": size, "mass": f"{1e3 * self.mass:g} g", "dots": str(self.n_markers)}
 
     @property
     def moment_diametral(self) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.brief import Brief
+from calibration.brief import Brief, Outline
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.declaration import contradictions
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
@@ -30,8 +30,8 @@ HEIGHT_TOLERANCE = 2e-6  # [m] by which a table may depart from the board's plan
 EXPECTED_NOISE_SCALE = (0.7, 1.5)  # found over stated variance of the poses: outside, the report says so
 
 
-@dataclass(frozen=True)
-class Scaling:
+@dataclass(frozen=True, repr=False)
+class Scaling(Outline):
     """Scaling laws of the last stage."""
 
     laws: PowerLaws

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
+from calibration.brief import Outline
 from disctrack.analyse.derivatives import MeasuredMotion
 from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
 from disctrack.disc import Disc
@@ -112,8 +113,8 @@ def contact_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
     return np.column_stack([point, *along, force[:, 2], needed])
 
 
-@dataclass(frozen=True)
-class Contact:
+@dataclass(frozen=True, repr=False)
+class Contact(Outline):
     """Contact of a recording."""
 
     series: tuple[DerivedSeries, ...]

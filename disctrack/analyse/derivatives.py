@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
+from calibration.brief import Outline
 from calibration.camera import N_RIG
 from disctrack.analyse.smoothing import (
     HALF_WINDOW_LENGTHS,
@@ -54,8 +55,8 @@ SYSTEMATIC_LENGTH = 0.1
 KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
 
 
-@dataclass(frozen=True)
-class MeasuredMotion:
+@dataclass(frozen=True, repr=False)
+class MeasuredMotion(Outline):
     """Pose and its first two derivatives in every frame; NaN where the samples do not determine them."""
 
     time: Array  # (n,) [s]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.arrays import Array
+from calibration.brief import Outline
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import MeasuredMotion
 from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
@@ -33,8 +34,8 @@ ENERGY = (
 TOTAL = 5  # column of the mechanical energy
 
 
-@dataclass(frozen=True)
-class Energy:
+@dataclass(frozen=True, repr=False)
+class Energy(Outline):
     """Energy of a recording."""
 
     series: tuple[DerivedSeries, ...]

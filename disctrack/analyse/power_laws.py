@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from calibration.arrays import Array
+from calibration.brief import Outline
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
 
@@ -54,8 +55,8 @@ class Exponent:
         return self.low <= other <= self.high
 
 
-@dataclass(frozen=True)
-class PowerLaws:
+@dataclass(frozen=True, repr=False)
+class PowerLaws(Outline):
     """Exponents over one window; NaN with a reason where the data do not determine them."""
 
     window: tuple[float, float]  # [s] longest and shortest time left, t_f - t

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
+from calibration.brief import Outline
 from disctrack.analyse.derivatives import N_STATE, MeasuredMotion
 from disctrack.frames import nodal_axes_world, rotation_from_vector
 
@@ -49,8 +50,8 @@ class MotionState:
         return e1, e2, e3
 
 
-@dataclass(frozen=True)
-class DerivedSeries:
+@dataclass(frozen=True, repr=False)
+class DerivedSeries(Outline):
     """One derived quantity over the recording."""
 
     name: str

@@ -61,8 +61,8 @@ class AnalyseOutcome(Brief):
 
 
 def run_analyse(
-    path: Path,
-    output: Path | None = None,
+    path: str | Path,
+    output: str | Path | None = None,
     window: float = WINDOW,
     circle_duration: float = CIRCLE_DURATION,
     overwrite: bool = False,

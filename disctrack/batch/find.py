@@ -13,6 +13,7 @@ from disctrack.readers.files import natural_key
 from disctrack.recording.declaration import FILE_NAME
 
 RESULTS = "results"  # beside a recording's images
+FOLDER = "batch_results"  # of a batch, for what belongs to no single recording
 _FILMS = VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES
 
 
@@ -34,7 +35,8 @@ class FoundRecordings:
 def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> FoundRecordings:
     """Folders at and below `folders` that hold a recording.toml; links are followed, each folder is looked at once.
 
-    leave_out : folders that are not searched (those that results go to); a recording's own `results` never is
+    leave_out : folders that are not searched (those that results go to); `results` of a recording and `batch_results`
+        never are
     Raises RecordingError if a folder does not exist or if there is no recording at all.
     """
     roots = [Path(folder).resolve() for folder in folders]
@@ -77,7 +79,7 @@ def _search(folder: Path, seen: set[Path], problems: list[str], undeclared: list
         yield folder
     of_images = 0
     for name in below:
-        if not (is_recording and name == RESULTS):
+        if name != FOLDER and not (is_recording and name == RESULTS):
             of_images += yield from _search(folder / name, seen, problems, [] if is_recording else undeclared)
     if not is_recording and max(of_images, sum(suffix in _FILMS for suffix in suffixes)) > 1:
         undeclared.append(folder)

@@ -9,11 +9,14 @@ from urllib.parse import quote
 
 from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING
 from disctrack.batch.reasons import reason_of
+from disctrack.batch.records import SKIPPED
+from disctrack.batch.summary import copies
 from disctrack.batch.together import FOLDER
 from disctrack.files.whole import write_whole
 from disctrack.pages.html import Markup, page, paragraph, section, table, text, warning
 
 Row = dict[str, Any]
+SAID = {SKIPPED: "measured before"}  # on a page, which is read long after the batch that found it done
 
 
 def write_index(path: Path, rows: Sequence[Row], compare: bool) -> str:
@@ -59,6 +62,7 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
     problems = [
         Markup(f"<b>{text(r['recording'])}</b> ({text(r['status'])}): {text(r['reason'])}") for r in rows if r["reason"]
     ]
+    problems += [text(f"{names}: the same images, one recording for any mean") for names in copies(rows)]
     diagnosed = [row for row in rows if row["diagnosis"]]
     missing = [row for row in diagnosed if row["diagnosis"] != "nothing missing"]
     if diagnosed:
@@ -69,6 +73,7 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
         )
     header = (
         "recording",
+        "",
         "status",
         "pairs",
         "k_m from the dots (10⁻⁸ m s²)",
@@ -78,7 +83,6 @@ def index_page(rows: Sequence[Row], fragment: str = "") -> str:
         "t_f (s)",
         "rms (px)",
         "χ²",
-        "",
     )
     results = table("", header, [_cells(row) for row in rows], [row["status"].split()[0] for row in rows])
     return page(
@@ -96,16 +100,16 @@ def _cells(row: Row) -> list[str]:
     pairs = "" if row["pairs"] is None else f"{row['pairs_measured']} / {row['pairs']}"
     return [
         row["recording"],
-        row["status"],
+        Markup(
+            " ".join(_link(row[key], name) for key, name in (("report", "report"), ("diagnosis_report", "diagnosis")))
+        ),
+        SAID.get(row["status"], row["status"]),
         pairs,
         _friction(row),
         *(_plus_minus(row[n], row[f"{n}_sigma"]) for n in ("n_energy", "n_theta", "n_psidot")),
         _plus_minus(row["t_f_s"], row["t_f_sigma_s"], digits=5),
         "–" if None in rms else f"{max(rms):.4f}",
         "–" if row["reduced_chi_square"] is None else f"{row['reduced_chi_square']:.2f}",
-        Markup(
-            " ".join(_link(row[key], name) for key, name in (("report", "report"), ("diagnosis_report", "diagnosis")))
-        ),
     ]
 
 

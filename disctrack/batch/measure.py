@@ -38,9 +38,11 @@ from disctrack.files.whole import write_whole
 from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.stage import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
+from disctrack.track.summary import file_lines
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
 from disctrack.trajectory.file import Provenance
+from disctrack.trajectory.reuse import origin_of, remember
 
 Progress = Callable[[float], None]  # is told the share of the job that is done
 
@@ -189,6 +191,8 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
     window, circle = job.options.window, job.options.circle
     if job.options.report:
         outcome = run_analyse(path, window=window, circle_duration=circle, overwrite=True)
+        origin = origin_of(path, {"window": window, "circle": circle})  # as of the command, which may go on from here
+        remember(outcome.report.parent, origin, outcome.lines(), [outcome.report])
         return outcome.analysis, outcome.report
     analysis = analyse(trajectory, window, circle)
     write_analysis(path, analysis)
@@ -197,9 +201,12 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
 
 def _diagnose(path: Path) -> tuple[Path, dict[str, Any]]:
     from disctrack.diagnosis import run_diagnose
+    from disctrack.diagnosis.disc.model_file import PAPER
 
     outcome = run_diagnose(path, overwrite=True)
     pages = {file.name: file for file in outcome.files}
+    origin = origin_of(path, {"model": PAPER})
+    remember(pages["diagnosis.html"].parent, origin, [*outcome.summary, *file_lines(outcome.files)], outcome.files)
     return pages["diagnosis.html"], json.loads(pages["diagnosis.json"].read_text(encoding="utf-8"))
 
 

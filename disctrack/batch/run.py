@@ -16,7 +16,7 @@ from disctrack.batch.jobs import JobQueue
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
 from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
-from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
+from disctrack.batch.summary import Row, copies, counts, line_of, rows_of, write_summary
 from disctrack.batch.together import diagnose_all
 from disctrack.errors import ClusterError, OutputError
 from disctrack.files.whole import check_writable
@@ -52,13 +52,14 @@ class BatchOutcome:
         width = max(len(row["recording"]) for row in self.rows)
         total = ", ".join(f"{n} {status}" for status, n in counts(self.rows).items() if n)
         left = [f"{'left out':<13} {name:<{width}}  images, and no {FILE_NAME}" for name in self.undeclared]
+        left += [f"{'copies':<13} {names}: the same images, one recording for any mean" for names in copies(self.rows)]
         return [*(line_of(row, width) for row in self.rows), *left, f"{'total':<13} {total}", *self.together]
 
 
 def run_batch(
-    folders: Sequence[Path],
+    folders: Sequence[str | Path],
     options: BatchOptions | None = None,
-    output: Path | None = None,
+    output: str | Path | None = None,
     side_by_side: int | None = None,
     shard: Shard | None = None,
     cluster: str | None = None,
@@ -94,17 +95,17 @@ def run_batch(
 
 
 def summarise_batch(
-    folders: Sequence[Path], options: BatchOptions | None = None, output: Path | None = None
+    folders: Sequence[Path], options: BatchOptions | None = None, output: str | Path | None = None
 ) -> BatchOutcome:
     """The summary of what lies on the disk; nothing is measured. Raises RecordingError."""
     places = _places(folders, output)
     return _summed_up(places, places.found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
-def _places(folders: Sequence[Path], output: Path | None) -> Places:
-    output = None if output is None else Path(output).resolve()
-    found = find_recordings(folders, [] if output is None else [output])
-    return Places(found, output)
+def _places(folders: Sequence[str | Path], output: str | Path | None) -> Places:
+    apart = None if output is None else Path(output).resolve()
+    found = find_recordings([Path(folder) for folder in folders], [] if apart is None else [apart])
+    return Places(found, apart)
 
 
 def _do(plan: BatchPlan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> str:

@@ -8,6 +8,7 @@ import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,9 @@ from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
 from disctrack.files.whole import write_whole
+from disctrack.recording.changed import changed_since
+from disctrack.recording.declaration import FILE_NAME
+from disctrack.trajectory.file import read_provenance
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
 _PATHS = ("trajectory", "report", "diagnosis_report")
@@ -33,6 +37,8 @@ def rows_of(places: Places, recordings: Sequence[Path], results: Mapping[str, Re
     for folder in recordings:
         name = places.found.name(folder)
         record, status = _outcome(places.results(folder), results.get(name))
+        if name not in results and status == SKIPPED:
+            record = _if_stale(folder, places.results(folder), record)
         rows.append(_row(places, folder, name, record, status))
     return rows
 
@@ -46,6 +52,14 @@ def _outcome(folder: Path, result: Result | None) -> tuple[Record, str]:
     if record.status == MEASURED and not is_done(folder, record, {}):
         return Record(NOT_MEASURED, "its files are not those that were measured, or not all there"), NOT_MEASURED
     return record, SKIPPED if record.status == MEASURED else FAILED
+
+
+def _if_stale(folder: Path, results: Path, record: Record) -> Record:
+    """The record, with a reason where the declaration is no longer the one that was measured."""
+    measured = read_provenance(results / record.files["trajectory"]).settings.get("recording")
+    changed = changed_since(folder, measured) if isinstance(measured, dict) else ""
+    stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
+    return replace(record, reason="; ".join(filter(None, [stale, record.reason])))
 
 
 def _row(places: Places, folder: Path, name: str, record: Record, status: str) -> Row:
@@ -65,6 +79,15 @@ def _relative(path: Path, folder: Path) -> str:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # another drive
         return path.as_posix()
+
+
+def copies(rows: Sequence[Row]) -> list[str]:
+    """Names of recordings of the same images and rig, "a, b" each: in means and repeats one counts as several."""
+    alike: dict[str, list[str]] = {}
+    for row in rows:
+        if row["input_sha256"]:
+            alike.setdefault(row["input_sha256"], []).append(row["recording"])
+    return [", ".join(names) for names in alike.values() if len(names) > 1]
 
 
 def write_summary(

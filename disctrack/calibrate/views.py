@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
 from calibration.board import Target
+from calibration.brief import Outline
 from calibration.stereo import Progress, check_sizes
 from calibration.stuck_pixels import repaired_views
 from disctrack.calibrate.targets import find_target, other_board
@@ -47,8 +48,8 @@ class FrameView:
 View = Path | FrameView
 
 
-@dataclass(frozen=True)
-class TargetImages:
+@dataclass(frozen=True, repr=False)
+class TargetImages(Outline):
     """Synchronised views; number i of the left and of the right show the board in the same place."""
 
     left: tuple[View, ...]
@@ -82,7 +83,7 @@ class TargetImages:
 
 
 def find_views(
-    left: str, right: str, folder: Path, fields: FlatFields = (None, None), parts: ImageParts = (None, None)
+    left: str, right: str, folder: str | Path, fields: FlatFields = (None, None), parts: ImageParts = (None, None)
 ) -> TargetImages:
     """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
 
@@ -90,7 +91,7 @@ def find_views(
     parts : of the images that are the cameras'; images of a part's own size are taken whole
     Raises RecordingError if they do not pair up.
     """
-    sides = [_views_of(pattern, folder, camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
+    sides = [_views_of(pattern, Path(folder), camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
     views = TargetImages(sides[0], sides[1], fields, parts)
     numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
     if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoRig
 from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.commands import DONE, INCOMPLETE
-from disctrack.errors import OutputError, RecordingError
+from disctrack.errors import OutputError, RecordingError, TrajectoryFileError
 from disctrack.files.json_text import json_file
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import write_whole
 from disctrack.progress import progress_bar, times_so_far
-from disctrack.recording.declaration import Recording
+from disctrack.recording.changed import changed_since, told_differences
+from disctrack.recording.declaration import FILE_NAME, Recording
 from disctrack.track import summary
 from disctrack.track.overlay import shown_rows, write_overlay
 from disctrack.track.stage import ImagePairs, check_rig, measure, trajectory_provenance
@@ -80,8 +81,8 @@ def track_into(
     if path.exists() and not options.overwrite:
         if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, options.settings)):
             raise OutputError(
-                f"{path}: exists, and is not the complete result of these images, settings and version. Keep it and "
-                "choose another place with -o, or replace it with --overwrite."
+                f"{path}: exists, and is not the complete result of these images, settings and version"
+                f"{_why(path, recording)}. Keep it and choose another place with -o, or replace it with --overwrite."
             )
         trajectory, findings = storage.read_trajectory(path), storage.read_findings(path)
         lines.append(f"{'reused':<13} {path}: complete result of the same images, settings and version")
@@ -99,6 +100,36 @@ def track_into(
     lines += summary.trajectory_lines(trajectory, findings)
     files = [path, *_companions(path, trajectory, pairs, options, fresh)]
     return lines, files, shortcomings(findings)
+
+
+def _why(path: Path, recording: Recording) -> str:
+    """What was declared otherwise, or which version made it, where that explains why a result is not reused."""
+    try:
+        made = storage.read_provenance(path)
+    except TrajectoryFileError:
+        return ""
+    changed = told_differences(json.loads(json.dumps(recording.declared, default=str)), _declared(made))
+    return f" ({FILE_NAME}: {changed})" if changed else f" (made by {made.version})"
+
+
+def _declared(made: storage.Provenance) -> dict[str, Any]:
+    """The declaration that a trajectory was measured with."""
+    kept = made.settings.get("recording")
+    return dict(kept) if isinstance(kept, dict) else {}
+
+
+def tell_stale(trajectory: Path) -> None:
+    """Say on stderr where the recording.toml beside a trajectory is no longer the one that it was measured with."""
+    folder = next((place for place in trajectory.absolute().parents[:2] if (place / FILE_NAME).is_file()), None)
+    kept = _declared(storage.read_provenance(trajectory))
+    changed = changed_since(folder, kept) if folder is not None and kept else ""
+    if folder is not None and changed:
+        place = relative(folder)
+        print(
+            f"disctrack: {place / FILE_NAME} has changed: {changed}. What follows is of {relative(trajectory)} as it "
+            f"was measured; `disctrack run {place} --overwrite` measures anew.",
+            file=sys.stderr,
+        )
 
 
 def shortcomings(findings: Mapping[str, Any]) -> list[str]:

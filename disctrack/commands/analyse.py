@@ -12,7 +12,7 @@ from disctrack.analyse.motion_page import write_motion_page
 from disctrack.analyse.stage import run_analyse
 from disctrack.analyse.viewer import require_rerun, write_rerun
 from disctrack.commands import DONE
-from disctrack.commands._outputs import pair_of, write_times
+from disctrack.commands._outputs import pair_of, tell_stale, write_times
 from disctrack.errors import RecordingError
 from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
@@ -29,9 +29,12 @@ def run(arguments: argparse.Namespace) -> int:
     motion = folder / "motion.rrd"
     if arguments.rerun:
         require_rerun(motion)  # at once: the analysis takes a while
+    tell_stale(path)
     origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
     told = reusable(folder, origin)
-    more = (arguments.rerun and not motion.exists()) or (arguments.figures and not (folder / "figures").is_dir())
+    page = folder / "motion.html"
+    asked = [page, *([motion] if arguments.rerun else []), *([folder / "figures"] if arguments.figures else [])]
+    more = not all(place.exists() for place in asked)
     if told is not None and not (arguments.overwrite or more):
         print(
             "\n".join([f"reused        {folder}: complete result of the same trajectory, settings and version", *told])
@@ -48,7 +51,6 @@ def run(arguments: argparse.Namespace) -> int:
             figures=arguments.figures,
         )
     lines = outcome.lines()
-    page = folder / "motion.html"
     with stage("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
     lines.append(f"              {page}")

@@ -21,6 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _together(arguments)
     path = arguments.trajectory[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
+    outputs.tell_stale(path)
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
     origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))
@@ -48,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _together(arguments: argparse.Namespace) -> int:
     """One answer for several files."""
+    for path in arguments.trajectory:
+        outputs.tell_stale(path)
     with stage(f"diagnose {len(arguments.trajectory)} recordings together"):
         outcome = run_together(
             arguments.trajectory,

@@ -423,8 +423,8 @@ def _also(diagnosis: Diagnosis, law: LearnedLaw, fitted: Fit) -> tuple[str, ...]
 
 
 def run_diagnose(
-    path: Path,
-    output: Path | None = None,
+    path: str | Path,
+    output: str | Path | None = None,
     *,
     model: str = PAPER,
     overwrite: bool = False,

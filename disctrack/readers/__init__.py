@@ -28,7 +28,7 @@ FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
 )
 
 
-def open_frames(pattern: str, folder: Path, camera: str) -> FrameReader:
+def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     """Reader of one camera's frames: a file pattern, relative to `folder`.
 
     pattern : "left/*.png", "left.mkv", "stack.tif", or "frames.h5:/left" for a data set in an HDF5 file;
@@ -37,7 +37,7 @@ def open_frames(pattern: str, folder: Path, camera: str) -> FrameReader:
     Raises RecordingError if nothing matches, or if no frame can be read.
     """
     pattern, member = split_member(pattern)
-    files = match_files(pattern, folder, camera)
+    files = match_files(pattern, Path(folder), camera)
     suffix = files[0].suffix.lower()
     module, function = next((module, function) for suffixes, module, function in FORMATS if suffix in suffixes)
     if NUMBER in member and suffix not in IMAGE_SUFFIXES:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
+from calibration.brief import Outline
 from calibration.tolerances import BoardTolerances
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
@@ -101,8 +102,8 @@ class TableView:
     source: str = "both"  # what tells where the table is: "board", "disc" (where its rim rolls) or "both"
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Outline):
     """What recording.toml declares, in SI units; exactly one of `views` and `rig_file` is given."""
 
     folder: Path
@@ -226,6 +227,17 @@ def _nearest(name: str, section: str, kind: str = "key") -> str:
     return f"Known here: {', '.join(here)}."
 
 
+def _missing(declared: Mapping[str, Any]) -> list[str]:
+    """Keys without a default that sections which are there lack, so that one message names them all."""
+    calibration = declared.get("calibration", {})
+    target = calibration.get("target", "chessboard")
+    needed = {
+        section: [key for key in keys if (section, key) not in OPTIONAL] for section, keys in KEYS.items() if section
+    }
+    needed["calibration"] = ["left", "right", *TARGET_KEYS.get(str(target), ())] if "rig" not in calibration else []
+    return [f"[{s}] {key}" for s, keys in needed.items() for key in keys if s in declared and key not in declared[s]]
+
+
 class _Section:
     """One section of a recording.toml; `get` converts a value or says what is wrong with it."""
 
@@ -234,6 +246,7 @@ class _Section:
         if name and name not in declared:
             raise RecordingError(f"{file}: section [{name}] is missing; it holds {', '.join(KEYS[name])}.")
         self.values: Mapping[str, Any] = declared[name] if name else declared
+        self.declared = declared
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -241,7 +254,10 @@ class _Section:
     def get(self, key: str, convert: Callable[[Any], Any]) -> Any:
         where = f"[{self.name}] {key}" if self.name else key
         if key not in self.values:
-            raise RecordingError(f"{self.file}: {where} is missing. Add it: every length in mm, mass in g, time in s.")
+            names = _missing(self.declared)
+            names = names if where in names else [where, *names]
+            said = "is missing. Add it" if len(names) == 1 else "are missing. Add them"
+            raise RecordingError(f"{self.file}: {', '.join(names)} {said}: every length in mm, mass in g, time in s.")
         try:
             return convert(self.values[key])
         except (_Unfit, OverflowError) as error:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
+from calibration.brief import Outline
 from disctrack.frames import nodal_axes_world, rotation_from_euler
 from disctrack.rolling import equations
 from disctrack.rolling.model import Model
@@ -44,8 +45,8 @@ class Switch:
     after: Regime
 
 
-@dataclass(frozen=True)
-class Motion:
+@dataclass(frozen=True, repr=False)
+class Motion(Outline):
     """Motion of the disc at n times. Forces and moments are those of the table on the disc, in (n0, m0, k)."""
 
     model: Model

@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from calibration.brief import Outline
 from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
@@ -32,8 +33,8 @@ _CONVENTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class SimulationRun:
+@dataclass(frozen=True, repr=False)
+class SimulationRun(Outline):
     """What `run_simulate` did."""
 
     path: Path
@@ -42,8 +43,8 @@ class SimulationRun:
 
 
 def run_simulate(
-    scene_path: Path,
-    output: Path,
+    scene_path: str | Path,
+    output: str | Path,
     *,
     duration: float | None = None,
     rate: float | None = None,
@@ -54,6 +55,7 @@ def run_simulate(
     duration [s], rate [Hz] : those of the scene's cameras (n_frames, frame_rate_hz) if not given. The file ends earlier
     where the motion does. Raises SceneError, ModelError, OutputError.
     """
+    scene_path, output = Path(scene_path), Path(output)
     keep(scene_path)
     refuse_input(output)
     scene = load_scene(scene_path)

@@ -37,7 +37,7 @@ _RIM, _LOWER, _DOT, _CENTRE, _REFUSED, _CONTACT = (
 
 
 def write_overlay(
-    path: Path,
+    path: str | Path,
     pairs: Iterable[tuple[int, NDArray]],
     trajectory: Trajectory,
     progress: Callable[[int], None] = lambda n: None,
@@ -47,7 +47,7 @@ def write_overlay(
     pairs : (row of the trajectory, images (2, height, width)) in order
     Raises OutputError.
     """
-    stream = iter(pairs)
+    path, stream = Path(path), iter(pairs)
     first = next(stream, None)
     if first is None:
         raise OutputError(f"{path}: no frame to draw")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from calibration.brief import Brief
 from calibration.camera import StereoRig
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.frames import euler_jacobian
+
+if TYPE_CHECKING:
+    import xarray
 
 
 class FrameStatus(IntEnum):
@@ -124,7 +127,7 @@ class Trajectory(Brief):
             }
         return told | {"disc": f"{2e3 * self.disc.radius:g} mm, {self.disc.n_markers} dots"}
 
-    def to_xarray(self) -> Any:
+    def to_xarray(self) -> xarray.Dataset:
         """The trajectory as an `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
         from disctrack.trajectory.exchange.xarray import to_xarray
 

@@ -65,7 +65,7 @@ class Provenance:
 
 
 def write_trajectory(
-    path: Path,
+    path: str | Path,
     trajectory: Trajectory,
     provenance: Provenance,
     overwrite: bool = False,
@@ -75,6 +75,7 @@ def write_trajectory(
 
     findings : what the run found out on the way (blur, noise, warnings, ...), of JSON's types; see `read_findings`
     """
+    path = Path(path)
     refuse_existing(path, overwrite)
     buffer = io.BytesIO()  # a disk that fills up fails in one plain write, not inside the HDF5 library
     with h5py.File(buffer, "w", track_order=True) as file:
@@ -89,9 +90,9 @@ def write_trajectory(
     write_whole(path, buffer.getbuffer())
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: str | Path) -> Trajectory:
     """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's."""
-    with _Reading(path) as file:
+    with _Reading(Path(path)) as file:
         return _trajectory(file)
 
 
@@ -129,14 +130,14 @@ class Group:
 
 
 def write_group(
-    path: Path,
+    path: str | Path,
     group: str,
     variables: Mapping[str, Variable],
     axes: Mapping[str, Variable] | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """Add a stage's group to a trajectory file, or replace it; as `write_groups`."""
-    write_groups(path, {group: Group(variables, attributes or {})}, axes)
+    write_groups(Path(path), {group: Group(variables, attributes or {})}, axes)
 
 
 def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Variable] | None = None) -> None:
@@ -158,13 +159,13 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
 
 
 def read_group(
-    path: Path, group: str, names: Collection[str] | None = None
+    path: str | Path, group: str, names: Collection[str] | None = None
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """Arrays and attributes of one group. Raises TrajectoryFileError that names the groups there are.
 
     names : the arrays that are wanted, where not all are
     """
-    with _Reading(path) as file:
+    with _Reading(Path(path)) as file:
         if group not in file or not isinstance(file[group], h5py.Group):
             there = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
             raise TrajectoryFileError(f"{path}: no group '{group}'; it holds {there}. Run the stage that writes it.")
@@ -194,12 +195,13 @@ def read_setup(path: Path) -> FilmedSetup:
         )
 
 
-def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> None:
+def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
     """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown.
 
     Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
-    calibration.
+    calibration. Coordinates have seven decimals however many turns the angles have counted, sigmas seven digits.
     """
+    path = Path(path)
     refuse_existing(path, overwrite)
     scale = np.array([1e3, 1e3, 1e3, *np.degrees([1.0, 1.0, 1.0])])
     units = ["mm"] * 3 + ["deg"] * 3
@@ -221,7 +223,7 @@ def write_csv(path: Path, trajectory: Trajectory, overwrite: bool = False) -> No
     for frame, time, values, status in zip(
         trajectory.frame, trajectory.time, table, trajectory.frame_status, strict=True
     ):
-        cells = ["" if np.isnan(value) else f"{value:.7g}" for value in values]
+        cells = ["" if np.isnan(v) else f"{v:.7f}" if i < 6 else f"{v:.7g}" for i, v in enumerate(values)]
         writer.writerow([frame, f"{time:.9g}", *cells, FrameStatus(status).name.lower()])
     write_whole(path, text.getvalue().encode())
 

@@ -22,7 +22,8 @@ from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job, Shard
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
-from disctrack.batch.summary import line_of
+from disctrack.batch.run import BatchOutcome
+from disctrack.batch.summary import copies, line_of
 from disctrack.errors import ClusterError, RecordingError
 
 GOOD = Result(MEASURED, Record(MEASURED))
@@ -60,6 +61,10 @@ def test_images_without_a_declaration_are_told(tmp_path):
     for name in ("day 1/r1/left", "day 1/r1/right", "day 1/r2/calibration/left", "day 1/r2/calibration/right"):
         (root / name).mkdir(parents=True)
         (root / name / "0.png").write_bytes(b"")
+    assert find_recordings([root]).undeclared == ()
+    for rig in ("one", "other"):  # pictures of two rigs that a batch calibrated are no images of two cameras
+        (root / "batch_results" / "rigs" / rig).mkdir(parents=True)
+        (root / "batch_results" / "rigs" / rig / "calibration_coverage.png").touch()
     assert find_recordings([root]).undeclared == ()
     for name in ("left", "right", "calibration/left", "calibration/right"):
         (root / "day 1" / "r3" / name).mkdir(parents=True)
@@ -292,6 +297,16 @@ def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as
     assert "&lt;b&gt;no&lt;/b&gt; rig" in text
     assert "3.8100 ± 0.0010 (model: χ² 23.9)" in text
     assert "9 / 10" in text
+
+
+def test_recordings_of_the_same_images_are_told():
+    rows = [
+        row(recording=name, input_sha256=digest) for name, digest in (("a", "1"), ("b", "2"), ("c", "1"), ("d", None))
+    ]
+    assert copies(rows) == ["a, c"]
+    assert "a, c: the same images" in index_page(rows)
+    assert "the same images" not in index_page(rows[1:])
+    assert "copies        a, c: the same images" in "\n".join(BatchOutcome(tuple(rows), (), ()).lines())
 
 
 def test_a_line_warns_where_the_model_lacks_something():

@@ -102,6 +102,11 @@ def test_each_missing_key_is_named_with_its_section(tmp_path, section, key):
     assert re.search(rf"\[{section}\] {key} is missing", message(tmp_path, text))
 
 
+def test_keys_that_init_leaves_open_are_named_at_once(tmp_path):
+    text = "\n".join(line for line in REFERENCE.splitlines() if not line.startswith(("mass_g", "square_mm", "view")))
+    assert re.search(r"\[disc\] mass_g, \[calibration\] square_mm, \[table\] view are missing", message(tmp_path, text))
+
+
 @pytest.mark.parametrize("section", [s for s, keys in KEYS.items() if s and any((s, k) not in OPTIONAL for k in keys)])
 def test_each_missing_section_is_named(tmp_path, section):
     start = REFERENCE.index(f"[{section}]")

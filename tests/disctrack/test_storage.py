@@ -199,11 +199,21 @@ def test_the_csv_is_in_millimetres_and_degrees_with_gaps_empty(tmp_path, traject
     with (tmp_path / "trajectory.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(trajectory)
-    # seven digits are written
-    assert_allclose(float(rows[7]["theta_deg"]), np.degrees(trajectory.q[7, 4]), rtol=1e-6)
+    assert_allclose(float(rows[7]["theta_deg"]), np.degrees(trajectory.q[7, 4]), atol=1e-7)  # seven decimals
     assert_allclose(float(rows[7]["z_sigma_mm"]), 1e3 * trajectory.coordinate_sigma[7, 2], rtol=1e-6)
     assert rows[3]["x_mm"] == ""
     assert rows[3]["status"] == "unreadable"
+
+
+def test_the_csv_keeps_an_angle_after_a_thousand_turns(tmp_path, trajectory):
+    """Ten seconds at 100 turns a second: 360 000 degrees, and still a thousandth of the smallest sigma."""
+    turns = 2 * np.pi * 1000 * np.array([0, 0, 0, 1, 0, -1])
+    turned = dataclasses.replace(trajectory, q=trajectory.q + turns)
+    write_csv(tmp_path / "trajectory.csv", turned)
+    with (tmp_path / "trajectory.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert_allclose(float(rows[7]["psi_deg"]), np.degrees(turned.q[7, 3]), atol=1e-7)
+    assert_allclose(float(rows[7]["phi_deg"]), np.degrees(turned.q[7, 5]), atol=1e-7)
 
 
 def test_findings_are_json_for_every_reader(tmp_path, trajectory):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from disctrack.cli import main
+from disctrack.recording.changed import told_differences
 from disctrack.trajectory.file import read_group
 
 
@@ -80,6 +81,22 @@ def test_a_second_analysis_is_reused_and_another_window_or_a_missing_figure_is_n
     assert (report / "report.html").stat().st_mtime_ns == before
     assert main([*command, "--window", "0.4"]) == 1  # another result: kept unless told otherwise
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_declaration_that_changed_since_is_told_and_an_equal_one_is_not(analysed_clip, sample_clip, capsys):
+    beside = analysed_clip.with_name("recording.toml")
+    declared = (sample_clip / "recording.toml").read_text()
+    command = ["analyse", str(analysed_clip), "-o", str(analysed_clip.parent / "report")]
+    for text, told in ((declared, False), (declared.replace("square_mm = 6.0", "square_mm = 6.1"), True)):
+        beside.write_text(text)
+        assert main(command) == 0
+        said = capsys.readouterr().err
+        assert ("[calibration] square_mm 6.1 (6.0 when it was measured)" in said) == told
+        assert ("has changed" in said) == told
+    beside.unlink()
+    assert told_differences({"disc": {"mass_g": 1.0}}, {"disc": {"mass_g": 1.0, "radius_mm": 2}}) == (
+        "[disc] radius_mm not declared (2 when it was measured)"
+    )
 
 
 def test_asymptotic_exponents_are_not_refused_where_the_law_is_not_asymptotic(analysed_clip):

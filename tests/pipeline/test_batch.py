@@ -232,6 +232,19 @@ def test_the_summary_is_that_of_all_shards(recording, tmp_path, in_this_process)
     assert statuses(summary)["c"] == "not measured"
 
 
+def test_a_summary_tells_of_declarations_that_changed_since(recording, tmp_path, capsys, in_this_process):
+    file = copy_of(recording, tmp_path / "day" / "a") / "recording.toml"
+    command = ["batch", str(tmp_path / "day"), *FAST]
+    assert main(command) == 0
+    text = file.read_text()
+    replace(file, re.sub("mass_g = .*", "mass_g = 200.5", text).encode())
+    capsys.readouterr()
+    assert main([*command, "--summary-only"]) == 3
+    assert "[disc] mass_g 200.5 (" in capsys.readouterr().out
+    assert main(command) == 0  # measures it anew
+    assert main([*command, "--summary-only"]) == 0
+
+
 @pytest.mark.parametrize("words", [["--shard", "0/3"], ["--shard", "4/3"], ["--shard", "x"], ["-j", "0"], []])
 def test_wrong_usage_is_told_apart_from_failure(words, tmp_path):
     with pytest.raises(SystemExit) as stop:

@@ -90,9 +90,14 @@ def test_one_covered_camera_is_said(taken):
 def test_results_show_a_few_facts_and_not_their_arrays(taken):
     declared, rig, images, by_files = taken
     tracker = disctrack.Tracker(rig, declared.disc)
-    for thing in (by_files, by_files.trajectory, rig, tracker.next(*images[0]), tracker):
+    motion = disctrack.differentiate(by_files.trajectory)
+    model = disctrack.Model(declared.disc)
+    rolled = disctrack.simulate(model, disctrack.steady_precession(0.1, declared.disc), duration=0.01)
+    results = (by_files, by_files.trajectory, rig, tracker.next(*images[0]), tracker)
+    for thing in (*results, declared, declared.disc, declared.views, motion, rolled, model):
         assert len(repr(thing)) < 400, type(thing)
         assert "array(" not in repr(thing)
+    assert f"position {len(motion)} x 3" in repr(motion)
     shown = by_files.trajectory._repr_html_()
     assert shown.startswith("<table>")
     assert f"{len(images)} at 1000 Hz" in shown

@@ -10,6 +10,7 @@ from scipy import special
 from scipy.optimize import lsq_linear
 
 from calibration.arrays import Array
+from calibration.brief import Outline
 from disctrack.diagnosis.engine.nuisances import Projection, is_linear, projection
 from disctrack.diagnosis.engine.system import Quantity, System, Values
 
@@ -21,8 +22,8 @@ _HALVINGS = 8
 NO_DERIVATIVE = np.zeros(0)
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, repr=False)
+class Fit(Outline):
     """Minimum of chi-square, data and priors together."""
 
     quantities: tuple[Quantity, ...]

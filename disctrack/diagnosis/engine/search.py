@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.arrays import Mask
+from calibration.brief import Outline
 from disctrack.diagnosis.engine.chance import Chance, chance
 from disctrack.diagnosis.engine.fit import Fit, fit, no_fit, prior_rows
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
@@ -92,8 +93,8 @@ class Tried:
     reason: str
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Outline):
     """Answer of the search."""
 
     verdict: str  # "nothing missing", "found" or "unexplained"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,8 +10,11 @@ from disctrack.errors import OutputError
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import labelled
 
+if TYPE_CHECKING:
+    import xarray
 
-def to_xarray(trajectory: Trajectory) -> Any:
+
+def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
     """`xarray.Dataset` with the root of the trajectory file and its dots (`marker_...`).
 
     Raises OutputError where xarray is not installed.

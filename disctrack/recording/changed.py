@@ -1,0 +1,49 @@
+"""What differs between the declaration that a result was measured with and the recording.toml that lies there now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from disctrack.errors import RecordingError
+from disctrack.files.toml_tree import read_toml
+from disctrack.recording.declaration import FILE_NAME
+
+MOST = 5  # differences that are told one by one
+
+
+def changed_since(folder: Path, measured: Mapping[str, Any]) -> str:
+    """Keys of the folder's recording.toml whose values are no longer those declared when it was measured.
+
+    measured : the tree of the declaration that the trajectory file keeps
+    returns  : "[calibration] square_mm 6.1 (6.0 when it was measured)", several by commas; empty where all is the
+        same, or where there is no declaration that can be read
+    """
+    try:
+        now = json.loads(json.dumps(read_toml(folder / FILE_NAME, RecordingError), default=str))
+    except (OSError, RecordingError):
+        return ""
+    return told_differences(now, measured)
+
+
+def told_differences(now: Mapping[str, Any], then: Mapping[str, Any]) -> str:
+    """Two declarations key by key, in words; empty where they say the same."""
+    found = list(_differences(now, then))
+    more = [f"and {len(found) - MOST} more"] if len(found) > MOST else []
+    return ", ".join([*found[:MOST], *more])
+
+
+def _differences(now: Mapping[str, Any], then: Mapping[str, Any], section: str = "") -> Iterator[str]:
+    for key in dict.fromkeys([*then, *now]):
+        new, old = now.get(key), then.get(key)
+        if isinstance(new, dict) or isinstance(old, dict):
+            yield from _differences(new or {}, old or {}, f"[{key}] ")
+        elif new != old:
+            yield f"{section}{key} {_shown(new)} ({_shown(old)} when it was measured)"
+
+
+def _shown(value: Any) -> str:
+    text = "not declared" if value is None else json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
