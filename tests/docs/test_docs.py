@@ -1,7 +1,7 @@
 """What README and documentation say is run: commands, snippets, tables of keys and effects, links and pictures.
 
-A block ```sh or ```python runs in the default tests, ```sh slow and ```python slow with `-m slow`, page by page in one
-folder with the sample data in it. Commands that do not begin with disctrack are the shell's own (mkdir, cp, cat, rm).
+A block ```sh or ```python runs in the default tests, those below <!-- slow --> with `-m slow`, page by page in
+one folder with the sample data in it. Commands that do not begin with disctrack are the shell's own (mkdir, cp, cat).
 """
 
 import argparse
@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "disctrack" / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 RUN = [page for page in PAGES if page.name != "systems.md"]  # that page has a test of its own
-BLOCK = re.compile(r"^```(sh|python|toml)( slow)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^(?:(<!-- slow -->)\n)?```(sh|python|toml)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 IN_TEXT = re.compile(r"`(disctrack [^`]+)`")
 
@@ -39,6 +39,11 @@ def text_of(page: Path) -> str:
     if not page.is_file():
         pytest.skip("not in this checkout")
     return page.read_text(encoding="utf-8")
+
+
+def blocks_of(text: str) -> list[tuple[str, str, str]]:
+    """(language, whether it is slow, content) of every block of a page."""
+    return [(kind, slow, block) for slow, kind, block in BLOCK.findall(text)]
 
 
 def commands_of(shell: str) -> list[list[str]]:
@@ -80,7 +85,7 @@ def run_shell(block: str, folder: Path) -> None:
 def test_short_blocks_run(page, workplace, monkeypatch):
     monkeypatch.chdir(workplace)
     scope: dict[str, object] = {}
-    for kind, slow, block in BLOCK.findall(text_of(page)):
+    for kind, slow, block in blocks_of(text_of(page)):
         if slow or page.name == "README.md":
             continue
         if kind == "sh":
@@ -93,7 +98,7 @@ def test_short_blocks_run(page, workplace, monkeypatch):
 def measured(tmp_path_factory) -> Path:
     """A workplace of its own after the README was followed: nothing there was made by single blocks before."""
     workplace = with_sample(tmp_path_factory.mktemp("follower"))
-    for kind, _, block in BLOCK.findall(text_of(ROOT / "README.md")):
+    for kind, _, block in blocks_of(text_of(ROOT / "README.md")):
         if kind == "sh":
             run_shell(block, workplace)
     return workplace
@@ -104,7 +109,7 @@ def measured(tmp_path_factory) -> Path:
 def test_all_blocks_run_in_their_order(page, measured, monkeypatch):
     monkeypatch.chdir(measured)
     scope: dict[str, object] = {}
-    for kind, _, block in BLOCK.findall(text_of(page)):
+    for kind, _, block in blocks_of(text_of(page)):
         if kind == "sh" and page.name != "README.md" and not ("mkdir -p sheets" in block or "-o sheets" in block):
             run_shell(block.replace("rm my-disc", "rm -f my-disc"), measured)
         elif kind == "python":
@@ -118,7 +123,7 @@ def test_all_blocks_run_in_their_order(page, measured, monkeypatch):
 @pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
 def test_every_command_exists_with_its_options(page, monkeypatch):
     text = text_of(page)
-    written = [command for kind, _, block in BLOCK.findall(text) if kind == "sh" for command in commands_of(block)]
+    written = [command for kind, _, block in blocks_of(text) if kind == "sh" for command in commands_of(block)]
     written += [shlex.split(command) for command in IN_TEXT.findall(text)]
     for command in written:
         if command[1] == "COMMAND":
@@ -130,6 +135,15 @@ def test_every_command_exists_with_its_options(page, monkeypatch):
         for word in command[2:]:
             if word.startswith("-") and not re.fullmatch(r"-?[0-9.]+", word):
                 assert word.partition("=")[0] in known, f"{' '.join(command)}: no option {word}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+def test_every_block_is_one_for_every_renderer_of_markdown(page):
+    """One word after the fence: with two, Python's Markdown, of which the site is built, takes it for a paragraph."""
+    fences = re.findall(r"^```.*$", text_of(page), re.MULTILINE)
+    assert all(re.fullmatch(r"```[a-z]*", fence) for fence in fences)
+    assert len(fences) % 2 == 0
+    assert sum(len(fence) > 3 for fence in fences) == len(blocks_of(text_of(page)))  # all are run, or read
 
 
 @pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
@@ -152,12 +166,22 @@ def test_the_readme_is_short():
     assert len(prose.split()) < 850
 
 
+def test_every_stage_of_the_readme_lives_where_it_says():
+    lines = text_of(ROOT / "README.md").splitlines()
+    rows = [line.split("|") for line in lines if line.startswith("| ") and "disctrack" in line]
+    places = [re.findall(r"`([a-z_/]+)`", row[5]) for row in rows if len(row) == 7]
+    assert sum(map(len, places)) > 10
+    for names_of_row in places:
+        for name in names_of_row:
+            assert (ROOT / name).is_dir() or (ROOT / "disctrack" / name).is_dir(), name
+
+
 def test_every_key_of_a_recording_is_explained_and_the_example_is_one(tmp_path):
     text = text_of(DOCS / "recording-toml.md")
     for section, keys in KEYS.items():
         for key in keys:
             assert re.search(rf"`(\[{section}\] )?[^|]*\b{key}\b", text), f"[{section}] {key}"
-    example = next(block for kind, _, block in BLOCK.findall(text) if kind == "toml")
+    example = next(block for kind, _, block in blocks_of(text) if kind == "toml")
     (tmp_path / "recording.toml").write_text(example)
     assert read_recording(tmp_path).disc.radius == pytest.approx(0.0375)
     declared = tomllib.loads(example)
@@ -244,3 +268,21 @@ def test_a_wrong_option_or_block_would_be_noticed(workplace):
     ]
     with pytest.raises(AssertionError):
         run_shell("disctrack simulate no-such-scene.toml", workplace)
+
+
+def test_an_editor_knows_the_types_of_the_recipes(tmp_path):
+    """All of the page as one script, checked as strictly as mypy can, from outside the project."""
+    pytest.importorskip("mypy")
+    page = text_of(DOCS / "python.md")
+    script = "\n".join(block for kind, _, block in blocks_of(page) if kind == "python")
+    (tmp_path / "recipes.py").write_text(script + "\nreveal_type(answer)\nreveal_type(dataset)\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "recipes.py"],
+        cwd=tmp_path,
+        env=os.environ | {"MYPYPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "DiscDiagnosis" in done.stdout
+    assert "Dataset" in done.stdout
