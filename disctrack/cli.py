@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import sys
 import tempfile
@@ -47,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. Errors are one line on stderr."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
+        _print_what_the_terminal_knows()
         _keep_compiled_loops_somewhere()
         parser = _parser()
         arguments = parser.parse_args(words)
@@ -68,6 +70,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
         return _tell(error)
+
+
+def _print_what_the_terminal_knows() -> None:
+    """A name that a terminal or log has no letters for is printed as escapes; it must not end a measurement."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _keep_compiled_loops_somewhere() -> None:

@@ -56,11 +56,11 @@ def _rig_text(rig: StereoRig) -> str:
     axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
     turn = float(np.degrees(np.sqrt(axis @ C[PAIR_TURN, PAIR_TURN] @ axis)))
     focal = [
-        f"{name} {camera.fx:.1f} x {camera.fy:.1f} (± {np.sqrt(C[i, i]):.2g})"
+        f"{name} {camera.fx:.1f} x {camera.fy:.1f} (+- {np.sqrt(C[i, i]):.2g})"
         for name, camera, i in (("left", rig.left, OF_LEFT.start), ("right", rig.right, OF_RIGHT.start))
     ]
     return (
-        f"baseline {rig.baseline * 1e3:.3f} ± {baseline:.2g} mm, cameras turned by {angle:.3f} ± {turn:.2g} deg, "
+        f"baseline {rig.baseline * 1e3:.3f} +- {baseline:.2g} mm, cameras turned by {angle:.3f} +- {turn:.2g} deg, "
         f"focal lengths [px] {', '.join(focal)}"
     )
 

@@ -142,6 +142,18 @@ def test_an_output_that_exists(recording, tmp_path, capsys):
     assert path.read_text() == "something dear"
 
 
+def test_a_terminal_without_the_letters_of_a_name_does_not_end_the_work(tmp_path):
+    """A scheduled job or an old log in ASCII: the name is told as escapes, the file is written."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text('name = "Münze"\n[cameras]\nn_frames = 5\n[motion]\nkind = "rolling"\n')
+    command = [sys.executable, "-m", "disctrack", "simulate", str(scene), "-o", str(tmp_path / "Münze.h5")]
+    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(command, env=ascii_only, capture_output=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert rb"M\xfcnze.h5" in done.stdout
+    assert (tmp_path / "Münze.h5").is_file()
+
+
 @pytest.mark.parametrize("range_", ["30:40", "9:5"])
 def test_a_range_without_frames(recording, capsys, range_):
     assert "holds no frame; the recording has 24" in failure(capsys, "track", recording, "--frames", range_)
