@@ -88,26 +88,27 @@ def tiles(named: Iterable[tuple[str, str]]) -> Markup:
 def table(
     caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], classes: Sequence[str] | None = None
 ) -> Markup:
-    """A table that scrolls by itself where the screen is narrow; what is said in sentences wraps.
+    """A table that scrolls by itself where the screen is narrow; a column with sentences wraps.
 
     classes : CSS class of each row
     """
     rows = list(rows)
     kinds = [f" class={escape(kind, quote=True)}" for kind in classes] if classes else [""] * len(rows)
+    said = [" class=said" if any(map(_sentence, column)) else "" for column in zip(*rows, strict=True)]
     top = "".join(f"<th>{text(cell)}</th>" for cell in header)
     body = "".join(
-        f"<tr{kind}>" + "".join(f"<td{_wraps(cell)}>{text(cell)}</td>" for cell in row) + "</tr>"
+        f"<tr{kind}>" + "".join(f"<td{kind}>{text(cell)}</td>" for kind, cell in zip(said, row, strict=True)) + "</tr>"
         for kind, row in zip(kinds, rows, strict=True)
     )
-    said = f"<caption><span>{text(caption)}</span></caption>" if caption else ""
-    return Markup(f"<div class=scroll><table>{said}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>")
+    above = f"<caption><span>{text(caption)}</span></caption>" if caption else ""
+    return Markup(f"<div class=scroll><table>{above}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>")
 
 
 SENTENCE = 48  # characters of a cell from which on it is no number, name or link
 
 
-def _wraps(cell: str) -> str:
-    return " class=said" if len(cell) > SENTENCE and not isinstance(cell, Markup) else ""
+def _sentence(cell: str) -> bool:
+    return len(cell) > SENTENCE and not isinstance(cell, Markup)
 
 
 def details(title: str, parts: Iterable[str]) -> Markup:
@@ -156,6 +157,6 @@ details{{margin:.6rem 0}}summary{{cursor:pointer;color:var(--mark)}}
 section{{border:0;padding:0}}.scroll{{overflow:visible;background:none}}.gallery{{columns:auto}}
 figure img{{width:auto;max-width:100%;max-height:98mm}}h1,h2,summary,caption{{break-after:avoid}}
 tr{{break-inside:avoid}}.tiles{{grid-template-columns:repeat(4,1fr)}}td,th{{white-space:normal}}td:first-child{{min-width:11em}}
-td.said{{min-width:20em}}details>*{{display:block}}
+td.said{{min-width:16em}}details>*{{display:block}}
 details::details-content{{content-visibility:visible;block-size:auto}}}}
 """

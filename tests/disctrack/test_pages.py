@@ -112,8 +112,8 @@ def test_numbers_and_angles_are_set_as_people_write_them():
 
 def test_sentences_in_cells_wrap_and_numbers_do_not():
     said = "gains 4.57, noise alone reaches 21.6; only bounded: translation_x"
-    made = table("", ["a", "b"], [("1.234 ± 0.001", said)])
-    assert made.count("class=said") == 1
+    made = table("", ["a", "b"], [("1.234 ± 0.001", said), ("2", "short")])
+    assert made.count("class=said") == 2  # all of its column
     assert f"<td class=said>{said}" in made
 
 

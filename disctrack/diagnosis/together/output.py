@@ -20,7 +20,7 @@ from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, To
 from disctrack.diagnosis.together.sharing import EACH
 from disctrack.files.json_text import plain
 from disctrack.pages.figures import Drawn, panels
-from disctrack.pages.html import bullets, details, page, paragraph, section, table, warning
+from disctrack.pages.html import bullets, details, page, paragraph, section, table, typeset, warning
 from disctrack.pages.palette import AMBER, BLUE, MUTED
 
 SHOWN = 12  # effects whose standard deviations are tabled by number of recordings; all are in the JSON
@@ -335,7 +335,8 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
         else:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlabel("recording, from 0")
-        axes.set_ylabel(q.name.partition(".")[2].partition("[")[0] + (f" [{q.unit}]" if q.unit != "1" else ""))
+        unit = f" ({typeset(q.unit)})" if q.unit != "1" else ""
+        axes.set_ylabel(q.name.partition(".")[2].partition("[")[0] + unit)
         caption = "Each recording alone with its standard deviation; the band is two of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
     return tuple(drawn)
