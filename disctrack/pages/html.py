@@ -150,7 +150,7 @@ th{{color:var(--soft);font-weight:600;white-space:normal;vertical-align:bottom}}
 tr.failed td,tr.not td{{color:var(--bad)}}
 details{{margin:.6rem 0}}summary{{cursor:pointer;color:var(--mark)}}
 @media (max-width:40rem){{main{{padding:1rem .8rem 3rem}}section{{padding:1rem .9rem}}h1{{font-size:1.35rem}}
-.gallery{{columns:1}}td:first-child{{min-width:8em}}td.said{{min-width:16em}}}}
+.gallery{{columns:1}}td.said{{min-width:16em}}td:first-child{{min-width:8em}}}}
 @page{{margin:14mm 15mm}}
 @media print{{:root{{color-scheme:light;--ink:#000;--soft:#333;--back:#fff;--card:#fff;--line:#ccc;--warn:#fff;
 --mark:#000;--bad:#000;--shade:transparent}}html{{font-size:11.5px}}main{{max-width:none;padding:0}}
