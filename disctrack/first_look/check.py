@@ -33,6 +33,7 @@ from disctrack.track.summary import left_out
 from disctrack.track.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import MarkerStatus, Trajectory
 
+KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # it is installed with the package
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
 PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
 FRAMES_AT_EACH = 40  # twice what the free refinement of the clock needs
@@ -95,7 +96,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
     try:
         recording = seen.recording = read_recording(folder)
     except RecordingError as error:
-        seen.say("fix", "declaration", str(error), "every key: disctrack/docs/recording-toml.md")
+        seen.say("fix", "declaration", str(error), f"every key: {KEYS_EXPLAINED}")
         return seen
     seen.say("fine", "declaration", f"{recording.file} is complete")
     if recording.chessboard is not None:
