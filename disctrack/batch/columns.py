@@ -1,5 +1,8 @@
 """The columns of the summary."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from disctrack.frames import CAMERAS, COORDINATES
 
 UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
@@ -57,3 +60,12 @@ COLUMNS: dict[str, str] = {
     "fingerprint": "of inputs, settings and version",
     "version": "of disctrack that measured it",
 }
+
+
+def copies(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of recordings of the same images and rig, "a, b" each: in means and repeats one counts as several."""
+    alike: dict[str, list[str]] = {}
+    for row in rows:
+        if row["input_sha256"]:
+            alike.setdefault(row["input_sha256"], []).append(row["recording"])
+    return [", ".join(names) for names in alike.values() if len(names) > 1]

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING
+from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING, copies
 from disctrack.batch.reasons import reason_of
 from disctrack.batch.records import SKIPPED
-from disctrack.batch.summary import copies
 from disctrack.batch.together import FOLDER
 from disctrack.files.whole import write_whole
 from disctrack.pages.html import Markup, page, paragraph, section, table, text, warning

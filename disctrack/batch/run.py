@@ -11,12 +11,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from disctrack.batch.cluster import connect, run_on_cluster
+from disctrack.batch.columns import copies
 from disctrack.batch.find import find_recordings
 from disctrack.batch.jobs import JobQueue
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
 from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
-from disctrack.batch.summary import Row, copies, counts, line_of, rows_of, write_summary
+from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
 from disctrack.batch.together import diagnose_all
 from disctrack.errors import ClusterError, OutputError
 from disctrack.files.whole import check_writable

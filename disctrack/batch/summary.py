@@ -81,15 +81,6 @@ def _relative(path: Path, folder: Path) -> str:
         return path.as_posix()
 
 
-def copies(rows: Sequence[Row]) -> list[str]:
-    """Names of recordings of the same images and rig, "a, b" each: in means and repeats one counts as several."""
-    alike: dict[str, list[str]] = {}
-    for row in rows:
-        if row["input_sha256"]:
-            alike.setdefault(row["input_sha256"], []).append(row["recording"])
-    return [", ".join(names) for names in alike.values() if len(names) > 1]
-
-
 def write_summary(
     places: Places, recordings: Sequence[Path], results: Mapping[str, Result], options: BatchOptions
 ) -> tuple[list[Row], tuple[Path, ...], tuple[str, ...]]:

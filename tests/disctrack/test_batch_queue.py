@@ -14,7 +14,7 @@ import pytest
 
 from disctrack.batch import locks
 from disctrack.batch.cluster import run_on_cluster
-from disctrack.batch.columns import COLUMNS
+from disctrack.batch.columns import COLUMNS, copies
 from disctrack.batch.find import find_recordings
 from disctrack.batch.index import index_page
 from disctrack.batch.jobs import JobQueue
@@ -23,7 +23,7 @@ from disctrack.batch.plan import BatchOptions, Job, Shard
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
 from disctrack.batch.run import BatchOutcome
-from disctrack.batch.summary import copies, line_of
+from disctrack.batch.summary import line_of
 from disctrack.errors import ClusterError, RecordingError
 
 GOOD = Result(MEASURED, Record(MEASURED))
