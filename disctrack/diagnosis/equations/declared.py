@@ -51,6 +51,8 @@ class Term:
     observed: Mapping[str, Formula] = field(default_factory=dict)  # by channel: added to what the sensor shows
     clock: Formula = 0.0  # added to the time that is written beside a sample, a formula in t
     lag: Mapping[str, Formula] = field(default_factory=dict)  # by channel: how late the sensor is [s]
+    # by a name that stands in the rates: an input, and how much earlier it is taken [s]
+    delayed: Mapping[str, tuple[str, Formula]] = field(default_factory=dict)
     parameters: Mapping[str, float | Parameter] = field(default_factory=dict)
     title: str = ""
     source: str = ""

@@ -17,6 +17,7 @@ from calibration.compiled import njit
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Equations, Parameter, Term
 from disctrack.diagnosis.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
+from disctrack.diagnosis.equations.late_inputs import with_late
 from disctrack.errors import AnalysisError
 
 OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
@@ -42,6 +43,7 @@ class Formulas:
     late: tuple[sympy.Expr, ...]  # by channel: true instant minus the time beside the sample, in t and numbers
     widths: dict[sympy.Expr, sympy.Symbol]
     along: dict[str, sympy.Expr]  # by name of a shape: values along the motion that are tried for it
+    late_inputs: tuple[tuple[int, sympy.Expr], ...]  # the last of the inputs: which of the first each is, how late [s]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,10 +72,29 @@ class Formulas:
             (f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)
         ]
         fitted = [s for s, _ in self.fitted.values()]
-        targets += [(f"{by_number}[{i}, {j}]", e.diff(s)) for i, e in enumerate(formulas) for j, s in enumerate(fitted)]
+        for i, e in enumerate(formulas):
+            targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
         arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
         source = source_of(name, [sympy.Symbol("t"), *arrays], targets, out)
         return _compiled_source(source, name)
+
+    def _by_number(self, formula: sympy.Expr, number: sympy.Symbol) -> sympy.Expr:
+        """Derivative of a formula: a number may also say how late an input is."""
+        found = formula.diff(number)
+        first = len(self.inputs) - len(self.late_inputs)
+        for u, rate, (_, late) in zip(self.inputs[first:], self.input_rates[first:], self.late_inputs, strict=True):
+            found -= formula.diff(u) * rate * late.diff(number)
+        return found
+
+    def driven(self, knots: Array, pieces: Array, p: Array) -> tuple[Array, Array]:
+        """Inputs of a run (`declared.Samples`) with those that act late, for numbers p."""
+        if not self.late_inputs:
+            return knots, pieces
+        return with_late(knots, pieces, [which for which, _ in self.late_inputs], np.array(self._how_late(p), float))
+
+    @cached_property
+    def _how_late(self) -> Any:
+        return sympy.lambdify((self.numbers,), [late for _, late in self.late_inputs], "numpy")
 
     @cached_property
     def is_late(self) -> bool:
@@ -137,6 +158,8 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     position = {name: i for i, name in enumerate(states)}
     seen: set[str] = set()
     along: dict[str, sympy.Expr] = {}
+    late_inputs: list[tuple[int, sympy.Expr]] = []
+    driving, driving_rates = list(inputs.values()), list(input_rates.values())
     for term in terms:
         if term.name in seen or "[" in term.name or "." in term.name:
             raise AnalysisError(f"term {term.name!r}: needs a name of its own, without '.' and '['.")
@@ -154,9 +177,18 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
         for name, p in term.parameters.items():
             if isinstance(p, Parameter) and p.along:
                 along[f"{term.name}.{name}"] = parsed(p.along, everything, f"{here}, {name} along")
+        before: dict[str, sympy.Symbol] = {}
+        for name, (u, f) in term.delayed.items():
+            checked_name(name, f"late input of term {term.name}")
+            _known(u, inputs, f"{here}, delayed {name}")
+            delay = parsed(f, {**constants, **own, **mine}, f"{here}, delay of {u}")
+            late_inputs.append((list(inputs).index(u), delay))
+            driving.append(symbol(f"term{len(seen)}_late_{name}"))
+            driving_rates.append(symbol(f"term{len(seen)}_late_{name}_rate"))
+            before |= {name: driving[-1], f"{OWN}{name}": driving[-1]}
         for name, f in term.rates.items():
             _known(name, states, f"{here}, rates")
-            rates[position[name]] += parsed(f, words, f"{here}, rate of {name}")
+            rates[position[name]] += parsed(f, {**words, **before}, f"{here}, rate of {name}")
         for name, f in term.observed.items():
             _known(name, observed, f"{here}, observed")
             found = parsed(f, {**channel_names, **words}, f"{here}, observed {name}")
@@ -171,9 +203,9 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     rates = [smooth(e, widths) for e in rates]
     rates = _solved(equations, rates, everything)
     return Formulas(
-        equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(inputs.values()),
-        tuple(input_rates.values()), tuple(rates), tuple(smooth(e, widths) for e in observed.values()),
-        tuple(late.values()), widths, along,
+        equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(driving),
+        tuple(driving_rates), tuple(rates), tuple(smooth(e, widths) for e in observed.values()),
+        tuple(late.values()), widths, along, tuple(late_inputs),
     )  # fmt: skip
 
 

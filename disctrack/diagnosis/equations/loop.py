@@ -425,16 +425,17 @@ def _with_memory(
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
     shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
-    if diagnosis.verdict == "unexplained" and lasting > SLOW * shortest_turn:
-        # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
+    # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
+    as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
+    remembering = Remembering(system, system.rows, coefficients, present)
+    base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
+    if diagnosis.verdict == "unexplained" and (base is None or not base.converged):
         block = max(2 * shortest_turn, 5 * lasting)
         reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
         spread = replace(_certain(system, diagnosis, block), reason=reason)
         text = f"sigmas are those of what is left ({block:.2g} s taken as one error), not of the noise alone"
         return spread, None, text
-    remembering = Remembering(system, system.rows, coefficients, present)
-    base = fit(remembering, system.base, diagnosis.before.values)
-    if not base.converged:
+    if base is None or not base.converged:
         return None, None, ""
     noise = float(share * size**2)
     again = diagnose(remembering, base.values, replace(settings, noise=noise), system.training, diagnosis)

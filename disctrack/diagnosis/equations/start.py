@@ -57,7 +57,7 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
     local = [local_polynomial(s, c, first) for c in range(w)]
     value_size = np.array([np.nanstd(s.data[:, c]) or 1.0 for c in range(w)])
     slope_size = value_size / max(turn(s), 1e-300) * 2 * np.pi
-    knots, pieces = s.knots, s.pieces
+    knots, pieces = formulas.driven(s.knots, s.pieces, p)
 
     def misfit(y: Array, slopes: float) -> Array:
         t, y = np.array([s.time[first]]), np.ascontiguousarray(y[None])
@@ -65,7 +65,8 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
         f, F_p = np.zeros((1, n)), np.zeros((1, n, len(p)))
         kernel.observe_all(formulas.observe, t, y, p, knots, pieces, h, H_y, H_p)
         kernel.rates_all(formulas.rhs, t, y, p, knots, pieces, f, F_p)
-        slope = H_y[0] @ f[0]
+        with np.errstate(all="ignore"):  # a guess may lie where a logarithm or a root has no value
+            slope = H_y[0] @ f[0]
         parts = [1e-4 * (y[0] - begin) / np.maximum(np.abs(begin), 1.0)]
         for c, known in enumerate(local):
             if known is not None:

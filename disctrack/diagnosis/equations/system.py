@@ -199,7 +199,8 @@ class EquationSystem:
                 z0[n * (1 + c) + (-1 - which)] = 1.0
         columns = np.array([max(which, -1) for which in own], np.int64)
         by_number, group_of, times = self._instants(s, p)
-        out = followed(f.rhs, z0, p, columns, (s.time[0], max(float(times.max()), s.time[0] + 1e-9)), s.knots, s.pieces,
+        knots, pieces = f.driven(s.knots, s.pieces, p)
+        out = followed(f.rhs, z0, p, columns, (s.time[0], max(float(times.max()), s.time[0] + 1e-9)), knots, pieces,
                        self.sizes, times)  # fmt: skip
         if out is None:
             return None
@@ -207,7 +208,7 @@ class EquationSystem:
         h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, n)), np.zeros((m, self._w, len(p)))
         for g in range(len(times)):
             states = np.ascontiguousarray(out[g, :, :n])
-            kernel.observe_all(f.observe, times[g], states, p, s.knots, s.pieces, h, H_y, H_p)
+            kernel.observe_all(f.observe, times[g], states, p, knots, pieces, h, H_y, H_p)
             channels = [c for c in range(self._w) if group_of[c] == g]
             seen[:, channels] = h[:, channels]
             if k == 0:
@@ -241,13 +242,14 @@ class EquationSystem:
         return by_number, group_of, np.ascontiguousarray(s.time + late[groups])
 
     def inputs_of(self, s: Samples, times: Array | None = None) -> list[Array]:
-        """Every input (m,) at instants of a stretch (at its samples, if not said)."""
+        """Every input (m,) at instants of a stretch (at its samples, if not said); late ones as if they were not."""
         times = s.time if times is None else times
         if not len(s.pieces):
             return []
         piece = np.clip(np.searchsorted(s.knots, times, side="right") - 1, 0, len(s.knots) - 2)
         x = times - s.knots[piece]
-        return [((a * x + b) * x + c) * x + d for a, b, c, d, _ in s.pieces[:, :, piece]]
+        found = [((a * x + b) * x + c) * x + d for a, b, c, d, _ in s.pieces[:, :, piece]]
+        return [*found, *(found[which] for which, _ in self.formulas.late_inputs)]
 
     def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
         """Rates (m, n), their derivatives (m, n, n_p), sensors (m, w), theirs (m, w, n_p) along a stretch's motion."""
@@ -257,13 +259,15 @@ class EquationSystem:
         rates, by_number = self._rates(s, p, s.time, states)
         h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, states.shape[1])), np.zeros((m, self._w, len(p)))
         states = np.ascontiguousarray(states)
-        kernel.observe_all(self.formulas.observe, s.time, states, p, s.knots, s.pieces, h, H_y, H_p)
+        knots, pieces = self.formulas.driven(s.knots, s.pieces, p)
+        kernel.observe_all(self.formulas.observe, s.time, states, p, knots, pieces, h, H_y, H_p)
         return rates, by_number, h, H_p
 
     def _rates(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array]:
         """Rates (m, n) and their derivatives (m, n, n_p) along a motion."""
         rates, by_number = np.zeros(states.shape), np.zeros((*states.shape, len(p)))
-        kernel.rates_all(self.formulas.rhs, times, np.ascontiguousarray(states), p, s.knots, s.pieces, rates, by_number)
+        knots, pieces = self.formulas.driven(s.knots, s.pieces, p)
+        kernel.rates_all(self.formulas.rhs, times, np.ascontiguousarray(states), p, knots, pieces, rates, by_number)
         return rates, by_number
 
 

@@ -181,9 +181,9 @@ def saturation(v: str, u: str, gain: str, name: str = "") -> Term:
 
 
 def input_delay(v: str, u: str, gain: str, name: str = "") -> Term:
-    """The measured input acts late (to first order in the delay); `gain` is its factor in the equation of v."""
-    return Term(name or f"delay_{u}", {v: f"-own_tau*({gain})*{u}_rate"}, parameters={"tau": Parameter(0.0, unit="s")},
-                title=f"input {u} acts late")  # fmt: skip
+    """The measured input acts late; `gain` is its factor in the equation of v."""
+    return Term(name or f"delay_{u}", {v: f"({gain})*(own_late - {u})"}, delayed={"late": (u, "own_tau")},
+                parameters={"tau": Parameter(0.0, unit="s")}, title=f"input {u} acts late")  # fmt: skip
 
 
 def usual(equations: Equations) -> tuple[Term, ...]:
