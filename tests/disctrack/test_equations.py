@@ -753,6 +753,20 @@ def test_a_held_input_that_acts_late_is_found(late, rng):
         assert answer.sigmas["delay_u.tau"] < 1e-3
 
 
+def test_a_search_that_takes_long_tells_what_would_make_it_shorter(monkeypatch, capfd):
+    """Ten times as many samples of a turn as tell anything; a patience of no time stands in for a minute."""
+    time = 0.001 * np.arange(4000)
+    run = Run(time, {"x": swinging(lambda x, v: 0.0, time)}, sigma=SIGMA)
+    diagnose(OSCILLATOR, run, FIVE[:1])
+    assert not capfd.readouterr().err
+    monkeypatch.setattr(loop, "PATIENCE", 0.01)
+    real = loop.guessed
+    monkeypatch.setattr(loop, "guessed", lambda system: (clock.sleep(0.3), real(system))[1])
+    diagnose(OSCILLATOR, run, FIVE[:1])
+    every = int(re.search(r"there are 4000 samples, \d+ a turn.*time\[::(\d+)\]", capfd.readouterr().err)[1])
+    assert 30 < 2 * np.pi / 12 / 0.001 / every < 50  # samples of a turn that are left
+
+
 @pytest.mark.parametrize(("hold", "late"), [("smooth", 0.37), ("linear", 0.37), ("smooth", -0.08), ("linear", 0.0)])
 def test_one_of_two_inputs_that_acts_late_is_integrated_exactly(rng, hold, late):
     """Against SciPy with the late signal as a function of time; derivatives against differences."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +45,8 @@ SAFE = 0.5  # of the time over which the model can be made to follow: near its e
 SCANNED = 8  # values along the motion that are tried for a limit
 ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
+PATIENCE = 60.0  # [s] of a search without a word
+ENOUGH_A_TURN = 40  # samples of a turn: more of them tell little more than the noise of each
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
@@ -66,6 +71,37 @@ def ask(
     terms : None: the usual ones (`terms.usual`)
     stretch : [s] after which every run begins anew with a state of its own; None: as far as the model follows
     """
+    samples: list[Samples] = []
+    with _word_of_patience(samples):
+        return _asked(equations, runs, terms, settings, stretch, samples)
+
+
+@contextmanager
+def _word_of_patience(samples: list[Samples]) -> Iterator[None]:
+    """After a minute, a line on stderr: what makes the search shorter. `samples` may be filled in meanwhile."""
+    timer = threading.Timer(PATIENCE, lambda: print(_shorter(samples), file=sys.stderr, flush=True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _shorter(samples: Sequence[Samples]) -> str:
+    count = sum(len(s.time) for s in samples)
+    text = f"the search goes on after {PATIENCE:.0f} s; there are {count} samples"
+    a_turn = min((turn(s) / float(np.median(np.diff(s.time))) for s in samples), default=0.0)
+    if a_turn > 2 * ENOUGH_A_TURN:
+        every = int(a_turn / ENOUGH_A_TURN)
+        return f"{text}, {a_turn:.0f} a turn. Every {every}th tells nearly as much sooner: Run(time[::{every}], ...)."
+    return f"{text}. A part of the record, or fewer terms, are answered sooner; what they tell can be declared."
+
+
+def _asked(
+    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None, settings: Settings | None,
+    stretch: float | None, read: list[Samples],
+) -> Answered:  # fmt: skip
     runs = [runs] if isinstance(runs, Run) else list(runs)
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
@@ -75,6 +111,7 @@ def ask(
     offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
     compiled = formulas(equations, offered, channels)
     samples = with_noise(given)
+    read += samples
     notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
     system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
     system, declared = _prepared(system)
