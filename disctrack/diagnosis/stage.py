@@ -375,8 +375,10 @@ def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -
     doubted, notes = list[Found](), list[str]()
     for found in kept:
         candidate = found.candidate
-        index = [fitted.names.index(name) for name in candidate.names]
-        amounts = np.array([fitted.values[q.name] - q.null for q in candidate.quantities])
+        shape = {q.name for q in candidate.shape}  # an exponent or a frequency is no amount
+        sizes = [q for q in candidate.quantities if q.name not in shape]
+        index = [fitted.names.index(q.name) for q in sizes]
+        amounts = np.array([fitted.values[q.name] - q.null for q in sizes])
         gain = wald(amounts, fitted.covariance[np.ix_(index, index)])
         if gain > found.threshold:
             continue

@@ -172,6 +172,12 @@ def test_an_effect_beside_a_law_is_claimed_only_if_no_form_of_the_law_may_do_as_
     assert kept.found == ()
     assert "[spring]" in note
     assert "not claimed" in note
+    exponent = Quantity("spring.p", "1", 0.1, null=1.0)
+    known = replace(found, candidate=replace(candidate, quantities=(*quantities, exponent), shape=(exponent,)))
+    shaped = np.zeros((3, 3))
+    shaped[:2, :2], shaped[2, 2] = wider.covariance, 1e-6
+    bent = replace(wider, quantities=(*quantities, exponent), values=values | {"spring.p": 2.0}, covariance=shaped)
+    assert stage._beside_any_form(replace(diagnosis, found=(known,)), [known], bent)[0].found == ()
 
 
 def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():

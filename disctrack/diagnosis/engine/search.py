@@ -314,26 +314,28 @@ class _Search:
                 self.refits.setdefault(extra[0].name, trial)
         trials.sort(key=lambda item: self._criterion(item[1]))
         chosen: Trial | None = None
+        obvious: Trial | None = None
         for extra, trial in trials[: self.settings.judged]:
             if not self._enough(trial, extra):
                 continue
             judged = self._judged(current, trial)
             if len(extra) == 1 and self.refits[extra[0].name] is trial:
                 self.refits[extra[0].name] = judged
-            if chosen is None and self._foretells(judged, extra):
+            held = judged.held_out_gain
+            if chosen is None and held is not None and held > 0:
                 chosen = judged
-        return chosen
+            elif obvious is None and self._obvious(judged, extra):
+                obvious = judged
+        return chosen or obvious
 
-    def _foretells(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
-        """Are samples that were not fitted more probable with it?
+    def _obvious(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
+        """Does it gain far more than noise does, while samples that were not fitted do not speak against it?
 
-        Of what noise does not reach by far the fitted part may know all: then they need only not speak against it.
+        The fitted part may know all that there is to know of it.
         """
         held = trial.held_out_gain
-        if held is None:
-            return False
         k = len({n for c in extra for n in c.names})
-        return held > 0 or (held > -CLASS_GAIN and trial.gain > OBVIOUS * self.threshold(k))
+        return held is not None and held > -CLASS_GAIN and trial.gain > OBVIOUS * self.threshold(k)
 
     def _nearly_all(self, before: Trial, after: Trial) -> bool:
         """Does the enlargement remove nine tenths of what exceeds the noise?"""
