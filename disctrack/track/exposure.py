@@ -111,22 +111,25 @@ def exposure_by_smear(
 ) -> ExposureSquared:
     """The exposures that the dots' edges tell; arguments as of `shift_by_exposure`, blur_px (n, 2, m) sigma of an edge.
 
-    The squared blur is fitted by a constant of every dot, what changes with the distance (to second order) and with
-    the place in the image (to first), and T^2 times the smear of one second's exposure. Sigmas are those of sums over
-    stretches of the recording (sandwich), as what a lens adds is not white.
+    The squared blur is fitted by a constant of every dot, what changes with the distance (to second order), with the
+    place in the image and with how obliquely a dot is seen (to first: blurs of curved edges are off by some 1e-4 px,
+    which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are those of sums
+    over stretches of the recording (sandwich), as what a lens adds is not white.
     """
     every = max(1, -(-len(t) // OF_SMEAR))
     chosen = np.arange(0, len(t), every)
     rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))  # with their neighbours
     own = np.searchsorted(rows, chosen)
     pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
-    smear = _smear(_rate(pixels, time[rows])[own], _affine(J[own], R[chosen]))
+    affine = _affine(J[own], R[chosen])
+    smear = _smear(_rate(pixels, time[rows])[own], affine)
     points = disc.marker_centres_body @ np.swapaxes(R[chosen], 1, 2) + t[chosen, None]
 
     def of_camera(camera: int) -> tuple[float, float]:
         R_camera_world, t_camera_world = rig.camera_poses()[camera]
         distance = points @ R_camera_world[2] + t_camera_world[2]
-        optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0))]
+        long, short = _half_axes(affine[:, camera])
+        optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0), short / long)]
         squared = np.asarray(blur_px[chosen, camera], float) ** 2
         return _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
 
@@ -206,16 +209,14 @@ def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, pull: 
 
     affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
     """
-    xx, yy = (affine[..., i, 0] ** 2 + affine[..., i, 1] ** 2 for i in range(2))
-    xy = (affine[..., 0, :] * affine[..., 1, :]).sum(axis=-1)
-    long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
-    short = np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0]) / long
+    long, short = _half_axes(affine)
     size, shape = radius * np.sqrt(long * short), short / long
     known = np.isfinite(size) & np.isfinite(velocity).all(axis=-1)
     if not known.any():
         return np.full_like(velocity, np.nan)
     sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
     T = _between(_response(sizes, pull), sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
+    xx, yy, xy = _second_moments(affine)
     turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the long axis
     c, s = np.cos(turn), np.sin(turn)
     axes = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
@@ -290,6 +291,19 @@ def _between(table: Array, sizes: Array, size: Array, shape: Array) -> Array:
     x, y = (x - i)[..., None], (y - j)[..., None]
     low, high = ((1 - y) * table[k, j] + y * table[k, j + 1] for k in (i, i + 1))
     return np.asarray((1 - x) * low + x * high)
+
+
+def _second_moments(affine: Array) -> tuple[Array, Array, Array]:
+    """xx, yy and xy of the images of a unit circle by maps (..., 2, 2)."""
+    xx, yy = (affine[..., i, 0] ** 2 + affine[..., i, 1] ** 2 for i in range(2))
+    return xx, yy, (affine[..., 0, :] * affine[..., 1, :]).sum(axis=-1)
+
+
+def _half_axes(affine: Array) -> tuple[Array, Array]:
+    """The long and the short one of the images of a unit circle by maps (..., 2, 2)."""
+    xx, yy, xy = _second_moments(affine)
+    long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
+    return long, np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0]) / long
 
 
 def _affine(J: Array, R: Array) -> Array:
