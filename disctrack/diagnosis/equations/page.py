@@ -97,9 +97,9 @@ def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
                 shown = slice(1, None, max(1, len(frequency) // _MOST_POINTS))
                 bottom.loglog(frequency[shown], np.sqrt(power[shown]), lw=0.7, color=colour, label=label)
     top.set(ylabel=f"{name} {f'[{unit}]' if unit else ''}")
-    middle.set(ylabel="measured - model", xlabel="time [s]")
+    middle.set(ylabel="measured - model", xlabel="time (s)")
     middle.set_yscale("symlog", linthresh=max(3 * answer.after[name].noise, 1e-12))
-    bottom.set(xlabel="frequency [Hz]", ylabel="residual per root Hz")
+    bottom.set(xlabel="frequency (Hz)", ylabel="residual per root Hz")
     for axes in (top, middle, bottom):
         if axes.get_legend_handles_labels()[1]:
             axes.legend(frameon=False, fontsize=8)
