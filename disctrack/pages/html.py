@@ -21,6 +21,11 @@ def text(item: str) -> Markup:
     return item if isinstance(item, Markup) else Markup(escape(typeset(item)))
 
 
+def as_typed(said: str) -> Markup:
+    """Names and formulas that people wrote and will look for: letter by letter."""
+    return Markup(escape(said))
+
+
 def typeset(said: str) -> str:
     """Signs in place of what stands for them in plain text; units only after a number, a bracket or a space.
 

@@ -12,7 +12,7 @@ from disctrack.diagnosis.pages.figures import candidates
 from disctrack.files.json_text import json_file, json_text, plain
 from disctrack.pages import palette
 from disctrack.pages.figures import Drawn, draw, gallery, plain_powers
-from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, typeset, warning
+from disctrack.pages.html import Markup, as_typed, bullets, page, paragraph, section, table, typeset, warning
 
 
 class Tree(HTMLParser):
@@ -149,3 +149,9 @@ def test_a_candidate_without_which_nothing_fits_has_the_longest_bar():
     assert np.isfinite(lengths[0])
     assert lengths[0] > 5 * max(lengths[1:])
     assert "without it nothing fits" in [text.get_text() for text in axes.texts]
+
+
+def test_formulas_of_the_reader_stay_as_they_were_typed():
+    assert bullets([as_typed("dtheta/dt = omega - sin(theta) < 1e-3")]) == (
+        "<ul><li>dtheta/dt = omega - sin(theta) &lt; 1e-3</li></ul>"
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import signal
 
 from disctrack.pages.figures import Drawn, draw, gallery, panels
-from disctrack.pages.html import Markup, bullets, page, paragraph, section, table
+from disctrack.pages.html import Markup, as_typed, bullets, page, paragraph, section, table
 from disctrack.pages.palette import BLUE, MUTED, RED
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def written_page(answer: Answer, folder: Path) -> tuple[str, list[Path]]:
     d = answer.diagnosis
     drawings = [_drawn(answer, c, name) for c, name in enumerate(answer.system.formulas.channels)]
     files, pictures = draw(folder, drawings, ("png",))
-    equations = [f"d{k}/dt = {v}" for k, v in answer.equations.rates.items()]
+    equations = [as_typed(f"d{k}/dt = {v}") for k, v in answer.equations.rates.items()]
     parts = [
         paragraph(answer.sentence, "lead"),
         paragraph(f"Verdict: {d.verdict}. {_sentence(d.reason)}"),
@@ -32,7 +32,7 @@ def written_page(answer: Answer, folder: Path) -> tuple[str, list[Path]]:
         *(paragraph(_sentence(n)) for n in answer.notes),
         section("Before and after", [_before_after(answer)]),
         section("Fitted numbers", [_fitted(answer)]),
-        gallery(drawings, pictures),
+        section("In pictures", [gallery(drawings, pictures)]),
         section("What was tried", [_tried(answer)]),
     ]
     return page(f"{answer.equations.name}: what is missing?", parts), files
@@ -62,15 +62,16 @@ def _fitted(answer: Answer) -> Markup:
     for q in d.after.quantities:
         if not q.name.startswith("state."):
             old = f"{d.before.values[q.name]:.6g} +- {d.before.sigma(q.name):.2g}" if q.name in d.before.names else ""
-            rows.append([q.name, old, f"{d.after.values[q.name]:.6g} +- {d.after.sigma(q.name):.2g}", q.unit])
+            new = f"{d.after.values[q.name]:.6g} +- {d.after.sigma(q.name):.2g}"
+            rows.append([as_typed(q.name), old, new, "" if q.unit == "1" else q.unit])
     return table("", ["", "before", "after", "unit"], rows)
 
 
 def _tried(answer: Answer) -> Markup:
-    rows = [
-        [t.candidate.name, t.candidate.title, *(_number(x) for x in (t.score, t.gain, t.held_out_gain)), t.reason]
-        for t in answer.diagnosis.tried
-    ]  # fmt: skip
+    rows = []
+    for t in answer.diagnosis.tried:
+        numbers = (_number(x) for x in (t.score, t.gain, t.held_out_gain))
+        rows.append([as_typed(t.candidate.name), t.candidate.title, *numbers, t.reason])
     return table("", ["term", "", "score", "refitted", "held out", "outcome"], rows)
 
 
@@ -96,7 +97,7 @@ def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
                 frequency, power = signal.periodogram(np.nan_to_num(left), rate)
                 shown = slice(1, None, max(1, len(frequency) // _MOST_POINTS))
                 bottom.loglog(frequency[shown], np.sqrt(power[shown]), lw=0.7, color=colour, label=label)
-    top.set(ylabel=f"{name} {f'[{unit}]' if unit else ''}")
+    top.set(ylabel=f"{name} {f'({unit})' if unit else ''}")
     middle.set(ylabel="measured - model", xlabel="time (s)")
     middle.set_yscale("symlog", linthresh=max(3 * answer.after[name].noise, 1e-12))
     bottom.set(xlabel="frequency (Hz)", ylabel="residual per root Hz")
