@@ -88,7 +88,7 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
     page = (tmp_path / "out" / "diagnosis.html").read_text()
     assert "What many recordings bring" in page
     for bound in document["bounds"]:  # of a vector every number
-        assert all(f"<td>{p['name']}" in page for p in bound["parameters"])
+        assert all(f">{p['name']}" in page for p in bound["parameters"])
     assert main(words) == 0  # the complete result is used again
     assert main(["diagnose", str(paths[0]), str(paths[0])]) == 1
     assert "more than once" in capsys.readouterr().err
