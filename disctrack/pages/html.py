@@ -33,8 +33,19 @@ def typeset(said: str) -> str:
     """
     said = said.replace(" +- ", " ± ").replace("^2", "²").replace("^3", "³").replace(" -> ", " → ")
     said = re.sub(r"(?<=[\d \[(])u(?=(?:m|rad|s|N m)\b)", "µ", said)
+    said = re.sub(r"(?<![\w.+])(\d+(?:\.\d+)?e-\d+) (m|rad|s|N)(?=[,;)]|\.(?!\w)| \(|$)", _prefixed, said)
     said = re.sub(r"(?<![\w.+])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?![\w…])", _power, said)
     return re.sub(r"(?<![\w./-])(psi|theta|phi)(dot)?(?![\w/-]|\.\w)", _angle, said)
+
+
+def _prefixed(found: re.Match[str]) -> str:
+    """A small length, angle, time or force: 2.6e-07 m is 0.26 µm. Of compound units powers of ten stay."""
+    number, unit = found.groups()
+    digits = len(number.partition("e")[0].replace(".", ""))
+    for size, prefix in ((1e-3, "m"), (1e-6, "µ"), (1e-9, "n")):
+        if float(number) >= 0.1 * size:
+            return f"{float(number) / size:.{max(digits, 3)}g} {prefix}{unit}"
+    return found[0]
 
 
 def _power(found: re.Match[str]) -> str:

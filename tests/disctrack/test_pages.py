@@ -103,7 +103,10 @@ def test_json_holds_no_number_that_json_does_not_know():
 
 
 def test_numbers_and_angles_are_set_as_people_write_them():
-    assert typeset("k < 2.6e-07 m, -5e+10, 3e5").replace("\xa0", " ") == "k < 2.6 × 10⁻⁷ m, -5 × 10¹⁰, 3 × 10⁵"
+    assert typeset("k < 2.6e-07 m s, -5e+10, 3e5").replace("\xa0", " ") == "k < 2.6 × 10⁻⁷ m s, -5 × 10¹⁰, 3 × 10⁵"
+    small = "x < 2.6e-07 m, y < 1.25e-05 rad; t < 3e-08 s (95 %)"
+    assert typeset(small) == "x < 0.26 µm, y < 12.5 µrad; t < 30 ns (95 %)"
+    assert typeset("c < 5e-13 m, k 2e-08 m^2").replace("\xa0", " ") == "c < 5 × 10⁻¹³ m, k 2 × 10⁻⁸ m²"
     assert typeset("M = k psidot / sin theta, phi") == "M = k ψ̇ / sin θ, φ"
     assert typeset("psi + phi. Then theta.") == "ψ + φ. Then θ."
     for kept in ("state.theta", "theta_deg", "figures/theta.png", "theta.png", "1e", "case1e5", "0.2.0+1e5", "12e45…"):
