@@ -94,7 +94,7 @@ def _shorter(samples: Sequence[Samples]) -> str:
     a_turn = min((turn(s) / float(np.median(np.diff(s.time))) for s in samples), default=0.0)
     if a_turn > 2 * ENOUGH_A_TURN:
         every = int(a_turn / ENOUGH_A_TURN)
-        return f"{text}, {a_turn:.0f} a turn. Every {every}th tells nearly as much sooner: Run(time[::{every}], ...)."
+        return f"{text}, {a_turn:.0f} a turn. One in {every} tells nearly as much, sooner: Run(time[::{every}], ...)."
     return f"{text}. A part of the record, or fewer terms, are answered sooner; what they tell can be declared."
 
 
