@@ -363,7 +363,7 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
 def _as_noise_with_memory(system: System, fitted: Fit, names: Sequence[str], noise: float) -> float:
     """By how much more than white noise what is left, with its memory, lets these numbers gain."""
     factors = dict(zip(fitted.names, inflation(system, fitted), strict=True))
-    return max(1.0, fitted.reduced_chi_square / noise) * max(factors[name] for name in names) ** 2
+    return float(max(1.0, fitted.reduced_chi_square / noise) * max(factors[name] for name in names) ** 2)
 
 
 def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -> tuple[Diagnosis, tuple[str, ...]]:
