@@ -46,6 +46,7 @@ from disctrack.trajectory import FrameStatus
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
 MOST_STRETCHES = 16
 WAITED_FOR = 160  # pairs that are followed in the time that the first stretch takes to measure noise and blur for all
+FAR_PX = 1.0  # that dots miss their places by in all frames, beyond any lens: the poses are no better than none
 MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
@@ -124,8 +125,11 @@ def track(
     status = tracking.trajectory.frame_status
     one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)
     left_out = any(LEFT_OUT in doubt for doubt in tracking.doubts)  # which makes cameras contradict each other
-    if (one_sided or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY) and not left_out:
-        first = np.flatnonzero((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))[0]
+    contradicted = one_sided or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
+    far = bool(tracking.doubts) and max(tracking.systematic_px) > FAR_PX
+    if (contradicted or far) and not left_out:
+        of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
+        first = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))[0]
         if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
             told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
             tracking = replace(tracking, doubts=(told, *tracking.doubts))
