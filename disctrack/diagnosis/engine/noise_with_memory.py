@@ -55,7 +55,9 @@ def estimate(stretches: Sequence[SampleStretch], start: SmoothNoise) -> SmoothNo
     A memory beyond a fifth of the longest stretch is not sought: such an error looks like the motion itself.
     """
     # of large numbers that the bases explain, the likelihood would leave rounding
-    stretches = [replace(s, values=s.values - s.basis @ np.linalg.lstsq(s.basis, s.values)[0]) for s in stretches]
+    stretches = [
+        replace(s, values=s.values - s.basis @ np.linalg.lstsq(s.basis, s.values, rcond=None)[0]) for s in stretches
+    ]
     longest = 0.2 * max(float(np.ptp(s.time)) for s in stretches)
     bounds = [(np.log(1e-3 * x), np.log(1e3 * x)) for x in (start.white, start.smooth)]
     bounds.append((np.log(0.01 * longest), np.log(longest)))
