@@ -20,7 +20,8 @@ CALIBRATION = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by 
 
 def diagnosis_of(recording):
     out = recording.parent / "out"
-    assert main(["run", str(recording), "-o", str(out), "--no-figures", "--no-video", *CALIBRATION]) == 0
+    # 3: a doubt is told, as a camera that is late by 200 us leaves 11 times the dots' scatter
+    assert main(["run", str(recording), "-o", str(out), "--no-figures", "--no-video", *CALIBRATION]) in (0, 3)
     assert main(["diagnose", str(out / "trajectory.h5"), "-o", str(out / "diagnosis")]) == 0
     return json.loads((out / "diagnosis" / "diagnosis.json").read_text())
 

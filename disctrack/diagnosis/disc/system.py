@@ -22,7 +22,7 @@ from disctrack.diagnosis.disc.motion import (
     state_quantities,
 )
 from disctrack.diagnosis.disc.sought import sought
-from disctrack.diagnosis.disc.start import start_values
+from disctrack.diagnosis.disc.start import STRETCHES, start_values
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.diagnosis.engine.fit import triangle
@@ -298,6 +298,12 @@ class DiscSystem:
         for name in ("time", "used", "_observed", "_whiten", "weights", "_nuisance_columns"):
             setattr(part, name, getattr(self, name)[:n])
         return part
+
+    @property
+    def beginnings(self) -> tuple[DiscSystem, ...]:
+        """Parts over which a motion is followed that a fit of the whole would not find."""
+        span = float(self.time[-1] - self.time[0])
+        return tuple(self.first_part(stretch) for stretch in STRETCHES if stretch < span)
 
     def hurried(self, share: float = 1.0) -> DiscSystem:
         """The same system, that gives up with TrialGivenUp after this share of the steps of slip that a trial has."""

@@ -23,7 +23,16 @@ from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.diagnosis.engine.score import Linearisation, Score, angle, score_all, score_pairs
 from disctrack.diagnosis.engine.significance import TWO_SIDED
-from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, Values, hurried, several_minima
+from disctrack.diagnosis.engine.system import (
+    Candidate,
+    Quantity,
+    System,
+    TrialGivenUp,
+    Values,
+    beginnings,
+    hurried,
+    several_minima,
+)
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
 OBVIOUS = 5.0  # times the gain that noise alone does not reach
@@ -33,6 +42,7 @@ MOST_RIVALS = 12
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
 SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
+FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -266,14 +276,17 @@ class _Search:
         """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
         together = [*current.candidates, *extra]
         starts: list[dict[str, float]] = [{}]
+        fits = list[Fit]()
         for c in extra:
             if c.threshold:
                 starts = [dict(zip(c.names, s, strict=True)) for s in self.system.starts(c, current.fit.values)]
         if extra and all(
             c.threshold for c in extra
         ):  # a refit beyond a threshold is long: only where it leads somewhere
+            followed = [self._followed(current, together, s) for s in starts]
             starts = [s for s in starts if self._promising(current, together, s)]
-        fits = [self._fit(together, current.fit.values | start) for start in starts]
+            fits = [f for f in followed if f is not None]
+        fits += [self._fit(together, current.fit.values | start) for start in starts]
         if (ended := self.former.get(frozenset(c.name for c in together))) is not None:
             fits.append(self._fit(together, ended))
         declared = {q.name: q.declared for q in self.system.base if q.declared is not None}
@@ -290,6 +303,25 @@ class _Search:
         except TrialGivenUp:
             return False
         return few.cost < PROMISING * current.fit.cost
+
+    def _followed(self, current: Trial, together: Sequence[Candidate], start: Values) -> Fit | None:
+        """Refit that comes from longer and longer beginnings; None where one of them does not fit to the noise.
+
+        Each instant at which a threshold is passed is a valley of its own: from a motion that ignores it no step leads
+        to the one in which all of them are right. Where the residual is small, a step does.
+        """
+        values, quantities = {**current.fit.values, **start}, self._quantities(together)
+        if current.fit.reduced_chi_square < FAR * self.noise:
+            return None
+        for part in beginnings(self.system):
+            try:
+                found = fit(hurried(part, len(self.system.time) / len(part.time)), quantities, values)
+            except TrialGivenUp:
+                return None
+            if not found.converged or found.reduced_chi_square > AGREES * self.noise:
+                return None
+            values = found.values
+        return self._fit(together, values)
 
     def _judged(self, current: Trial, trial: Trial) -> Trial:
         """With the free run over held-out data."""
@@ -338,9 +370,10 @@ class _Search:
         return held is not None and held > -CLASS_GAIN and trial.gain > OBVIOUS * self.threshold(k)
 
     def _nearly_all(self, before: Trial, after: Trial) -> bool:
-        """Does the enlargement remove nine tenths of what exceeds the noise?"""
+        """Does the enlargement remove nine tenths of what exceeds the noise, and is little left?"""
         excess = [t.fit.chi_square / self.noise - t.fit.degrees_of_freedom for t in (before, after)]
-        return after.fit.converged and excess[1] < 0.1 * excess[0]
+        near = after.fit.reduced_chi_square < FAR * self.noise
+        return after.fit.converged and near and excess[1] < 0.1 * excess[0]
 
     def _shortlist(
         self, current: Trial, linear: Linearisation, scores: list[Score] | None

@@ -112,6 +112,11 @@ def several_minima(system: System) -> bool:
     return bool(getattr(system, "several_minima", False))
 
 
+def beginnings(system: System) -> Sequence[System]:
+    """Parts of the system from its first sample on, shorter ones first; none where it does not give any."""
+    return tuple(getattr(system, "beginnings", ()))
+
+
 class Wrapped:
     """A system as another sees it: all as it is, but for what a subclass changes."""
 
