@@ -78,7 +78,7 @@ def look_into(folder: Path) -> FolderContent:
     """What the frames of a folder tell. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
     pairs, parts = pair_cameras(sequences), None
-    if not any(pair.named for pair in pairs) and (half := _side_by_side(folder, sequences)):
+    if _may_be_one_camera(folder, pairs, sequences) and (half := _side_by_side(folder, sequences)):
         width, height = half
         parts = [0, 0, width, height], [width, 0, width, height]
         pairs = [CameraPair(sequence, sequence, named=True) for sequence in sequences]
@@ -89,10 +89,8 @@ def look_into(folder: Path) -> FolderContent:
     candidates = [pair for pair in pairs if pair is not views] or pairs
     lengths = {id(pair): _length(folder, pair.left) for pair in candidates}
     frames = max(candidates, key=lambda pair: lengths[id(pair)])
-    if views is None and not frames.named:
-        boards = [board_size(some_images(side.pattern, folder))[0] for side in (frames.left, frames.right)]
-        if (boards[0] is None) != (boards[1] is None):  # views and frames of one camera
-            raise _no_two_cameras(folder, sequences)
+    if views is None and parts is None and _shows_the_board_once(folder, frames):
+        raise _no_two_cameras(folder, sequences)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
         notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
@@ -133,6 +131,21 @@ def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
         f"{folder}: no two sequences whose names differ by the camera alone (left and right, cam1 and cam2, ...). "
         f"It holds: {seen}. Put each camera's frames into a folder of its own, e.g. left/ and right/."
     )
+
+
+def _may_be_one_camera(folder: Path, pairs: list[CameraPair], sequences: list[Sequence]) -> bool:
+    """Is a sequence without a partner, or are partners unlike? Where all are two and two there are two cameras."""
+    if any(pair.named for pair in pairs):
+        return False
+    return 2 * len(pairs) < len(sequences) or any(_shows_the_board_once(folder, pair) for pair in pairs)
+
+
+def _shows_the_board_once(folder: Path, pair: CameraPair) -> bool:
+    """Does one of two sequences show a chessboard and the other none? Those are views and frames of one camera."""
+    if pair.named:
+        return False
+    left, right = (board_size(some_images(side.pattern, folder))[0] is None for side in (pair.left, pair.right))
+    return left != right
 
 
 def _side_by_side(folder: Path, sequences: list[Sequence]) -> tuple[int, int] | None:

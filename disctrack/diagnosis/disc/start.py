@@ -78,10 +78,8 @@ def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
     if SLIP in names:
         values[SLIP] = 1.0 / first_friction(times, q, system.model.gravity)
     state = tuple(quantity for quantity in system.base if quantity.name.startswith("state.") or quantity.name == SLIP)
-    for stretch in STRETCHES:
-        if stretch >= system.time[-1] - system.time[0]:
-            break
+    for stretch, part in zip(STRETCHES, system.beginnings, strict=False):
         # a law of friction shows only over several turns: held until the stretch is long enough
         moved = state if stretch < 0.1 else (*state, *laws)
-        values = fit(system.first_part(stretch), moved, values).values
+        values = fit(part, moved, values).values
     return values

@@ -276,17 +276,17 @@ class _Search:
         """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
         together = [*current.candidates, *extra]
         starts: list[dict[str, float]] = [{}]
-        fits = list[Fit]()
         for c in extra:
             if c.threshold:
                 starts = [dict(zip(c.names, s, strict=True)) for s in self.system.starts(c, current.fit.values)]
-        if extra and all(
-            c.threshold for c in extra
-        ):  # a refit beyond a threshold is long: only where it leads somewhere
-            followed = [self._followed(current, together, s) for s in starts]
+        if extra and all(c.threshold for c in extra):
+            for start in starts:
+                followed = self._followed(current, together, start)
+                if followed is not None and self._at_noise(followed):
+                    return followed
+            # a refit beyond a threshold is long: only where it leads somewhere
             starts = [s for s in starts if self._promising(current, together, s)]
-            fits = [f for f in followed if f is not None]
-        fits += [self._fit(together, current.fit.values | start) for start in starts]
+        fits = [self._fit(together, current.fit.values | start) for start in starts]
         if (ended := self.former.get(frozenset(c.name for c in together))) is not None:
             fits.append(self._fit(together, ended))
         declared = {q.name: q.declared for q in self.system.base if q.declared is not None}
