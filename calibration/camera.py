@@ -257,20 +257,14 @@ class StereoRig(Brief):
         pixels_right, d_right, d_k_right = project_with_jacobians(turned_right + self.t_right_left, self.right)
         d_right_left = d_right @ self.R_right_left  # d pixel_right / d point_left
 
-        def rotated(d_point: Array, arm: Array) -> Array:
-            """D pixel / d rotation vector when the arm turns: d_point @ (v x arm) = (arm x d_point) . v."""
-            x, y, z = (arm[..., None, i] for i in range(3))  # numpy.cross takes three times as long
-            a, b, c = (d_point[..., i] for i in range(3))
-            return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
-
         arm_world = points_world @ self.R_left_world.T
         d_rig = np.zeros((*points_world.shape[:-2], 2, points_world.shape[-2], 2, N_RIG))
         d_rig[..., 0, :, :, OF_LEFT] = d_k_left
         d_rig[..., 1, :, :, OF_RIGHT] = d_k_right
-        d_rig[..., 1, :, :, PAIR_TURN] = rotated(d_right, turned_right)
+        d_rig[..., 1, :, :, PAIR_TURN] = by_turning(d_right, turned_right)
         d_rig[..., 1, :, :, PAIR_SHIFT] = d_right
         for camera, d_point in enumerate((d_left, d_right_left)):
-            d_rig[..., camera, :, :, WORLD_TURN] = rotated(d_point, arm_world)
+            d_rig[..., camera, :, :, WORLD_TURN] = by_turning(d_point, arm_world)
             d_rig[..., camera, :, :, WORLD_SHIFT] = d_point
         d_world = np.stack([d_left @ self.R_left_world, d_right_left @ self.R_left_world], axis=-4)
         return np.stack([pixels_left, pixels_right], axis=-3), d_world, d_rig
@@ -287,6 +281,16 @@ class StereoRig(Brief):
             R_left_world=rotation_from_vector(delta[WORLD_TURN]) @ self.R_left_world,
             t_left_world=self.t_left_world + delta[WORLD_SHIFT],
         )
+
+
+def by_turning(d_point: Array, arm: Array) -> Array:
+    """D pixel / d rotation vector (..., 2, 3) when the arm (..., 3) turns, from d pixel / d point (..., 2, 3).
+
+    d_point @ (v x arm) = (arm x d_point) . v
+    """
+    x, y, z = (arm[..., None, i] for i in range(3))  # numpy.cross takes three times as long
+    a, b, c = (d_point[..., i] for i in range(3))
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
 def placed_at(poses: Sequence[tuple[Array, Array]]) -> dict[str, Any]:

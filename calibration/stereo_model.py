@@ -15,6 +15,7 @@ from calibration.camera import (
     PAIR_SHIFT,
     PAIR_TURN,
     Camera,
+    by_turning,
     project,
     project_with_jacobians,
     rotation_from_vector,
@@ -169,10 +170,10 @@ def predict(model: StereoModel, observations: Observations) -> tuple[Array, Arra
         turned = points_left[seen] @ model.R_right_left.T
         pixels[seen], d_right, d_k = project_with_jacobians(turned + model.t_right_left, camera)
         d_stereo[seen, :, N_INTRINSIC : 2 * N_INTRINSIC] = d_k
-        d_stereo[seen, :, 2 * N_INTRINSIC : 2 * N_INTRINSIC + 3] = _crossed(turned, d_right)
+        d_stereo[seen, :, 2 * N_INTRINSIC : 2 * N_INTRINSIC + 3] = by_turning(d_right, turned)
         d_stereo[seen, :, 2 * N_INTRINSIC + 3 :] = d_right
         d_left[seen] = d_right @ model.R_right_left
-    d_pose[..., :3] = _crossed(arm, d_left)
+    d_pose[..., :3] = by_turning(d_left, arm)
     return pixels, d_stereo, d_pose, d_left @ R
 
 
@@ -186,12 +187,6 @@ def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array,
             for one, of in zip((R, t), model.boards_right, strict=True)
         )
     return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
-
-
-def _crossed(arm: Array, d: Array) -> Array:
-    """Cross products of (m, 3) with each row of (m, 2, 3)."""
-    (x, y, z), (a, b, c) = np.moveaxis(arm, -1, 0)[..., None], np.moveaxis(d, -1, 0)
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
 def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
