@@ -10,9 +10,13 @@ import argparse
 import importlib
 import io
 import os
+import signal
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 
 from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE, options
 from disctrack.files.software import __version__
@@ -47,6 +51,11 @@ TRACEBACK_VARIABLE = "DISCTRACK_TRACEBACK"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. Errors are one line on stderr."""
     words = list(sys.argv[1:] if argv is None else argv)
+    with _interruptions() as interrupted:
+        return _answer(words, interrupted)
+
+
+def _answer(words: Sequence[str], interrupted: threading.Event) -> int:
     try:
         _print_what_the_terminal_knows()
         _keep_compiled_loops_somewhere()
@@ -62,14 +71,38 @@ def main(argv: Sequence[str] | None = None) -> int:
         with inputs_kept(), recorded_times():
             return int(command.run(arguments))
     except KeyboardInterrupt:
-        return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)
+        return _say_interrupted()
     except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
-        return _tell(error)
+        return _say_interrupted() if interrupted.is_set() else _tell(error)
+
+
+@contextmanager
+def _interruptions() -> Iterator[threading.Event]:
+    """Set when Ctrl-C was pressed.
+
+    Compiled libraries that are struck while they are loaded turn KeyboardInterrupt into an error of their own, which
+    would be told as ours.
+    """
+    interrupted = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield interrupted  # the caller decides what Ctrl-C does
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        interrupted.set()
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _print_what_the_terminal_knows() -> None:
@@ -109,6 +142,10 @@ def _tell(error: Exception) -> int:
         return _say("out of memory. Close other programs, or measure fewer frames at once with --frames.", FAILED)
     kind = type(error).__name__
     return _say(f"internal error ({kind}: {error}). {TRACEBACK_VARIABLE}=1 shows where; please report it.", INTERNAL)
+
+
+def _say_interrupted() -> int:
+    return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)
 
 
 def _say(message: str, code: int) -> int:

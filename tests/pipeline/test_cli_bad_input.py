@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from disctrack.cli import main
+from disctrack.commands import INTERRUPTED
 from disctrack.files import whole as whole_files
 from disctrack.trajectory.file import read_trajectory
 
@@ -255,6 +256,30 @@ def test_a_recording_folder_that_is_read_only(recording, monkeypatch, capsys, co
     message = failure(capsys, "run", recording)
     assert word in message
     assert "-o" in message
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+@pytest.mark.parametrize("struck", [True, False])
+def test_ctrl_c_that_a_library_turns_into_its_own_error_is_told_as_ctrl_c(recording, monkeypatch, capsys, struck):
+    from disctrack.commands import run as command
+
+    def loaded(arguments):
+        try:
+            if struck:
+                signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            pass
+        raise ImportError("initialization failed")
+
+    monkeypatch.setattr(command, "run", loaded)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background has it ignored
+    try:
+        code, told = main(["run", str(recording)]), capsys.readouterr().err
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (code == INTERRUPTED) == ("interrupted" in told) == struck
+    assert ("internal error" in told) == (not struck)
 
 
 def test_a_disk_that_fills_up_while_the_result_is_written(recording, monkeypatch, capsys):
