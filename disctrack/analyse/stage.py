@@ -18,9 +18,9 @@ from disctrack.analyse.propagation import DerivedSeries, shared_sigma
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
-from disctrack.files.whole import refuse_existing
 from disctrack.frames import euler_jacobian
 from disctrack.trajectory.file import Group, read_provenance, read_setup, read_trajectory, write_groups
+from disctrack.trajectory.reuse import refuse_other
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,7 +79,7 @@ def run_analyse(
     path = Path(path)
     keep(path)
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_analysis"
-    refuse_existing(folder / "report.html", overwrite)
+    refuse_other(folder / "report.html", overwrite)
     trajectory, provenance = read_trajectory(path), read_provenance(path)
     try:
         analysis = analyse(trajectory, window, circle_duration)

@@ -43,9 +43,10 @@ from disctrack.diagnosis.pages.words import law_text, sentence
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
+from disctrack.trajectory.reuse import refuse_other
 
 TRIED_BESIDE = 3  # effects of the catalogue beside what was found, where what is left is not noise
 DOUBTFUL = 0.05  # probability of what a single known effect leaves, below which laws outside the catalogue compete
@@ -448,7 +449,7 @@ def run_diagnose(
     keep(Path(model))
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"
     report = folder / "diagnosis.json"
-    refuse_existing(report, overwrite)
+    refuse_other(report, overwrite)
     for name in (report.name, "model.toml"):
         refuse_input(folder / name)
     provenance = read_provenance(path)

@@ -24,6 +24,7 @@ SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is 
 ONE_SIDED = "the dots of only one camera make sense"
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 MISFIT = "the dots miss their fitted places"
+LIE_OFF = "dots lie off the places declared in [markers]"
 LOWEST_POINT = "the disc's lowest point"
 
 
@@ -79,9 +80,7 @@ def misplaced_in_words(declared: Disc, found: Array) -> str:
     centres = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in 1e3 * found[:, :2])
     others = np.delete(away, far)
     rest = f" (the others within {others.max():.3f} mm)" if len(others) else ""
-    return (
-        f"dots lie off the places declared in [markers]: {named}{rest}, counted from 0; centres_mm = [{centres}] fits"
-    )
+    return f"{LIE_OFF}: {named}{rest}, counted from 0; centres_mm = [{centres}] fits"
 
 
 def _shaken_in_words(poses: PoseScatter, trajectory: Trajectory) -> str:

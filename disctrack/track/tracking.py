@@ -26,7 +26,7 @@ from disctrack.readers.blocks import PairBlock
 from disctrack.track import following, pose
 from disctrack.track.arrangement import arrangement_found
 from disctrack.track.assembly import Taken, Tracking, TrackingSettings, assemble
-from disctrack.track.doubts import MOVED, ONE_SIDED
+from disctrack.track.doubts import LIE_OFF, MOVED, ONE_SIDED
 from disctrack.track.following import (
     Follower,
     Image,
@@ -133,7 +133,9 @@ def track(
         if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
             told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
             tracking = replace(tracking, doubts=(told, *tracking.doubts))
-    return tracking
+    # in doubt only here: dots found elsewhere than declared are what the second look above is for
+    misplaced = (text for text in tracking.warnings if text.startswith(LIE_OFF))
+    return replace(tracking, doubts=(*tracking.doubts, *misplaced))
 
 
 def _followed(

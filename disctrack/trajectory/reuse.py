@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from disctrack.files.software import software_version
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory.file import read_setup
 
 FILE_NAME = "made_from.json"
@@ -36,3 +37,17 @@ def reusable(folder: Path, origin: str) -> list[str] | None:
         return [str(line) for line in content["summary"]] if whole else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def refuse_other(report: Path, overwrite: bool) -> None:
+    """Raise OutputError where there is a report that may not be replaced, with what sets it apart from a new one."""
+    other = ""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # what does not say who made it
+        made_by, here = (
+            json.loads((report.parent / FILE_NAME).read_text(encoding="utf-8"))["version"],
+            software_version(),
+        )
+        other = f", made by version {made_by} (this is {here})"
+        if made_by == here:
+            other = ", made from another trajectory, or with other settings"
+    refuse_existing(report, overwrite, other)

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 from pathlib import Path
 
 import h5py
@@ -80,7 +81,18 @@ def test_a_second_analysis_is_reused_and_another_window_or_a_missing_figure_is_n
     assert "rolls without slip" in told
     assert (report / "report.html").stat().st_mtime_ns == before
     assert main([*command, "--window", "0.4"]) == 1  # another result: kept unless told otherwise
-    assert "--overwrite" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "with other settings" in said
+    assert "--overwrite" in said
+    made_from = report / "made_from.json"
+    kept = made_from.read_text()
+    # one of an earlier version: other sources, so another origin
+    made_from.write_text(json.dumps(json.loads(kept) | {"version": "0.1.9+abc", "origin": "0"}))
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert "made by version 0.1.9+abc (this is 0." in said
+    assert "--overwrite" in said
+    made_from.write_text(kept)
 
 
 def test_a_declaration_that_changed_since_is_told_and_an_equal_one_is_not(analysed_clip, sample_clip, capsys):

@@ -151,6 +151,7 @@ def test_a_dot_declared_a_millimetre_off_is_found_and_named(clip):
     found = measure(clip.images, clip.rig, with_dots(clip.disc, off))
     (told,) = [text for text in found.warnings if "dots lie off" in text]
     assert "dot 0 by 1.00 mm (the others within 0.0" in told
+    assert found.doubts == (told,), "poses rest on other dots than declared: exit code 3, a reason in the batch's table"
     assert not any("a camera moved" in text for text in found.warnings)
     np.testing.assert_allclose(found.trajectory.disc.marker_centres_body, clip.disc.marker_centres_body, atol=8e-6)
     untouched = clip.untouched.trajectory

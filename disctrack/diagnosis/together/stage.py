@@ -13,9 +13,9 @@ from disctrack.diagnosis.together.recordings import Recorded, read_recorded
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import write_whole
 from disctrack.trajectory.file import read_setup
-from disctrack.trajectory.reuse import origin_of, remember, reusable
+from disctrack.trajectory.reuse import origin_of, refuse_other, remember, reusable
 
 FOLDER = "together_diagnosis"
 
@@ -64,7 +64,7 @@ def run_together(
     told = reusable(folder, origin) if reuse else None
     if told is not None:
         return TogetherOutcome(None, (report, folder / "diagnosis.html"), tuple(told))
-    refuse_existing(report, overwrite)
+    refuse_other(report, overwrite)
     refuse_input(report)
     recordings = _told_apart([read_recorded(p) for p in paths], paths)
     result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle)
