@@ -1,7 +1,5 @@
 """How good a calibration is: consistency of its parts, coverage, uncertainty in px and mm, and a verdict in words."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Board axes of every target: i to the right and j upwards as the pattern stands upright, k out of the print.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """How results show themselves: a few facts on one line, or as a small table in a notebook."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from enum import Enum

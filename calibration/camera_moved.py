@@ -6,8 +6,6 @@ a step of them, in the order in which the views were taken. Distances are measur
 see them, so that what a pair tells badly (a shift along the axis) counts as little as it is known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

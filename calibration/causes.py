@@ -1,7 +1,5 @@
 """What the uncertainty of a quantity comes from: the views of the board, its sizes, the disc's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

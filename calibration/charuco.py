@@ -3,8 +3,6 @@
 The board may be partly out of view or covered, or printed as a negative: every marker says where it belongs.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 OpenCV finds the board roughly; `corner_fit` locates the corners.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

@@ -6,8 +6,6 @@ formats has a place for the covariance: a rig that comes back has none, and pose
 calibration's part of the sigma.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import tomllib

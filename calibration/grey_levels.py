@@ -5,8 +5,6 @@ have been multiplied by 257. The step between neighbouring values is what roundi
 images of any depth look alike. A sensor with a colour filter writes grey values, too, in a pattern of 2 x 2 gains.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -5,8 +5,6 @@ them, and have none, so that the field holds only what those cannot. It is kept 
 better with it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ error into all others, which nothing would say (1.8 to 2.3 times the stated vari
 are fitted, and `priors` knows how large they are in lenses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -8,8 +8,6 @@ the errors. What lies in one image as a whole for another reason, errors that ne
 lens beyond its polynomial, is in it likewise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exchange of rigs with OpenCV's YAML or XML files, in the names of its stereo sample (M1 D1 M2 D2 R T)."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whether the two images of a pair show the board in one place: views that fit after all, boards that moved between."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Calibration from corners that another program located: points and one sigma."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

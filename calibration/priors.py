@@ -11,8 +11,6 @@ the corner 0.065, 0.073, 0.073 rms, 0.24 at most; tangential 0.0027; the middle 
 and shear of boards 0.3 % rms, 1.3 % at most. With ten good views little of this is felt.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

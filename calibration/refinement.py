@@ -3,8 +3,6 @@
 Outliers are rejected and the noise that the points' own covariances leave unexplained is measured on the way.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rig files: HDF5 that explains itself, with the corners it came from: it can be judged and redone years later."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

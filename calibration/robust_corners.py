@@ -5,8 +5,6 @@ may be trusted is read from the view itself: the image of a flat grid is a smoot
 the corners scatter about it is their error.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

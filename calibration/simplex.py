@@ -4,8 +4,6 @@ In the order of steps of Lagarias et al. 1998, SIAM J. Optim. 9, 112, section 2,
 variable in turn made larger by a twentieth. `scipy.optimize` does the same, and takes a quarter of a second to import.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

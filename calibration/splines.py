@@ -5,8 +5,6 @@
 As in splined camera models; here it takes up some hundredths of a pixel that vary over a third of the image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rough cameras and poses to start the refinement from: OpenCV per camera, then the pair that most views agree on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import cv2

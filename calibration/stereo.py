@@ -1,7 +1,5 @@
 """From synchronised views of a chessboard to a calibrated stereo rig with its uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The rounds of a joint fit of both cameras: the board's shape, which images are pairs, what moved, the lenses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ A dot or a corner is fitted to a thousand pixels; one that is off by half the ra
 pulls it by more than the noise of all others. Cameras replace such pixels by their neighbours; many do not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """The lab frame: the table under the board of one calibration view."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calibration.arrays import Array

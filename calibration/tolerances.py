@@ -8,8 +8,6 @@ the size of the board, is 0 +- |d| / 2; a board whose sides are equally long to 
 number tells a variance within a factor of ten only; whoever knows better declares a tolerance, which is used as it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lenses that are wider than the model: Brown's polynomial against OpenCV's rational one, on views left out."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

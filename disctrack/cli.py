@@ -4,8 +4,6 @@ A new subcommand is a line in COMMANDS, its arguments in `disctrack.commands.opt
 `disctrack.commands` with `run(arguments) -> exit code`, which is imported only when it is called.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import io

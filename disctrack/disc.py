@@ -6,8 +6,6 @@ corrected: I3 s + m r h c without the factor sin theta, I2 = J1 + m h^2 in place
     (I3 s + m r h c) p q - (I2 s c + m r h s^2) p^2 + m g (r c - h s) = 0
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

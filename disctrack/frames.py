@@ -24,8 +24,6 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
     camera 0 = left, 1 = right. A frame without an answer is NaN with a status, never a missing row.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -4,8 +4,6 @@ On a terminal a bar or the name of the stage stands there while it lasts and van
 terminal (a log, a pipe) there are no bars, and the lines are the same.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import threading

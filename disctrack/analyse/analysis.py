@@ -1,7 +1,5 @@
 """From a trajectory to the physics: motion, contact, energy and scaling laws."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ Against the printed equation (2.3) of Ma et al. 2014: its first line is the n0 c
 (the labels are exchanged), and its third line has r thetadot cos theta, because z = r sin theta + h cos theta.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

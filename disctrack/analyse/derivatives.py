@@ -6,8 +6,6 @@ function of R_k, regular at every angle; at frame i its first two derivatives ar
 acceleration in world axes. Euler rates are then read off the angular velocity, never off the Euler angles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

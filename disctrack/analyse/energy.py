@@ -4,8 +4,6 @@ Equation (2.10) of Ma et al. 2014 with the datum at rest: m g (z - h) instead of
 the end is not possible.
 """
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 

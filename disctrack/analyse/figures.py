@@ -1,7 +1,5 @@
 """Figures of an analysis in the manner of the paper's figures 4 to 16, drawn from this recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

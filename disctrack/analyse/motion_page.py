@@ -4,8 +4,6 @@ Disc in 3-D with the path of its contact, camera pictures with the fit drawn on 
 energy with a common cursor, and the residuals of the frame under it. The drawing is in `pages/motion.js`.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Callable

@@ -5,8 +5,6 @@ Noise differs from frame to frame; the calibration's error is one and the same i
 quantity carries the two apart.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Published measurements, as data: the exponents of Ma et al. (2014) with what can be said of them."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from importlib.resources import files

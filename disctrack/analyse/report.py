@@ -1,7 +1,5 @@
 """The report of an analysis: one HTML file that needs nothing else, and, if wanted, its figures as PNG and PDF."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

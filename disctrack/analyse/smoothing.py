@@ -11,8 +11,6 @@ integrated Wiener process, and its variance is right where that of the latter is
 test_differentiators.py has the candidates and the figures).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """From a trajectory file to the physics: motion, contact, energy and scaling laws, into the file and into a report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Needs the optional package: pip install rerun-sdk.
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Workers of a dask.distributed cluster. Every one of them must see the recordings under the same paths."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time

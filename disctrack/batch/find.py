@@ -1,7 +1,5 @@
 """Which folders are recordings."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The page that links the single reports and compares the recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

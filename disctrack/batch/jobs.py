@@ -1,7 +1,5 @@
 """Which job is ready, which waits for its rig, which is to be tried again."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """One process at a time works on a recording, on this machine or on another that shares the disk."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import time

@@ -1,7 +1,5 @@
 """What one process does with one job: calibrate a rig, or take a recording from its images to its report."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

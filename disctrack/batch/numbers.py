@@ -1,7 +1,5 @@
 """What was measured in one recording, with sigmas, in SI units: the numbers of its row in the summary."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

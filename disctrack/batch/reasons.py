@@ -1,7 +1,5 @@
 """Why something failed, in one line."""
 
-from __future__ import annotations
-
 import errno
 import signal
 

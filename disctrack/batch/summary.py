@@ -1,7 +1,5 @@
 """The summary of a batch: one row per recording, as JSON and as CSV, merged from all who took part."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

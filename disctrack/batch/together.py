@@ -1,7 +1,5 @@
 """All recordings of a batch diagnosed together, once they are measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 It ends when its stdin does: with the batch that started it, however that ended, even in the middle of a job.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import queue

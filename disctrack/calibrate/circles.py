@@ -5,8 +5,6 @@ is the image of the dot's centre, not the centre of its ellipse. The diameter is
 it need be declared.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise

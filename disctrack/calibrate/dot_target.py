@@ -4,8 +4,6 @@ The dots are found as blobs and numbered from the three marked ones. Which place
 known: those that enough views show make the target.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

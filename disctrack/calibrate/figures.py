@@ -1,7 +1,5 @@
 """Pictures of a calibration: what the corners leave unexplained, and which part of the images they cover."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calibration from files to a file: where the views come from, reuse of a rig, the rig file, the pictures."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

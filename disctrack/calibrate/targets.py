@@ -1,7 +1,5 @@
 """A calibration target of any kind, found in the images of both cameras."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """The calibration views of a recording, or of two file patterns, brought to the calibration."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

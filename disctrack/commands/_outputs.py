@@ -1,7 +1,5 @@
 """What the commands share: options, checks before the work, files after it."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """`disctrack analyse`: from a trajectory file to the physics."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`disctrack batch`: many recordings side by side."""
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys

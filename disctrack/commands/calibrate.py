@@ -1,7 +1,5 @@
 """`disctrack calibrate`: views of a chessboard become a stereo rig."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

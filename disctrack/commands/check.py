@@ -1,7 +1,5 @@
 """`disctrack check`: what would a run trip over?"""
 
-from __future__ import annotations
-
 import argparse
 import sys
 

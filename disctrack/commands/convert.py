@@ -1,7 +1,5 @@
 """`disctrack convert`: trajectories and rigs from and to the formats of other programs."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

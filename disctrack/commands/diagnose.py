@@ -1,7 +1,5 @@
 """`disctrack diagnose`: which effect does the model lack?"""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`disctrack init`: a recording.toml for a folder of frames."""
 
-from __future__ import annotations
-
 import argparse
 
 from disctrack.commands import DONE

@@ -3,8 +3,6 @@
 Nothing but the parser is imported here, so that --help and a mistyped option are answered at once.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`disctrack print`: the declared dots and board, true to scale."""
 
-from __future__ import annotations
-
 import argparse
 
 from disctrack.commands import DONE

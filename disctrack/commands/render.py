@@ -1,7 +1,5 @@
 """`disctrack render`: a scene as the pair of cameras would have recorded it, with what is true of it beside it."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`disctrack run`: the whole measurement of one recording."""
 
-from __future__ import annotations
-
 import argparse
 
 from disctrack.calibrate.stage import calibrate_into, given_rig, source_of

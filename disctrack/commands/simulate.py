@@ -1,7 +1,5 @@
 """`disctrack simulate`: the rolling model forwards, from a scene to its motion."""
 
-from __future__ import annotations
-
 import argparse
 
 from disctrack.commands import DONE

@@ -1,7 +1,5 @@
 """`disctrack track`: a recording and a rig become a trajectory."""
 
-from __future__ import annotations
-
 import argparse
 
 from calibration.rig_file import read_rig

@@ -1,7 +1,5 @@
 """`disctrack validate`: the accuracy claim put to the test on rendered recordings with known truth."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

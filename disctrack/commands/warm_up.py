@@ -1,7 +1,5 @@
 """`disctrack warm-up`: compile the inner loops ahead of the first recording, as when the image of a cluster is made."""
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stage: trajectory file in; diagnosis.json, enlarged model and the group `diagnosis` out."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

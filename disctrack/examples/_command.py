@@ -1,7 +1,5 @@
 """What all examples share: their command line, the two files that each writes, and how errors end."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Sequence

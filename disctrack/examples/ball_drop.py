@@ -8,8 +8,6 @@ balls together, and each alone; what two drops of one ball do not have in common
 Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 """
 
-from __future__ import annotations
-
 import csv
 import sys
 from collections.abc import Mapping, Sequence

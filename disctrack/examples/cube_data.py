@@ -4,8 +4,6 @@ Data: Pfrommer, Halm & Posa, "ContactNets", CoRL 2020: 570 tosses of a cube onto
 at 148 Hz. Lengths of the file are half widths of the cube; here they are metres, by the declared half width.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a tossed cube may lack, and what each effect leaves in its flight and where it rests, to first order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

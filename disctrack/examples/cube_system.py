@@ -6,8 +6,6 @@ and what is judged are the combinations of a flight's samples that these cannot 
 residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ FOLDER holds `cube_tosses.npz`. Two thirds of the tosses are fitted, every third
 flight sees gravity, frame rate and scale of the lengths as one number; cubes at rest tell them apart.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ phase differs from trial to trial, so that it enters the mean of a series to sec
 than 0.005 at 30 % of the nutation, by less than 0.002 at 15 %. It is therefore left out unless asked for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

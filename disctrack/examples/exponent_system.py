@@ -7,8 +7,6 @@ another law acts beside it. The tables' own t_f count from the blow that starts 
 rolling disc has nothing to say to them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

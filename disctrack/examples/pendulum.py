@@ -7,8 +7,6 @@ and keep the rest for validation; so is it done here. Only the ratios stiffness 
 k1 / (m1 a1^2 + I1) of their numbers can be told from a free swing.
 """
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from pathlib import Path

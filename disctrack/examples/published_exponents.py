@@ -8,8 +8,6 @@ through the catalogue of motions and through what the reading may do wrong, and 
 contradiction, and which of them these tables cannot tell apart.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 from functools import partial

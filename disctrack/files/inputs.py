@@ -1,7 +1,5 @@
 """No output replaces an input: what a command has read, or what a recording names, is kept whatever the user allows."""
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import os

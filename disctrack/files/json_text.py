@@ -1,7 +1,5 @@
 """JSON as every file of ours has it: no NaN, no infinity, no NumPy."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -3,8 +3,6 @@
 Every axis is a dimension scale at the root of the file; a variable of any group refers to it by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any

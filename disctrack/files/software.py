@@ -1,7 +1,5 @@
 """Which software makes a result."""
 
-from __future__ import annotations
-
 from functools import cache
 from hashlib import sha256
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files that are either whole or not there: written under another name, closed, flushed to the disk, renamed."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

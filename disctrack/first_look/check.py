@@ -4,8 +4,6 @@ Each step looks at one thing and adds remarks: `fix` would stop a run or spoil i
 `fine` tells what was seen. A step that cannot be made because an earlier one failed is left out and named.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace

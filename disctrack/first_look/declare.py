@@ -4,8 +4,6 @@ A value that no file tells stands as a comment with FILL IN: the declaration is 
 guess of ours becomes a measurement.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The picture of a check: the table view with the axes it defines, and frames with what was found in them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

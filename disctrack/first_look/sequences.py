@@ -1,7 +1,5 @@
 """What a folder holds: sequences of frames, which two of them are the cameras, which two show the chessboard."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import defaultdict

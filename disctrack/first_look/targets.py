@@ -1,7 +1,5 @@
 """The declared dots and board as PDF, true to scale: drawn from recording.toml, so that print and declaration agree."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Figures: how axes look, how they are written, and how a page shows them."""
 
-from __future__ import annotations
-
 import base64
 import io
 import struct

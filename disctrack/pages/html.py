@@ -3,8 +3,6 @@
 Text is escaped here; what is HTML already is a `Markup`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """Frames of one camera, whatever file they lie in: one small module per format, one interface."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 

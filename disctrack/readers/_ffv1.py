@@ -5,8 +5,6 @@ error status (8 bits) and a parity that makes the CRC of the whole slice zero (p
 significant bit first).
 """
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

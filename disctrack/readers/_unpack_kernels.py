@@ -1,7 +1,5 @@
 """Compiled unpacking of pixels of 10 and 12 bits that lie without a gap, most significant bit first."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The interface of all readers, and which files they read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable

@@ -1,7 +1,5 @@
 """Blocks of image pairs, read ahead by several threads in bounded memory."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

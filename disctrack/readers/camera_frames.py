@@ -1,7 +1,5 @@
 """Frames in a camera's own file, whose header says how the pixels lie: packed, upside down, coded by a table."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from dataclasses import dataclass

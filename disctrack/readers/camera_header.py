@@ -1,7 +1,5 @@
 """What a camera wrote beside its frames, and whether two cameras can have recorded the same motion with it."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from datetime import datetime

@@ -5,8 +5,6 @@ information, a table of where each image lies, images. Every number is little-en
 against the file's size before anything is read or made of that size.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Image files as pixels: container and checksums are verified, and nothing is converted that would be lost."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ Time is a frame's place in the sequence, so a gap that is closed would shift all
 belong would be a frame of its own. Where names leave a doubt, nothing is guessed: the files are named.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import math
 import re

@@ -1,7 +1,5 @@
 """Which files a pattern means, and in which order."""
 
-from __future__ import annotations
-
 import glob
 import os
 import re

@@ -7,8 +7,6 @@ values, a pixel would be off by the same part of one in every frame, which is a 
 stays so. One that hardly answers the light, or far more than its neighbours, is dead: it gets the median of these.
 """
 
-from __future__ import annotations
-
 import glob
 import hashlib
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ data set (or of its group) that are understood: `frame_rate` [Hz], `bit_depth`; 
 data set (n,) beside it. A data set that lies in one piece is read at the speed of memory.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import threading

@@ -1,7 +1,5 @@
 """Photron recordings: a header, .cih (text) or .cihx (XML), beside an .mraw file of frames without a gap."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """A part of every image as the images of a camera: of one sensor behind mirrors, or of two images stored in one."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Pages without compression are read at the speed of memory, grey strips by LZW or
 page goes to libtiff as a file of its own, made of the page's directory and its compressed bytes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

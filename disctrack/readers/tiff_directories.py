@@ -4,8 +4,6 @@ TIFF 6.0, Adobe 1992, section 2; BigTIFF with 64-bit offsets. No more is read th
 hold, whatever its numbers say.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

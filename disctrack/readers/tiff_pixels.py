@@ -1,7 +1,5 @@
 """Pixels of a page of a TIFF file without libtiff, where it holds whole-byte grey values in strips."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What differs between the declaration that a result was measured with and the recording.toml that lies there now."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path

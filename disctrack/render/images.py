@@ -1,7 +1,5 @@
 """Images of the disc and of the chessboard before the table, as the pair of cameras takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What no laboratory is without: lenses beyond their polynomial, uneven sensors, boards that are not flat."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Blur of the lens over the cells of the sensor, the table's texture, the lamp and the fall-off to the corners."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -4,8 +4,6 @@ Nothing here is shared with `calibration.camera` but the numbers in its containe
 as a disagreement between rendered images and projected points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 

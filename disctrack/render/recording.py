@@ -1,7 +1,5 @@
 """A whole recording on disk, as the pair of cameras would have written it, and the truth apart from it."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator

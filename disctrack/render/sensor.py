@@ -1,7 +1,5 @@
 """From light to the numbers in a file: photons, read noise, hot pixels, quantisation."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calibration.arrays import Array32, Image

@@ -1,7 +1,5 @@
 """truth.h5: what a synthetic recording really shows; for validation only, no stage of the measurement reads it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

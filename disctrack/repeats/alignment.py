@@ -6,8 +6,6 @@ mostly no noise (nutation in another phase, another loss), and neighbouring fram
 from the scatter of whole stretches, not from the number of frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Weighted mean, chi-square of consistency, and the Birge ratio sqrt(chi^2 / (n - 
 stretched to explain the scatter (Birge 1932, Phys. Rev. 40:207; the Particle Data Group's scale factor).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

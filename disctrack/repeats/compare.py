@@ -1,7 +1,5 @@
 """Which recordings repeat one another, on one clock, with their spread and their averages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of a comparison: the runs over one another as the paper's figure 4, their spread, and what was fitted."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A comparison on paper: one page, its fragment for another page, figures, tables as CSV and JSON."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """What the comparison needs of one analysed trajectory file, and why a file cannot be compared."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

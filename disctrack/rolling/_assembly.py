@@ -1,7 +1,5 @@
 """A model turned into what the compiled functions are called with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

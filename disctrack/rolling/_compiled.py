@@ -6,8 +6,6 @@ never that of the integrator, and a cached integrator can never hold an outdated
 are part of each signature: a changed layout recompiles what depends on it. A call by address costs about 3 ns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Laws on given motions, in plain NumPy: what an effect would supply there, and what the motion needs."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

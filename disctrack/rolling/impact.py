@@ -1,7 +1,5 @@
 """The start of the experiment: a disc at rest on its edge is hit on its upper face by a ball."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from disctrack.disc import Disc

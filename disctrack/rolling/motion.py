@@ -1,7 +1,5 @@
 """A simulated motion: what the model predicts at the given times, and why it ended."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Any

@@ -5,8 +5,6 @@ a small wrench f(t) moves the state by Phi(t) times the integral of Phi(s)^-1 B(
 hundreds of laws can be asked for what each would do, for the price of some sums.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

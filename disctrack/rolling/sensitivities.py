@@ -6,8 +6,6 @@ move is included. Columns that follow from a symmetry of the model are written d
 direction of the table, or one angle of the body from another, a motion that begins elsewhere is the same motion there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import CodeType

@@ -1,7 +1,5 @@
 """From a model and a state to the motion: pure rolling, slip and flight, with the switches between them found."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """States of regular precession, with a nutation oscillation on top if wanted."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from disctrack.disc import Disc, followers, nutation_frequency, precession_rate

@@ -1,7 +1,5 @@
 """The true rig and the poses of the chessboard that a scene stands for: seeded, so that every recording has its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

@@ -6,8 +6,6 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 0.25 mm per pixel). Every random choice follows from `seed`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace

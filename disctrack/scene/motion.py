@@ -1,7 +1,5 @@
 """From the motion section of a scene to the pose of the disc at any instant: at rest, by a table, or rolling."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """disctrack simulate: the motion of a scene into an HDF5 file that explains itself."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

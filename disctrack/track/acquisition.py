@@ -5,8 +5,6 @@ candidate motions. If one camera sees too little, three blobs of the other give 
 problem), and of mirror twins the one that touches the table is taken.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations, permutations
 

@@ -4,8 +4,6 @@ Tried only where the dots make no sense as declared: each way in which a camera'
 arranged the images is undone, and the disc searched for anew.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The measurement on frames in memory: arrays in, trajectory out."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from itertools import pairwise

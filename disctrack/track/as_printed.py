@@ -17,8 +17,6 @@ pattern's from how regular it is: one that is stretched or sheared by little was
 size is moved by its share.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial

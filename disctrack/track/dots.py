@@ -13,8 +13,6 @@ Free per dot: centre (2), R, sigma, L, g (2), c. R and sigma do not couple with 
 printed too large, or motion blur, costs no accuracy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a run says about its own result: what makes it worse, and what puts it in question."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calibration.arrays import Array, Mask

@@ -22,8 +22,6 @@ by a linear fit. Variance of the path and shift of its mean are both in proporti
 the exposure.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

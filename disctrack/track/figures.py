@@ -1,7 +1,5 @@
 """Pictures of a measurement: coordinates with their sigmas, reprojection error, residual per dot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -5,8 +5,6 @@ not. Levels are those of chi-square distributions; what is usual, in a recording
 taken from the frames around, so that a frame is judged by its neighbours and by nothing far away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Steps and probabilities of many small least-squares problems at once."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

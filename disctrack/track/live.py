@@ -4,8 +4,6 @@ The same compiled loop as for recordings, a pair at a time; what `track` learns 
 printed, their scatter) is not known yet, so the disc should be one that was measured before.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ and a pause in the middle stays. "Differs" means more than noise, a change of th
 VIBRATION_PX: anything else counts as motion, a hand as well as the disc, so that doubt costs time and not data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

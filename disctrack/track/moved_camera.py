@@ -5,8 +5,6 @@ shift of the right camera for all are fitted (`as_printed`, with a rig of which 
 degree and a millimetre or two, as the two make up for each other; enough to say what happened.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

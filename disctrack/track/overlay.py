@@ -1,7 +1,5 @@
 """A video that shows the eye what was measured: fitted disc and dots drawn over the frames of both cameras."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path

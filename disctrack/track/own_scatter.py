@@ -6,8 +6,6 @@ is what remains after a free refinement of the two cameras, the dots' places and
 one pose per frame: nothing slow or systematic can pass it, and it needs no model of the motion.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

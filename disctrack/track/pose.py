@@ -4,8 +4,6 @@ The unknowns are a translation and a rotation vector in world axes that multipli
 singular at theta = 0; psi, theta, phi follow at the border (`frames.euler_from_rotation`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ the poses white noise is 30 times itself, and what precesses by an angle a per f
 of 5 mm. So only frames are counted between which the disc precesses by less.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import comb
 

@@ -1,7 +1,5 @@
 """The same function on parts of the frames, by several threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar

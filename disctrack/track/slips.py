@@ -5,8 +5,6 @@ To first order they are displaced by their velocity in the image times the delay
 makes up for is no sign of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 

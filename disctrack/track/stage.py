@@ -1,7 +1,5 @@
 """The measurement from end to end: a recording's files -> rig -> trajectory, with what is needed to reuse results."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import time

@@ -1,7 +1,5 @@
 """What a run tells its user at the end, in plain words."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -20,8 +20,6 @@ whoever fits the motion lets the table's plane free by so much.
 This is geometry alone. A table that is not level leans in the world and against gravity; here the world leans with it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

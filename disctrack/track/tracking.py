@@ -3,8 +3,6 @@
 The disc is followed through each stretch in `following`; what comes of it is put together in `assembly`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -4,8 +4,6 @@ One camera alone numbers the dots, on any scale and of any size. What both see o
 the rig, to some 0.2 mm: enough to say which declared number is wrong, and what it should be.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

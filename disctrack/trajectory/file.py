@@ -4,8 +4,6 @@ Layout (axes in brackets): at the root time, frame, x y z psi theta phi with the
 reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_groups`).
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

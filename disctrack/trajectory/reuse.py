@@ -1,7 +1,5 @@
 """A folder of results is reused where it was made, completely, from the same trajectory, settings and version."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -6,8 +6,6 @@ pose components is F = sum_p (dI_p/dq) (dI_p/dq)^T / s_p^2 over both images; the
 here, so that a method that also fits those must scatter a little more.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A validation that cannot fail says nothing. Each fault is planted in the images 
 same poses without any fault are the baseline, and must raise no alarm.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scatter of the measurement beside the Cramer-Rao bound: noisy copies of the same images, pose by pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import cast
 

@@ -1,7 +1,5 @@
 """The same claim in an imperfect laboratory: recordings rendered with what every laboratory has and nobody declares."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Pictures of a validation: error against nutation, scatter against the bound, what each disturbance does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses that a validation asks for: every attitude, everywhere in the field, and who can see the upper face there."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

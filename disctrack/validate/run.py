@@ -1,7 +1,5 @@
 """`disctrack validate`: render, measure, compare, write the verdict."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable

@@ -5,8 +5,6 @@ from mild to hopeless, then bisection (in the logarithm) between the last level 
 which it did not. The rig is the one calibrated under good conditions: only the filming is disturbed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The numbers of a validation, and the sentence that follows from them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A validation's numbers as Markdown for people and as JSON for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

@@ -4,8 +4,6 @@ Frames 0 ... s-1 are static poses, each measured without a prior; then come stre
 is a folder like any other and passes through the readers, the calibration and the tracking as the user's would.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ has to come out as one. Farther off than any printer puts it, it was declared wr
 the dots move with a place is no longer linear.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What the diagnosis of a trajectory of the disc holds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from calibration.brief import Brief

@@ -1,7 +1,5 @@
 """How far a fitted model is from the measurement, in the units of an experimenter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ Quantities are addressed by name, as parameters of the effects of the motion are
 always zero: as calibrated, as declared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

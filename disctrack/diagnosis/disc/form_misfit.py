@@ -11,8 +11,6 @@ laws of other kinds are that describe the data too. What a law's numbers could t
 2017).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

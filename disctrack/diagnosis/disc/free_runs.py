@@ -1,7 +1,5 @@
 """What a report shows beside the answer: rates and forces from the poses alone, the missing moment, free runs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ known of the motion: poses and fault are found in turn, from the dots alone. Whi
 on its table decides. A clock that is wrong by a good part shows in the precession, which gravity sets.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

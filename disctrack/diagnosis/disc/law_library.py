@@ -5,8 +5,6 @@ records.KINEMATICS and gets a coefficient of its own. Numbers in braces are the 
 fast something hums): a grid of them is looked over, and the best is fitted along with the coefficients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 

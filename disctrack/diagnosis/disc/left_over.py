@@ -4,8 +4,6 @@ A frame's dots are more numbers than a pose. What is missing in the motion shows
 other; what is wrong with lenses, dots or light shows in all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The enlarged model as a scene file: what `simulate`, `render` and the next `diagnose` read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

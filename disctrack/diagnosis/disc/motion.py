@@ -1,7 +1,5 @@
 """Effects of the motion, from the rolling model's catalogue, as candidates of the engine."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ The fitted model is started anew, filmed by the same cameras with the same noise
 the shared quantities (laws, cameras, dots) is put beside what this recording says; initial states are each one's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """When in a recording the model fails: the longest beginning and the longest end that it describes to noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The rig of a recording as a scene describes rigs: where the cameras stand, towards what they look, their lenses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

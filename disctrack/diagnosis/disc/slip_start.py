@@ -5,8 +5,6 @@ the contact's velocity decides, which needs no model of the motion. Slip is fitt
 at the first instant, and where no coefficient describes it, the diagnosis begins where rolling does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

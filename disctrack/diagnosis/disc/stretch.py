@@ -1,7 +1,5 @@
 """Which frames of a recording belong to one motion of the disc on its own, and what the others are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ fewer independent chances than fifty. Vectors of noise are drawn and put to the 
 probability counts the looking, the overlap, and bounds that let an effect act one way only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

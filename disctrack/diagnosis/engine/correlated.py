@@ -1,7 +1,5 @@
 """Numbers that move together in a fit: how strongly, and which combination of them is well known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Gauss-Newton with bounds and priors; it has never heard of discs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

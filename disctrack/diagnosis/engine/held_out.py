@@ -1,7 +1,5 @@
 """Fit on the first part, free run over the rest: the judge that a flexible model cannot flatter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ more: by the long-run variance of its influence function over the variance that 
 (Newey and West 1987, with the bandwidth of Andrews 1991 for Bartlett's weights).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ with the object, a scale that differs from take to take). To take them for white
 significant; to whiten with their covariance makes chi-squares, sigmas and predictive densities mean what they say.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

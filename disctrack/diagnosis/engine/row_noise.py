@@ -5,8 +5,6 @@ each number's scatter for independent finds effects in them. Directions in which
 noise does are weighted by what they scatter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Every candidate's derivative columns are cleared of what the fitted quantities c
 value, its sigma and the gain in chi-square follow from inner products, so that a whole catalogue costs one fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -5,8 +5,6 @@ counts is refitted together with all that the base fit moves, within its bounds;
 candidates as were looked at; and a free run over data that the fit has not seen must become more probable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations

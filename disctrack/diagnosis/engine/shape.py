@@ -5,8 +5,6 @@ found as the nearest one, or not at all; so the shape of what was found is fitte
 something unexplained, its laws with a shape get a second trial with the shape free.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace

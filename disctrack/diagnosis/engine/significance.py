@@ -1,7 +1,5 @@
 """How surprising a gain of chi-square is; and how many of many findings may be false."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

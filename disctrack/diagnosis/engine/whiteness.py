@@ -1,7 +1,5 @@
 """Is a residual noise? Size, memory and lines in its spectrum."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

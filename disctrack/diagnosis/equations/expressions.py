@@ -1,7 +1,5 @@
 """Formulas as text or SymPy expressions, with names checked, and made smooth where they jump."""
 
-from __future__ import annotations
-
 import difflib
 import keyword
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Declared equations and terms, differentiated and compiled: motion, sensors and clock as functions of numbers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Measured inputs that act late: the same signals on knots of their own, exact for any delay."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calibration.arrays import Array

@@ -1,7 +1,5 @@
 """From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence

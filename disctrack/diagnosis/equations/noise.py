@@ -1,7 +1,5 @@
 """How large the noise of a channel is, from its data or from what a fit leaves; and noise that remembers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from math import comb

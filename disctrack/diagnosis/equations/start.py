@@ -4,8 +4,6 @@ Over many turns of an oscillation chi-square has many minima; over half a turn i
 is led to longer and longer windows stays in it, for as long as the model can follow at all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

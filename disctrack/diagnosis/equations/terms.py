@@ -5,8 +5,6 @@ a term is added. `v` is a velocity, `x` its coordinate; both may be formulas. A 
 so that formulas which are handed in mean the equations' numbers of the same name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 

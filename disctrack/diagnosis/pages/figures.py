@@ -1,7 +1,5 @@
 """Figures of a diagnosis: model and measurement superposed, the residual before and after, what was tried."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

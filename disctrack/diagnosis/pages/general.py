@@ -1,7 +1,5 @@
 """A diagnosis of any system, not of the disc alone, in the words and keys of diagnosis.json."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any

@@ -1,7 +1,5 @@
 """What would settle it, in words: recordings that would answer what one leaves open."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The report of a diagnosis: one HTML page that needs nothing else, and its figures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

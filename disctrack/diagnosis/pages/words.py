@@ -1,7 +1,5 @@
 """A diagnosis in plain words."""
 
-from __future__ import annotations
-
 from itertools import takewhile
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How does the coefficient of a law depend on what was declared: on nothing, on a power of the mass, on the air?"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

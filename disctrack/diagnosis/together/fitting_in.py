@@ -1,7 +1,5 @@
 """Which recordings do not fit the others?"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

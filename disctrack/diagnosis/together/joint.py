@@ -1,7 +1,5 @@
 """Many recordings as one system for the engine: its samples are recordings, its rows what each says of the shared."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

@@ -5,8 +5,6 @@ the search over effects is made with the summed evidence, and recordings that do
 out. The cost is linear in the number of recordings.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The answer for many recordings: a sentence, lines for the terminal, JSON, and one page."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Recordings of the rolling disc as members of a joint diagnosis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -6,8 +6,6 @@ equations, without squaring the condition): a few dozen rows, however long the r
 the shared quantities move.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Who shares what: quantities of single recordings, and those of many of which they are made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

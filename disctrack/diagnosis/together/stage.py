@@ -1,7 +1,5 @@
 """The stage: trajectory files in; one page, one diagnosis.json and one sentence out."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -9,8 +9,6 @@ of what is left, whose probabilities are bounds (Bonferroni's). With --whole the
 user; claims are fewer than stated, as an effect must also foretell the frames that were not fitted.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

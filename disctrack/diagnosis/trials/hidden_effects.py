@@ -4,8 +4,6 @@ Every size is that of the issue at hand or one that a careful experimenter would
 are drawn, passive effects keep theirs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

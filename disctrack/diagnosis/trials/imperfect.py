@@ -4,8 +4,6 @@ Nothing here knows how the diagnosis describes such errors. A lens' residual fie
 directions and phases; a gleam moves each dot in its own way; the board that the table was taken from was bowed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ calibration and the dots' biases leave of a planted effect is its noncentrality,
 that gives the probability of a claim. Held against trials with refits and free runs by `trials.rates --factor`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ Every trial draws a motion, a rig with a calibration error of its own, and the n
 (`hidden_effects`); and hands the measured trajectory, which does not tell of it, to the diagnosis.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Iterator, Sequence

@@ -6,8 +6,6 @@ simulated, exposures through a mean over instants. The rig that the trajectory c
 error drawn from its covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

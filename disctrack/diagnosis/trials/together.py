@@ -6,8 +6,6 @@ Recordings are drawn as those of `trials.rates`, all of one disc on one surface,
 error. They are fitted together without any effect; the derivatives by every effect there say how well it is known.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 

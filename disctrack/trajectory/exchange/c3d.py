@@ -1,7 +1,5 @@
 """A trajectory for programs of motion capture: points and the rigid body in a C3D file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

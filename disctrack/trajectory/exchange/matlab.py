@@ -1,7 +1,5 @@
 """A trajectory for MATLAB and Octave: one struct `disctrack` in a MAT file of version 5."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 
