@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -220,7 +221,27 @@ def beyond_model(rig: StereoRig) -> dict[str, tuple[Any, str, str, dict[str, str
     return found
 
 
+def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
+    """A document as HDF5 has it: numbers, texts and lists of them (texts a line each) as attributes, objects as groups.
+
+    What HDF5 has no attribute for, a list of objects or nothing at all, is left out.
+    """
+    for key, value in document.items():
+        name = str(key).replace("/", "|")
+        if isinstance(value, Mapping):
+            write_attributes(group.create_group(name, track_order=True), value)
+        elif isinstance(value, str):
+            group.attrs[name] = value
+        elif isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
+            group.attrs[name] = "\n".join(value)
+        else:
+            with contextlib.suppress(ValueError, TypeError):  # rows of unequal length; nothing, or objects
+                array = np.asarray(value)
+                group.attrs[name] = array.astype(np.uint8 if array.dtype == bool else array.dtype)
+
+
 def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
+    write_attributes(group, {"settings": record.settings, "figures": record.figures, "versions": record.versions})
     group.attrs["settings"] = json.dumps(record.settings)
     group.attrs["figures"] = json.dumps(record.figures)
     group.attrs["versions"] = json.dumps(record.versions)

@@ -4,6 +4,7 @@ Layout (axes in brackets): at the root time, frame, x y z psi theta phi with the
 reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_groups`).
 """
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
-from calibration.rig_file import beyond_model, read_beyond_model
+from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import TrajectoryFileError
 from disctrack.files.json_text import json_text
@@ -84,6 +85,8 @@ def write_trajectory(
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
         file.attrs.update(_root_attributes(trajectory, provenance))
         file.attrs["findings"] = json_text(dict(findings or {}))
+        made_from = {"inputs_sha256": provenance.inputs, "settings": provenance.settings, "dependencies": _versions()}
+        write_attributes(file, {"findings": findings or {}, "made_from": made_from})
         file.attrs["complete"] = 1
     write_whole(path, buffer.getbuffer())
 
@@ -121,7 +124,7 @@ def is_result_of(path: Path, provenance: Provenance) -> bool:
 
 @dataclass(frozen=True)
 class Group:
-    """What a stage adds to a trajectory file."""
+    """What a stage adds to a trajectory file; attributes as of `write_attributes`."""
 
     variables: Mapping[str, Variable]
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -152,7 +155,7 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
         for name, group in groups.items():
             created = file.create_group(name, track_order=True)
             write_variables(created, group.variables, axes)
-            created.attrs.update(dict(group.attributes))
+            write_attributes(created, group.attributes)
     write_whole(path, buffer.getbuffer(), adds_to_input=True)
 
 
@@ -237,7 +240,7 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "schema_version": SCHEMA_VERSION,
         "software": "disctrack",
         "software_version": provenance.version,
-        "dependencies": json.dumps({"python": platform.python_version()} | {n: _version(n) for n in _DEPENDENCIES}),
+        "dependencies": json.dumps(_versions()),
         "recording": provenance.recording,
         "inputs_sha256": json.dumps(dict(provenance.inputs), sort_keys=True),
         "settings": json.dumps(dict(provenance.settings), sort_keys=True),
@@ -250,11 +253,12 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
     }
 
 
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "unknown"
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in _DEPENDENCIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
 
 
 # The file's layout. Of every array of a Trajectory: its dataset (in a group or at the root), axes, unit and meaning.

@@ -226,6 +226,29 @@ def test_findings_are_json_for_every_reader(tmp_path, trajectory):
         }
 
 
+@pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
+def test_what_was_found_and_chosen_are_plain_attributes_that_a_later_stage_keeps(tmp_path, trajectory, engine):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
+    path = tmp_path / "t.h5"
+    findings = {
+        "warnings": ["one", "two"], "notes": [], "blur_px": (0.7, np.inf), "first_pass": {"moves": True, "start": 3},
+        "noise": [{"read": 1.0}], "shared_sigma": [[1e-7, "the views"]], "none": None,
+    }  # fmt: skip
+    write_trajectory(path, trajectory, PROVENANCE, findings=findings)
+    write_group(path, "later", {}, attributes={"found": {"km.k_m": {"value": 1.5}}})
+    tree = xarray.open_datatree(path, engine=engine)
+    found = tree["findings"].attrs
+    assert set(found) == {"warnings", "notes", "blur_px"}  # objects in lists, and nothing, stand in the JSON alone
+    assert found["warnings"] == "one\ntwo"
+    assert_array_equal(found["blur_px"], (0.7, np.inf))
+    assert dict(tree["findings/first_pass"].attrs) == {"moves": 1, "start": 3}
+    assert tree["made_from/inputs_sha256"].attrs == PROVENANCE.inputs
+    assert tree["later/found/km.k_m"].attrs["value"] == 1.5
+    tree.close()
+    assert read_provenance(path) == PROVENANCE
+
+
 @pytest.mark.parametrize("i", [5, 28])  # precession 9 and 48 deg: every component of the axis counts
 def test_sigmas_of_angles_agree_with_perturbed_poses(trajectory, rng, i):
     from disctrack.frames import euler_from_rotation, rotation_from_vector

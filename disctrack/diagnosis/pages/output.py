@@ -239,11 +239,8 @@ def write_diagnosis(
         what = "contact moment that the model before fails to supply"
         variables["missing_moment"] = Variable(beside.moment.moment, dims, "N m", what)
         variables["missing_moment_sigma"] = Variable(beside.moment.sigma, dims, "N m", f"standard deviation: {what}")
-    attributes = {
-        "verdict": result.diagnosis.verdict,
-        "sentence": result.sentence,
-        "diagnosis": json_text(document),
-    }
+    effects = {effect["name"]: effect for effect in document["effects"]}
+    attributes = {**document, "effects": effects, "diagnosis": json_text(document)}
     write_group(path, GROUP, variables, axes=axes, attributes=attributes)
 
 
