@@ -1,9 +1,12 @@
 """What a diagnosis found has a place in a scene: simulated, rendered or given to the next diagnosis, it acts again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from calibration.camera import rotation_from_vector
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
 from disctrack.diagnosis.disc.faults import measurement_candidates, predict
 from disctrack.diagnosis.disc.model_file import declared_model, model_toml
@@ -125,3 +128,26 @@ def test_derivative_by_every_fault_agrees_with_central_differences(short, everyt
         assert_allclose(
             derivative[inner, :, column], expected, atol=3e-3 * np.abs(expected).max(), err_msg=name, rtol=0
         )
+
+
+def test_table_that_the_rim_levelled_wrongly_is_no_fault_of_the_saved_scene(short, tmp_path):
+    """Paper on the face lifts the table by the rim; in the file the cameras stand above the one that is rolled on."""
+    state = {k: v for k, v in first_state(short.time, short.q).items() if not k.startswith("state.v_")}
+    height, slope = -1e-4, 2e-3
+    values = state | {"pattern_height.offset": 1e-4, "table_height.offset": height, "table_plane.tilt_x": slope}
+
+    def eyes(rig):
+        return np.array([-R.T @ t for R, t in rig.camera_poses()])
+
+    levelled = DiscSystem(replace(short, table_moved=(1e-4, 0.0, 2e-3)), declared_model(short).model)
+    scene = load_scene(saved(levelled, values, tmp_path))
+    assert (scene.faults.table_height_mm, scene.faults.table_turn_deg) == (0.0, (0.0, 0.0))
+    assert scene.faults.pattern_height_mm == pytest.approx(0.1)
+    # from the board's axes to those of the table, which leans about x and lies lower
+    lean = rotation_from_vector(np.array([slope, 0.0, 0.0]))
+    assert_allclose(eyes(rig_of(scene)), (eyes(short.rig) - [0.0, 0.0, height]) @ lean, atol=1e-10)
+
+    as_calibrated = DiscSystem(short, declared_model(short).model)  # nobody levelled it: a fault of the table view
+    scene = load_scene(saved(as_calibrated, values, tmp_path))
+    assert scene.faults.table_height_mm == pytest.approx(-0.1)
+    assert_allclose(eyes(rig_of(scene)), eyes(short.rig), atol=1e-10)
