@@ -1,6 +1,6 @@
 """The stage: trajectory file in; diagnosis.json, enlarged model and the group `diagnosis` out."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -106,9 +106,12 @@ def diagnose_trajectory(
         remembering = with_memory(_judged(diagnosis, system), learned.fit)
         left = left_over(system, learned.fit, diagnosis.noise)
         not_noise = left is not None and not left.white
-        wider, course = with_form(system, remembering, learned.law, diagnosis.noise, not_noise)
-        learned = replace(learned, fit=wider, course=course)
-        diagnosis, doubted = _beside_any_form(diagnosis, kept, wider)
+        as_found = (system, remembering, learned.law, diagnosis.noise, not_noise)
+        formed = with_form(*as_found, _of_motion(kept))
+        diagnosis, doubted = _beside_any_form(diagnosis, kept, formed.of_another)
+        if _of_motion(diagnosis.found):  # what holds beside any law does not stand in with this one
+            formed = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
+        learned = replace(learned, fit=formed.fit, course=formed.course)
         also = (*also, *doubted)
     else:
         diagnosis = replace(diagnosis, after=with_memory(_judged(diagnosis, system), diagnosis.after))
@@ -369,7 +372,8 @@ def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -
     """Without effects beside a law that stand out no longer once the law's form may be another; and a note of each.
 
     They stay in the fit: with the law they describe the data.
-    kept : effects beside the law.   fitted : with sigmas that know of the form's misfit
+    kept : effects beside the law.   fitted : with sigmas as they are if the law's form is another's: a library seldom
+    holds the law that no catalogue names
     """
     doubted, notes = list[Found](), list[str]()
     for found in kept:
@@ -388,6 +392,10 @@ def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -
         )
     established = tuple(found for found in diagnosis.found if found not in doubted)
     return replace(diagnosis, found=established), tuple(notes)
+
+
+def _of_motion(found: Iterable[Found]) -> set[str]:
+    return {f.candidate.effect for f in found if f.candidate.kind == "motion"}
 
 
 def _rivals(

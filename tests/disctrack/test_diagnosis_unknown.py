@@ -188,3 +188,15 @@ def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
     result = diagnose_trajectory(unknown("seam").trajectory, separate=False)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is None or np.isfinite(result.learned.course.sigma).all()
+
+
+@pytest.mark.parametrize(("name", "beside"), [("loose_ball", "rolling_classical"), ("pad", "table_shaken")])
+def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
+    """A ball in oil, and a table that gives way: the library has neither, and sums that come near are no finding."""
+    made = unknown(name, 1)
+    result = diagnose_trajectory(made.trajectory, separate=False)
+    assert not result.diagnosis.found
+    assert any(f"[{beside}] helps the law" in note for note in result.notes)  # it does, by far more than noise
+    course = result.learned.course
+    truth = np.stack([np.interp(course.time, made.time, made.moment[:, i]) for i in range(3)], axis=1)
+    assert np.mean(np.abs(course.moment - truth) < 3 * course.sigma) > 0.95

@@ -6,12 +6,12 @@ discrepancy beside the parameters). Where the form is nearly right, it is a norm
 a probe. Where it is another's, it is a sum: along each axis such a process, and some that change slowly beside the
 precession and its harmonics, as what depends on place and direction does; each of a size of its own, so that what the
 recording does not show may be as large as the law. All sizes are in proportion to the law's, and their probabilities
-follow from the residual. That the form is another's is certain where the residual is not noise, and else as probable as
-laws of other kinds are that describe the data too. What a law's numbers could take up themselves is no misfit (Plumlee
-2017).
+follow from the residual. That the form is another's is certain where the residual is not noise, or where it takes
+several to describe the data, and else as probable as laws of other kinds are that describe the data too. What a law's
+numbers could take up themselves is no misfit (Plumlee 2017).
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -47,11 +47,22 @@ class LawCourse:
     misfit: float  # rms of that over the law's own, as the residual has it
 
 
-def moment_about_contact(system: DiscSystem, values: Values, motion: Motion, only: str | None = None) -> Array:
+@dataclass(frozen=True)
+class WithForm:
+    """A fit with a law, with sigmas that know what the law's form may be off by."""
+
+    fit: Fit  # as probable as it is that the form is another's
+    of_another: Fit  # if it is: for whatever is to hold of any law
+    course: LawCourse | None  # None where the disc slips
+
+
+def moment_about_contact(
+    system: DiscSystem, values: Values, motion: Motion, only: Collection[str] | None = None
+) -> Array:
     """(n, 3) of the effects at `values` on a given motion [N m]; a force X at the centre counts as -r_OA x X.
 
     A sharp edge on a flat table, as the arm goes; a tilt counts as the force by which gravity is another than declared.
-    only : the effect of this name
+    only : the effects of these names
     """
     model = system.model_with(values)
     k = kinematics(motion.q, motion.qdot, system.disc, model.gravity, motion.time, model.air_density)
@@ -60,7 +71,7 @@ def moment_about_contact(system: DiscSystem, values: Values, motion: Motion, onl
     arm = np.stack([0.0 * s, h * s - r * c, -r * s - h * c], axis=1)
     total = np.zeros((len(motion), 3))
     for effect in model.effects:
-        if effect.law is not None and only in (None, effect.name):
+        if effect.law is not None and (only is None or effect.name in only):
             moment, force = effect_wrench(effect, k, motion.contact_force[:, 2])
             total += moment - np.cross(arm, force)
     if only is None:
@@ -73,28 +84,33 @@ def moment_about_contact(system: DiscSystem, values: Values, motion: Motion, onl
 
 
 def with_form(
-    system: DiscSystem, fitted: Fit, law: LearnedLaw, noise: float, remembers: bool = False
-) -> tuple[Fit, LawCourse | None]:
-    """The fit with sigmas that know of the form's misfit, and the law's course; the fit alone where the disc slips.
+    system: DiscSystem,
+    fitted: Fit,
+    law: LearnedLaw,
+    noise: float,
+    remembers: bool = False,
+    beside: Collection[str] = (),
+) -> WithForm:
+    """Sigmas that know of the form's misfit, and the law's course; the fit as it is where the disc slips.
 
     system : knows the law.   noise : variance of the residual's noise over that stated
     remembers : what the fit leaves is not noise
+    beside : known effects that were found with the law: where they stand in with it, the misfit is of them all
     """
     blocks = probe(system, fitted)
     if blocks is None:
-        return fitted, None
+        return WithForm(fitted, fitted, None)
     n, k = blocks.n_fitted, len(blocks.time)
     R = triangle(np.vstack([*(part / np.sqrt(noise) for part in blocks.triangles), blocks.prior]))
-    course, own, by_number = _courses(system, fitted, law, blocks.time)
+    course, own, by_number = _courses(system, fitted, {law.candidate.effect, *beside}, blocks.time)
     parts = _parts(system, fitted, blocks, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
-    others = sum(odds for rival, odds in law.rivals if not _kinds(rival) & _kinds(law))
-    wrong = 1.0 if remembers else max(SELDOM, others / (1.0 + others))
+    wrong = 1.0 if remembers else form_is_another(law, beside)
     laws = by_number[:, np.any(by_number != 0.0, axis=0)]
     Q = _solver(laws)[0] if laws.size else laws
     U, inverse = _solver(R[:, :n])
     right = R[:, -1] - U @ (U.T @ R[:, -1])
     variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1)
-    covariance, misfit = fitted.covariance.copy(), 0.0
+    mixed, another, misfit = fitted.covariance.copy(), fitted.covariance, 0.0
     for probability, some in ((1.0 - wrong, [np.concatenate(parts[:: HARMONICS + 2], axis=1)]), (wrong, parts)):
         S = np.concatenate(some, axis=1)
         S = S - Q @ (Q.T @ S)
@@ -103,19 +119,32 @@ def with_form(
         second, size = _second_moment(B - U @ (U.T @ B), right, [part.shape[1] for part in some])
         moved = S - by_number @ taken
         variance += probability * np.sum((moved @ second) * moved, axis=1)
-        covariance += probability * taken @ second @ taken.T
+        another = fitted.covariance + taken @ second @ taken.T  # in the end that of all parts
+        mixed += probability * (another - fitted.covariance)
         misfit += probability * size**2
     variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_rivals(system, fitted, law, course, blocks.time)
-    sigma = np.sqrt(variance)
-    return replace(fitted, covariance=covariance), LawCourse(blocks.time, course, sigma, float(np.sqrt(misfit)))
+    found = LawCourse(blocks.time, course, np.sqrt(variance), float(np.sqrt(misfit)))
+    return WithForm(replace(fitted, covariance=mixed), replace(fitted, covariance=another), found)
 
 
-def _kinds(law: LearnedLaw) -> set[str]:
-    return {family.kind for family in law.families}
+def form_is_another(law: LearnedLaw, beside: Collection[str] = ()) -> float:
+    """Probability that the true law has another form than those of the library, where what is left is noise.
+
+    A sum of several, or one with known effects `beside` it, is what a library makes of a law that it does not hold.
+    """
+    if len(law.families) + len(beside) > 1:
+        return 1.0
+    others = sum(odds for rival, odds in law.rivals if not _kinds(rival) <= _kinds(law))
+    return max(SELDOM, others / (1.0 + others))
 
 
-def _courses(system: DiscSystem, fitted: Fit, law: LearnedLaw, time: Array) -> tuple[Array, Array, Array]:
-    """All laws' moment (k, 3) and the law's own, and the former's derivative (3 k, n) by the fitted numbers."""
+def _kinds(law: LearnedLaw) -> set[tuple[str, ...]]:
+    """Of what kind each family is, and on which components of moment and force it acts."""
+    return {(f.kind, *sorted({component for parts in f.terms for component in parts})) for f in law.families}
+
+
+def _courses(system: DiscSystem, fitted: Fit, own: Collection[str], time: Array) -> tuple[Array, Array, Array]:
+    """All laws' moment (k, 3), that of the effects `own`, the former's derivative (3 k, n) by the fitted numbers."""
     values = fitted.values
     motion = _motion(system, values, time)
     course = moment_about_contact(system, values, motion)
@@ -126,8 +155,7 @@ def _courses(system: DiscSystem, fitted: Fit, law: LearnedLaw, time: Array) -> t
             step = step if values[name] + step <= fitted.quantities[i].upper else -step
             moved = moment_about_contact(system, {**values, name: values[name] + step}, motion)
             by_number[:, i] = ((moved - course) / step)[1:].T.ravel()
-    own = moment_about_contact(system, values, motion, law.candidate.effect)
-    return course[1:], own[1:], by_number
+    return course[1:], moment_about_contact(system, values, motion, own)[1:], by_number
 
 
 def _among_rivals(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Array, time: Array) -> Array:
