@@ -7,7 +7,7 @@ Three laws hold whatever the friction is, and each contains declared numbers:
   satisfies it goes as the square of the frame rate and as the radius; the mass cancels. It holds in rolling, in slip
   and in the air; not while something else touches the disc, nor at rest on a patch.
 - rigidity: dots seen by both cameras are as far apart as their declared centres, on the scale of the chessboard.
-- geometry: the centre of a disc on its rim rises by r sin(theta) + h cos(theta).
+- geometry: the centre of a disc on its rim rises by r sin(theta) + h cos(theta), over one plane, which is the table.
 
 A mirrored world obeys all three. It is told by what has a left and a right: dots without an axis of symmetry, which are
 not found in it; and the cameras, of which the left one stands on the left.
@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from calibration.arrays import Array
 from calibration.camera import StereoRig, triangulate
@@ -30,6 +31,7 @@ from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.propagation import state_of
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
+from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
 if TYPE_CHECKING:
@@ -52,6 +54,8 @@ COHERENT, COHERENT_SHARE = 0.3, 0.8
 GROWTH, STEADY = 0.05, 0.7  # of the energy; share of the blocks in which it does: a push is short
 SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
+MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
+MIN_ROUND, ANOTHER = 2.0, 0.2  # [rad] of precession; scatter about the plane found over that about the declared one
 MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
 SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
@@ -117,7 +121,8 @@ def contradictions(
     found = [*density(declared), *scale_of_dots(trajectory, declared, square), *unseen_dots(trajectory, declared)]
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, declared)
-        found += [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
+        # on another plane than the declared one neither heights nor the direction of gravity mean anything
+        found += another_plane(trajectory) or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
     return tuple(found)
 
 
@@ -284,6 +289,40 @@ def _blocks(motion: MeasuredMotion, size: int) -> tuple[Array, Array]:
 
 def _robust(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def another_plane(trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Whether the rim rolls on a plane far from z = 0: the board of the table view did not lie on the table."""
+    rows, disc = trajectory.measured, trajectory.disc
+    centre, e3 = trajectory.q[rows, :3], rotation_from_quaternion(trajectory.quaternion[rows])[:, :, 2]
+    if len(centre) < BLOCK:
+        return ()
+    start = e3.mean(axis=0) / np.linalg.norm(e3.mean(axis=0))  # it precesses about the normal
+    across = np.linalg.svd(start[None])[2][1:]
+
+    def normal_of(slopes: Array) -> Array:
+        normal = start + slopes @ across
+        return np.asarray(normal / np.linalg.norm(normal))
+
+    def heights(normal: Array) -> Array:
+        cosine = e3 @ normal
+        edge = disc.radius * np.sqrt(np.maximum(1 - cosine**2, 0)) + disc.half_thickness * np.abs(cosine)
+        return np.asarray(centre @ normal - edge)
+
+    def misfit(plane: Array) -> Array:
+        return heights(normal_of(plane[:2])) - plane[2]
+
+    fit = least_squares(misfit, [0, 0, np.median(heights(start))], loss="soft_l1", f_scale=1e-4, x_scale=[1, 1, 0.1])
+    normal = normal_of(fit.x[:2])
+    side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
+    turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
+    scatter, declared = _robust(misfit(fit.x)), heights(K)
+    apart = _robust(declared - np.median(declared))
+    if turned < MIN_LEAN or precessed < MIN_ROUND or scatter > min(RISE * disc.radius, ANOTHER * apart):
+        return ()
+    suspect = Suspect("[table] view", "as declared", "that in which the board lies flat on the table", 0.0)
+    seen = f"the rim rolls on a plane that is turned by {np.degrees(turned):.1f} deg from the table's"
+    return (Finding("table view", seen, "the plane under the board of the table view", (suspect,), spoils=True),)
 
 
 def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:

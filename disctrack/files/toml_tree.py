@@ -6,6 +6,7 @@ Fields may be bool, int, float, str, tuples, dictionaries by name, and dataclass
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 import types
 import typing
@@ -21,13 +22,20 @@ from disctrack.errors import DiscTrackError, SceneError
 
 def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
     """The file's tree. Raises `error` with the file, what is wrong with it, and what to do."""
+    text = ""
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
+        text = path.read_bytes().decode("utf-8")
+        return tomllib.loads(text)
     except UnicodeDecodeError as reason:
         raise error(f"{path}: byte {reason.start} is not UTF-8 text. Save the file as UTF-8.") from reason
     except tomllib.TOMLDecodeError as reason:
+        place = re.search(r"at line (\d+)", str(reason))
+        line = text.splitlines()[int(place[1]) - 1].strip()[:80] if place else ""
+        hint = " Numbers have a point: 37.5." if re.search(r"= *-?\d+,\d", line) else ""
+        hint += " Folders are divided by /." if "\\" in line else ""
         raise error(
-            f"{path}: not valid TOML: {reason}. Correct that line; if this is not a TOML file, give the right one."
+            f"{path}: not valid TOML: {reason}{f': {line}' if line else ''}. Correct that line; if this is not a TOML "
+            f"file, give the right one.{hint}"
         ) from reason
     except RecursionError as reason:
         raise error(f"{path}: nested too deeply for a file of settings.") from reason

@@ -54,6 +54,11 @@ def test_numbers_of_numpy_are_numbers():
     ("content", "message"),
     [
         (b"a = ", "not valid TOML"),
+        (
+            b"[disc]\nradius_mm = 37,5\n",
+            r"line 2, column 15\): radius_mm = 37,5. Correct that line.* Numbers have a point",
+        ),
+        (b'left = "left\\*.png"', "Folders are divided by /"),
         (b"a = '\xff'", "byte 5 is not UTF-8"),
         (b"a = " + b"[" * 100_000, "nested too deeply"),
         (b"a = " + b"1" * 10_000, "a value cannot be read"),

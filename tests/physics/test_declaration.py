@@ -11,7 +11,14 @@ import pytest
 
 from calibration.camera import Camera, StereoRig
 from disctrack.analyse.declaration import balance, contradictions, handedness, told, turned_board, unseen_dots
-from disctrack.frames import rotation_from_quaternion, rotation_from_vector
+from disctrack.frames import (
+    continuous_quaternions,
+    euler_from_rotation,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    unwrap_euler,
+)
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 SIXTHS = np.radians(60.0 * np.arange(6))
@@ -69,6 +76,24 @@ def test_a_wrong_radius_is_named_before_the_rate_where_the_rim_says_so(factor, h
     first = found["gravity and rate"].suspects[0]
     assert first.key == "[disc] radius_mm"
     assert abs(float(first.would_be) / (1e3 * honest.disc.radius) - 1) < 2e-3
+
+
+@pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
+@pytest.mark.parametrize("turn_deg", [3.0, 25.0])
+def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(
+    turn_deg, theta, seconds, k_m, nutation, spin, true_motion, as_tracked
+):
+    """Before, the radius was said to be 0.5 mm: over another plane the height of the centre means nothing."""
+    motion = true_motion(theta, seconds, k_m, nutation, spin=spin)
+    trajectory = as_tracked(motion, np.random.default_rng(1), missing=range(50, 58))
+    Q = rotation_from_vector(np.radians(turn_deg) * np.array([0.6, -0.8, 0.0]))
+    R = Q @ rotation_from_quaternion(trajectory.quaternion)
+    q = np.column_stack([trajectory.q[:, :3] @ Q.T + [0.0, 0.0, 0.02], unwrap_euler(euler_from_rotation(R))])
+    turned = replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)))
+    (finding,) = contradictions(turned)
+    assert finding.suspects[0].key == "[table] view"
+    assert f"turned by {turn_deg:.1f} deg" in finding.sentence
+    assert finding.spoils
 
 
 @pytest.mark.parametrize("key", ["mass", "half_thickness"])
