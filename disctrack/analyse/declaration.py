@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calibration.arrays import Array
 from calibration.camera import StereoRig, triangulate
@@ -55,7 +54,7 @@ GROWTH, STEADY = 0.05, 0.7  # of the energy; share of the blocks in which it doe
 SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
-MIN_ROUND, ANOTHER = 2.0, 0.2  # [rad] of precession; scatter about the plane found over that about the declared one
+MIN_ROUND, FLAT = 2.0, 0.1  # [rad] of precession; scatter about the plane over what the rim rises from the declared one
 MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
 SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
@@ -297,28 +296,21 @@ def another_plane(trajectory: Trajectory) -> tuple[Finding, ...]:
     centre, e3 = trajectory.q[rows, :3], rotation_from_quaternion(trajectory.quaternion[rows])[:, :, 2]
     if len(centre) < BLOCK:
         return ()
-    start = e3.mean(axis=0) / np.linalg.norm(e3.mean(axis=0))  # it precesses about the normal
-    across = np.linalg.svd(start[None])[2][1:]
-
-    def normal_of(slopes: Array) -> Array:
-        normal = start + slopes @ across
-        return np.asarray(normal / np.linalg.norm(normal))
-
-    def heights(normal: Array) -> Array:
-        cosine = e3 @ normal
-        edge = disc.radius * np.sqrt(np.maximum(1 - cosine**2, 0)) + disc.half_thickness * np.abs(cosine)
-        return np.asarray(centre @ normal - edge)
-
-    def misfit(plane: Array) -> Array:
-        return heights(normal_of(plane[:2])) - plane[2]
-
-    fit = least_squares(misfit, [0, 0, np.median(heights(start))], loss="soft_l1", f_scale=1e-4, x_scale=[1, 1, 0.1])
-    normal = normal_of(fit.x[:2])
+    start = normal = e3.mean(axis=0) / np.linalg.norm(e3.mean(axis=0))  # it precesses about the normal
+    weight = np.ones(len(centre))
+    for _ in range(10):  # lowest points as seen from the plane through the last ones; frames in the air count less
+        down = (e3 @ normal)[:, None] * e3 - normal
+        rim = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
+        lowest = centre + rim - disc.half_thickness * np.sign(e3 @ normal)[:, None] * e3
+        middle = weight @ lowest / weight.sum()
+        normal = np.linalg.svd(np.sqrt(weight)[:, None] * (lowest - middle), full_matrices=False)[2][2]
+        normal = normal * np.sign(normal @ start)
+        gap = (lowest - middle) @ normal
+        weight = 1 / (1 + (gap / (2 * np.median(np.abs(gap)) + 1e-9)) ** 2)
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
-    scatter, declared = _robust(misfit(fit.x)), heights(K)
-    apart = _robust(declared - np.median(declared))
-    if turned < MIN_LEAN or precessed < MIN_ROUND or scatter > min(RISE * disc.radius, ANOTHER * apart):
+    rolls = precessed > MIN_ROUND and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
+    if not (rolls and turned > MIN_LEAN and _robust(gap) < FLAT * disc.radius * turned):
         return ()
     suspect = Suspect("[table] view", "as declared", "that in which the board lies flat on the table", 0.0)
     seen = f"the rim rolls on a plane that is turned by {np.degrees(turned):.1f} deg from the table's"
