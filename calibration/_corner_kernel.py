@@ -8,7 +8,9 @@ with h = u / sigma, k = v / sigma and rho the cosine between the edges' normals,
 exact for any angle between the edges (the product of two error functions is so only at 90 degrees). sigma^2 holds the
 variance 1/12 of the square pixel; its fourth cumulant, which a Gaussian lacks, is added by Edgeworth's term. Lines stay
 lines under perspective, so the corner is where they cross, without bias; lens distortion bends them by a known
-curvature.
+curvature. Light that falls off over the window multiplies both levels, and is fitted; light that is added (a gleam,
+a lens that flares) takes more of the dark squares' share, so that the contrast changes over the window. Left out, that
+shifts a corner along its gradient, 0.1 grey values per px by 0.004 px; it is known from the other corners.
 
 numba, because one view is some 10^6 evaluations of this model: 0.05 s compiled.
 """
@@ -74,12 +76,13 @@ def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
 
 
 @_part
-def normal_equations(image, window, p, curvature, noise, weights, first_pass, H, g):  # type: ignore[no-untyped-def]
+def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):  # type: ignore[no-untyped-def]
     """Weighted sums of one corner; H (9, 9) and g (9,) are filled. Returns chi-square, and sums over pixels.
 
     weights : of the window's pixels; filled in the first pass from the noise at the model's grey values, then left, so
     that chi-square is one function of p and Gauss-Newton's step goes down on it
 
+    known (4,): bends of the two edges [1/px]; relative gradient of the contrast against the light's [1/px]
     window (14,): x0, x1, y0, y1 [px, inclusive]; centre x, y; inverse of the local axes, row by row; half widths along
     i and j [squares]; largest step [px]; distance from both edges [squares] beyond which the light squares are
     not plain (a marker), positive if they lie where i j > 0, negative if where i j < 0.
@@ -89,7 +92,7 @@ def normal_equations(image, window, p, curvature, noise, weights, first_pass, H,
     g[:] = 0.0
     sums = np.zeros(9)  # chi2, n; dark: r2, grey, n; light: r2, grey, n; edge chi2
     c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
-    bend1, bend2 = curvature[0], curvature[1]
+    bend1, bend2 = known[0], known[1]
     rho, turn, inverse_sigma = math.cos(p[3] - p[2]), math.sin(p[3] - p[2]), 1.0 / p[4]
     table = nodes(rho)
     # Edgeworth: kappa4 of a unit box along the normal is -(nx^4 + ny^4) / 120
@@ -110,10 +113,11 @@ def normal_equations(image, window, p, curvature, noise, weights, first_pass, H,
             h = (across1 - bend1 * along1 * along1) * inverse_sigma
             k = (across2 - bend2 * along2 * along2) * inverse_sigma
             light = 1.0 + p[7] * dx + p[8] * dy
+            half = p[6] * (1.0 + known[2] * wx + known[3] * wy)
             first = 0
             if abs(h) > _FAR and abs(k) > _FAR:
                 S = 1.0 if h * k > 0 else -1.0
-                base = p[5] + p[6] * S
+                base = p[5] + half * S
                 first = 5  # an even level tells nothing of the edges
             else:
                 blurred_saddle(h, k, rho, table, S4)
@@ -126,15 +130,16 @@ def normal_equations(image, window, p, curvature, noise, weights, first_pass, H,
                     e = 0.3989422804014327 * math.exp(-0.5 * k * k) * (1.0 if h > 0 else -1.0) * min(abs(h), 1.0)
                     S += box2 * (k * k * k - 3.0 * k) * e
                     S_k += box2 * (6.0 * k * k - k**4 - 3.0) * e
-                base = p[5] + p[6] * S
-                slope = p[6] * light
+                base = p[5] + half * S
+                slope = half * light
                 a, b = slope * S_h * inverse_sigma, slope * S_k * inverse_sigma
                 gradient[0] = a * (s1 + 2 * bend1 * along1 * c1) + b * (s2 + 2 * bend2 * along2 * c2) - base * p[7]
                 gradient[1] = a * (-c1 + 2 * bend1 * along1 * s1) + b * (-c2 + 2 * bend2 * along2 * s2) - base * p[8]
                 gradient[2] = -a * along1 * (1 + 2 * bend1 * across1) + slope * S4[3] * turn
                 gradient[3] = -b * along2 * (1 + 2 * bend2 * across2) - slope * S4[3] * turn
                 gradient[4] = -(a * h + b * k)
-            gradient[5], gradient[6], gradient[7], gradient[8] = light, light * S, base * dx, base * dy
+            gradient[5], gradient[7], gradient[8] = light, base * dx, base * dy
+            gradient[6] = light * S * (1.0 + known[2] * wx + known[3] * wy)
             model = base * light
             residual = image[y, x] - model
             if first_pass:
@@ -189,14 +194,14 @@ def cholesky_solve(H, damping, rhs, L):  # type: ignore[no-untyped-def]
 
 
 @_part
-def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covariance):  # type: ignore[no-untyped-def]
+def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt on p (9,) in place; covariance (2, 2) of x, y is filled. Returns sums and success."""
     H, g = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
     H_new, g_new = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
     L = np.zeros((N_CORNER, N_CORNER))
     covariance[:] = np.nan
     weights = np.empty((max(int(window[3] - window[2]) + 1, 1), max(int(window[1] - window[0]) + 1, 1)))
-    sums = normal_equations(image, window, p, curvature, noise, weights, True, H, g)
+    sums = normal_equations(image, window, p, known, noise, weights, True, H, g)
     if sums[1] < 4 * N_CORNER:
         return sums, False
     damping, converged = 1e-3, False
@@ -216,7 +221,7 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
         reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
         accepted = reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
         if accepted:
-            sums_new = normal_equations(image, window, trial, curvature, noise, weights, False, H_new, g_new)
+            sums_new = normal_equations(image, window, trial, known, noise, weights, False, H_new, g_new)
             accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
         if accepted:
             blur_step = trial[4] - p[4]  # as clamped: edges sharper than the pixel hold it at its lower bound
@@ -248,7 +253,7 @@ def fit_corner(image, window, p, curvature, noise, iterations, tolerance, covari
 
 
 @njit(cache=True, nogil=True)
-def fit_corners(image, windows, starts, curvatures, noise, iterations, tolerance):  # type: ignore[no-untyped-def]
+def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  # type: ignore[no-untyped-def]
     """`fit_corner` for many corners of one image: parameters (n, 9), covariances (n, 2, 2), sums (n, 9), converged."""
     n = starts.shape[0]
     found = starts.copy()
@@ -257,7 +262,7 @@ def fit_corners(image, windows, starts, curvatures, noise, iterations, tolerance
     converged = np.empty(n, np.bool_)
     for i in range(n):
         own, converged[i] = fit_corner(
-            image, windows[i], found[i], curvatures[i], noise, iterations, tolerance, covariance[i]
+            image, windows[i], found[i], known[i], noise, iterations, tolerance, covariance[i]
         )
         for k in range(own.shape[0]):
             sums[i, k] = own[k]

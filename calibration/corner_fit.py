@@ -24,12 +24,13 @@ MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of tw
 BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
 MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered or in glare
 ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
+CORNERS_FOR_DEGREE = (6, 15, 30, 45)  # of a polynomial: 2.5 to 3 corners for each of its coefficients
 MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 
 
 def prepare() -> None:
     """Compile the fit of corners, or load it: some seconds once per installation, then nothing."""
-    fit_corners(np.zeros((8, 8)), np.zeros((0, 14)), np.zeros((0, N_CORNER)), np.zeros((0, 2)), np.zeros(2), 1, 1e-2)
+    fit_corners(np.zeros((8, 8)), np.zeros((0, 14)), np.zeros((0, N_CORNER)), np.zeros((0, 4)), np.zeros(2), 1, 1e-2)
 
 
 @dataclass(frozen=True)
@@ -68,19 +69,19 @@ def fit_view(
     seen: Mask | None = None,
     plain: float = 1.0,
 ) -> CornerView:
-    """Fit every corner twice: first to learn blur, noise and the bend of the lines, then with them.
+    """Fit every corner twice: first to learn blur, noise, bends of the lines and changes of contrast, then with them.
 
     rough : (n, 2) [px] of all corners; where one is not `seen` (n,), the place where the others put it
     plain : how far, in squares, the light squares are plain on either side of an edge: markers leave a margin
     """
-    noise, blur, curvature = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 2))
+    noise, blur, known = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 4))
     seen = np.ones(len(rough), bool) if seen is None else seen
     points, ok = rough, seen
     axes = local_axes(points, ok, inner_corners)
     starts = _starts(grey, points, axes, blur, 0.7 * min(plain, 0.57))
     for iterations, tolerance, most in ((12, 1e-2, FIRST_REACH), (30, 1e-5, np.inf)):
         windows = _windows(points, axes, blur, grey.shape, -plain * np.sign(starts[:, 6]), most)
-        fit = _Fit(*fit_corners(grey, windows, starts, curvature, noise, iterations, tolerance))
+        fit = _Fit(*fit_corners(grey, windows, starts, known, noise, iterations, tolerance))
         displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
         ok = fit.converged & (displaced < MAX_DISPLACEMENT) & seen
         if not ok.any():
@@ -88,9 +89,10 @@ def fit_view(
         noise, blur = _measured_noise(fit.sums[ok]), float(np.median(fit.found[ok, 4]))
         points = np.where(ok[:, None], fit.found[:, :2], rough)
         axes = local_axes(points, ok, inner_corners)
-        curvature = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
+        bends = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
+        known = np.concatenate([bends, _contrast_gradient(points, ok, fit.found[:, 5:7])], axis=1)
         starts = np.where(ok[:, None], fit.found, starts)
-    fit = _with_smaller_windows(grey, fit, windows, starts, curvature, noise)
+    fit = _with_smaller_windows(grey, fit, windows, starts, known, noise)
     displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
     return _judged(grey, fit, displaced, noise, axes, rough, inner_corners, seen, plain)
 
@@ -112,9 +114,7 @@ class _Fit:
         return np.where(self.converged & np.isfinite(value), value, np.inf)
 
 
-def _with_smaller_windows(
-    grey: Array, fit: _Fit, windows: Array, starts: Array, curvature: Array, noise: Array
-) -> _Fit:
+def _with_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array) -> _Fit:
     """Fit again, nearer to the corner, where something else reaches into the window (a narrow or dirty square)."""
     for factor in (0.6, 0.35):
         limit = BAD_WINDOW * max(float(np.median(fit.chi_square)), 1.0)
@@ -123,7 +123,7 @@ def _with_smaller_windows(
             break
         smaller = windows[bad].copy()
         smaller[:, 10:12] *= factor
-        again = _Fit(*fit_corners(grey, smaller, starts[bad], curvature[bad], noise, 30, 1e-5))
+        again = _Fit(*fit_corners(grey, smaller, starts[bad], known[bad], noise, 30, 1e-5))
         better = again.chi_square < 0.5 * fit.chi_square[bad]
         merged = [np.array(getattr(fit, name)) for name in ("found", "covariance", "sums", "converged")]
         for old, name in zip(merged, ("found", "covariance", "sums", "converged"), strict=True):
@@ -263,6 +263,31 @@ def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple
             edge = np.stack([np.cos(angles[line, axis]), np.sin(angles[line, axis])], axis=-1)
             curvature[line, axis] = bend * np.sign(edge @ direction)
     return curvature
+
+
+def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
+    """Relative gradient (n, 2) [1/px] of the contrast, over the light's, at every corner, by a polynomial over all.
+
+    levels : (n, 2) mean grey and half contrast. Of light that falls off their ratio is the same everywhere.
+    """
+    use = ok & (levels[:, 0] > 0) & (levels[:, 1] != 0)
+    ratio = np.zeros(len(points))
+    ratio[use] = np.log(np.abs(levels[use, 1] / levels[use, 0]))
+    n = int(use.sum())
+    degree = sum(n >= least for least in CORNERS_FOR_DEGREE)
+    if not degree:
+        return np.zeros((len(points), 2))
+    centre, scale = points[use].mean(0), np.ptp(points[use], axis=0).max() / 2
+    x, y = ((points - centre) / scale).T
+    powers = [(i, k - i) for k in range(degree + 1) for i in range(k + 1)]
+    A = np.stack([x**i * y**j for i, j in powers], axis=1)
+    for _ in range(3):  # dirt and shadows in single squares are no gradient
+        c = np.linalg.lstsq(A[use], ratio[use], rcond=None)[0]
+        left = np.abs(ratio - A @ c)
+        use &= left <= 4.0 * 1.4826 * np.median(left[use]) + 1e-12
+    along_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in powers], axis=1) @ c
+    along_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in powers], axis=1) @ c
+    return np.stack([along_x, along_y], axis=1) / scale
 
 
 def _judged(

@@ -15,8 +15,9 @@ from disctrack.disc import Disc
 from disctrack.track.as_printed import AsBuilt, motions_of_pattern, pattern_place, refine_as_built, share_of_places
 from disctrack.track.dots import NoiseModel, TemplateLimits
 from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
-from disctrack.track.exposure import Exposure, Pull, exposure_by_smear, exposure_of, shift_by_exposure
+from disctrack.track.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
 from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
+from disctrack.track.gleam import shift_by_gleam
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.least_squares import step_to_minimum
 from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
@@ -25,6 +26,7 @@ from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.side_by_side import side_by_side
 from disctrack.track.slips import slips_in_words
 from disctrack.track.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
+from disctrack.track.template_pull import Pull
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 MIN_GOOD_DOT_IMAGES = 6
@@ -88,7 +90,7 @@ def assemble(
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
     repeated = repeats(tables.digest)
-    exposure = _to_mid_exposure(tables, first, settings, taken, workers)
+    exposure = _as_they_were(tables, first, settings, taken, workers)
     _clean(tables, repeated, first.setup.rig)
     as_built, faults, outlying = _shared(tables, first.setup, settings, workers)
     fits = _fit_all(tables, as_built, settings.reject_outliers, workers)
@@ -125,16 +127,15 @@ def assemble(
     )
 
 
-def _to_mid_exposure(
-    tables: Tables, first: Follower, settings: TrackingSettings, taken: Taken, workers: int
-) -> Exposure:
-    """Move the dots to where they were in the middle of the exposure, and tell by which exposure."""
+def _as_they_were(tables: Tables, first: Follower, settings: TrackingSettings, taken: Taken, workers: int) -> Exposure:
+    """Move the dots to where they were in the middle of the exposure but for gleams, and tell by which exposure."""
     where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
     found = exposure_by_smear(*where, tables.blur_px, rig, disc, workers)
     exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
+    law = first.law
+    left, right = (Pull(*seen) for seen in zip(law.blur, law.light, law.noise, strict=True))
+    tables.pixels -= shift_by_gleam(tables.R, tables.t, tables.contrast, rig, disc, (left, right))
     if any(exposure.seconds):
-        law = first.law
-        left, right = (Pull(*seen) for seen in zip(law.blur, law.light, law.noise, strict=True))
         tables.pixels -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, (left, right))
     return exposure
 

@@ -11,7 +11,7 @@ g T^2 / (6 r), at every theta alike (steady precession, psidot^2 sin(theta) = 4 
 r = 37.5 mm. The other comes from a dot whose outline changes while it moves, which smears one side more than the other:
 the image I(d) of the edge, d the signed distance, changes by T^2 / 24 (I' d_tt + I'' v_n^2) with
 d_tt = -n.a - kappa v_t^2 + 2 v_t dv_n/ds, and of that the template takes what looks to its normal equations like a
-shift: mostly I'', as light that may slope over the paper takes up the halo of the smeared side (`_response`). A dot
+shift: mostly I'', as light that may slope over the paper takes up the halo of the smeared side (`template_pull`). A dot
 seen obliquely is an ellipse, whose ends bend more and count less than its sides: at 70 deg from the normal, what a
 circle of the same area would be pulled by is twice too much.
 
@@ -22,7 +22,6 @@ by a linear fit. Variance of the path and shift of its mean are both in proporti
 the exposure.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,10 +30,10 @@ from calibration.arrays import Array, Array32, Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
-from disctrack.track.dots import NoiseModel
 from disctrack.track.least_squares import inner_products
 from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import side_by_side
+from disctrack.track.template_pull import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
 OF_SMEAR = 500  # frames at most that the smear is taken from
@@ -42,9 +41,6 @@ PARTS = 10  # stretches of the recording: what the fit leaves has a memory, its 
 LEAST_PARTS = 4.0  # that the motion is spread over: (sum w)^2 / sum w^2 of what each tells
 FEWEST = 2 * PARTS  # frames
 AT_ONCE = 4096  # poses
-BAND = 3.0  # blurs
-ACROSS, AROUND = 60, 32  # nodes of an edge
-SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
 EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
 ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
@@ -58,14 +54,6 @@ class ExposureSquared(NamedTuple):
 
     value: Array  # (2,) [s^2]
     sigma: Array  # (2,) [s^2]
-
-
-class Pull(NamedTuple):
-    """What a camera's templates see of an edge."""
-
-    blur_px: float  # sigma of the edge
-    light: tuple[float, float]  # grey value of the paper, and the dots' contrast with it
-    noise: NoiseModel
 
 
 class Exposure(NamedTuple):
@@ -119,14 +107,14 @@ def exposure_by_smear(
     rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))  # with their neighbours
     own = np.searchsorted(rows, chosen)
     pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
-    affine = _affine(J[own], R[chosen])
+    affine = plane_to_image(J[own], R[chosen])
     smear = _smear(_rate(pixels, time[rows])[own], affine)
     points = disc.marker_centres_body @ np.swapaxes(R[chosen], 1, 2) + t[chosen, None]
 
     def of_camera(camera: int) -> tuple[float, float]:
         R_camera_world, t_camera_world = rig.camera_poses()[camera]
         distance = points @ R_camera_world[2] + t_camera_world[2]
-        long, short = _half_axes(affine[:, camera])
+        long, short = half_axes(affine[:, camera])
         optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0), short / long)]
         squared = np.asarray(blur_px[chosen, camera], float) ** 2
         return _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
@@ -186,7 +174,7 @@ def _in_words(camera: str, squared: float, sigma: float) -> str:
 def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]) -> Array:
     """(n, 2, m, 2) [px/s^2] the bracket of the module's first equation; NaN at the ends and beside gaps."""
     pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
-    affine = _affine(J, R)
+    affine = plane_to_image(J, R)
     velocity, acceleration = _rate(pixels, time), np.full_like(pixels, np.nan)
     if len(pixels) > 2:
         before, after = (np.diff(time)[part, None, None, None] for part in (slice(-1), slice(1, None)))
@@ -207,106 +195,15 @@ def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, pull: 
 
     affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
     """
-    long, short = _half_axes(affine)
-    size, shape = radius * np.sqrt(long * short), short / long
-    known = np.isfinite(size) & np.isfinite(velocity).all(axis=-1)
-    if not known.any():
-        return np.full_like(velocity, np.nan)
-    sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
-    T = _between(_response(sizes, pull), sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
-    xx, yy, xy = _second_moments(affine)
-    turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the long axis
-    c, s = np.cos(turn), np.sin(turn)
-    axes = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+    T = pulls_by_exposure(radius, affine, pull)
+    axes = turned_to_axes(affine)
     v = (axes @ velocity[..., None])[..., 0]
     G = axes @ growth @ np.swapaxes(axes, -1, -2)
     along = (T[..., 0] * G[..., 0, 0] + T[..., 1] * G[..., 1, 1]) * v[..., 0]
     along += (T[..., 2] * G[..., 0, 1] + T[..., 3] * G[..., 1, 0]) * v[..., 1]
     across = (T[..., 4] * G[..., 0, 0] + T[..., 5] * G[..., 1, 1]) * v[..., 1]
     across += (T[..., 6] * G[..., 0, 1] + T[..., 7] * G[..., 1, 0]) * v[..., 0]
-    return np.asarray(c[..., None] * np.stack([along, across], -1) + s[..., None] * np.stack([-across, along], -1))
-
-
-def _response(sizes: Array, pull: Pull) -> Array:
-    """(sizes, SHAPES, 8) what the template takes for a shift, over T^2 / 24 and products of velocity v and growth G.
-
-    sizes : [px] root of the half axes' product. Axes 1, 2 are the dot's long and short one. The first four numbers are
-    of a shift along axis 1, by v1 G11, v1 G22, v2 G12, v2 G21; the others along axis 2, by v2 G11, v2 G22, v1 G12,
-    v1 G21: the others vanish by symmetry. Least squares over the template's band of pixels, weighted by their noise, of
-    centre and slope of the light together; what else is fitted (size, blur, grey values) is even about the centre.
-    """
-    sigma, (level, contrast) = pull.blur_px, pull.light
-    d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, ACROSS)  # as `_kernels` selects its pixels
-    edge = 1.0 - 0.5 * contrast * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])
-    first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
-    second = -d / sigma**2 * first
-    angle = 2 * np.pi * (np.arange(AROUND) + 0.5) / AROUND
-    cos, sin = np.cos(angle), np.sin(angle)
-    a, b = (sizes[:, None, None] * SHAPES[:, None] ** power for power in (-0.5, 0.5))  # (sizes, shapes, angles)
-    speed = np.hypot(b * cos, a * sin)  # of the outline with the angle
-    n1, n2, bend = b * cos / speed, a * sin / speed, a * b / speed**3
-    # products of v and G as listed: n.v, t.v and n.Gu, t.Gu, with how they change along the edge
-    t1, t2, u1, u2 = -n2, n1, a * cos, b * sin
-    of_v = {1: (n1, t1, bend * t1), 2: (n2, t2, bend * t2)}
-    of_G = {}
-    for i, j in ((1, 1), (2, 2), (1, 2), (2, 1)):
-        u, tangent = (u1, t1) if j == 1 else (u2, t2)
-        n, t = (n1, t1) if i == 1 else (n2, t2)
-        of_G[i, j] = n * u, t * u, bend * t * u + n * tangent
-    terms = []
-    for v, (i, j) in (
-        (1, (1, 1)),
-        (1, (2, 2)),
-        (2, (1, 2)),
-        (2, (2, 1)),
-        (2, (1, 1)),
-        (2, (2, 2)),
-        (1, (1, 2)),
-        (1, (2, 1)),
-    ):
-        (vn, vt, dvn), (gn, gt, dgn) = of_v[v], of_G[i, j]
-        terms.append((2 * (vt * dgn + gt * dvn) - 2 * bend * vt * gt, 2 * vn * gn))
-    weight = np.clip(1 + bend[..., None] * d, 0.0, None) * speed[..., None] / pull.noise.variance(level * edge)
-    found = []
-    for half in range(2):
-        n, u = ((n1, u1), (n2, u2))[half]
-        design = np.stack([-first * n[..., None], (u[..., None] + n[..., None] * d) * edge])
-        weighted = (design * weight).reshape(2, *a.shape[:2], -1)
-        flat = design.reshape(2, *a.shape[:2], -1)
-        normal = np.einsum("ixyk,jxyk->xyij", weighted, flat)
-        data = np.stack([first * at[..., None] + second * squared[..., None] for at, squared in terms[4 * half :][:4]])
-        rhs = np.einsum("ixyk,jxyk->xyij", weighted, data.reshape(4, *a.shape[:2], -1))
-        found.append(np.linalg.solve(normal, rhs)[..., 0, :])
-    return np.concatenate(found, axis=-1)
-
-
-def _between(table: Array, sizes: Array, size: Array, shape: Array) -> Array:
-    """The table (sizes, SHAPES, k) at dots of any number: linear in the size and in the logarithm of the shape."""
-    width = max(sizes[-1] - sizes[0], 1e-9 * sizes[0])
-    x = np.clip((size - sizes[0]) / width, 0.0, 1.0) * (len(sizes) - 1)
-    y = np.clip(np.log(shape / SHAPES[0]) / np.log(SHAPES[-1] / SHAPES[0]), 0.0, 1.0) * (len(SHAPES) - 1)
-    i, j = np.minimum(x.astype(int), len(sizes) - 2), np.minimum(y.astype(int), len(SHAPES) - 2)
-    x, y = (x - i)[..., None], (y - j)[..., None]
-    low, high = ((1 - y) * table[k, j] + y * table[k, j + 1] for k in (i, i + 1))
-    return np.asarray((1 - x) * low + x * high)
-
-
-def _second_moments(affine: Array) -> tuple[Array, Array, Array]:
-    """xx, yy and xy of the images of a unit circle by maps (..., 2, 2)."""
-    xx, yy = (affine[..., i, 0] ** 2 + affine[..., i, 1] ** 2 for i in range(2))
-    return xx, yy, (affine[..., 0, :] * affine[..., 1, :]).sum(axis=-1)
-
-
-def _half_axes(affine: Array) -> tuple[Array, Array]:
-    """The long and the short one of the images of a unit circle by maps (..., 2, 2)."""
-    xx, yy, xy = _second_moments(affine)
-    long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
-    return long, np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0]) / long
-
-
-def _affine(J: Array, R: Array) -> Array:
-    """(n, 2, m, 2, 2) [px/m] disc's plane -> image: a step in the plane moves a dot as it moves the disc."""
-    return np.asarray(J[..., :3] @ R[:, None, None, :, :2])
+    return np.asarray((np.stack([along, across], -1)[..., None, :] @ axes)[..., 0, :])
 
 
 def _rate(values: Array, time: Array) -> Array:

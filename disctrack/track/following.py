@@ -157,6 +157,7 @@ class Tables:
     misfit: Array32  # (n, 2, m) reduced chi-square of the grey values round each dot
     n_pixels: Array32  # (n, 2, m) grey values that it was taken over
     blur_px: Array32  # (n, 2, m) sigma of each dot's edge, smear of its motion included
+    contrast: Array32  # (n, 2, m) of each dot with its paper
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
     frame_status: NDArray[np.uint8]  # (n,)
@@ -273,6 +274,7 @@ def empty_tables(n: int, m: int) -> Tables:
         misfit=np.full((n, 2, m), np.nan, np.float32),
         n_pixels=np.full((n, 2, m), np.nan, np.float32),
         blur_px=np.full((n, 2, m), np.nan, np.float32),
+        contrast=np.full((n, 2, m), np.nan, np.float32),
         R=np.full((n, 3, 3), np.nan),
         t=np.full((n, 3), np.nan),
         frame_status=np.full(n, FrameStatus.NOT_PROCESSED, np.uint8),
@@ -330,6 +332,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
     tables.pixels[own], tables.covariance_px2[own] = dots.pixels, dots.covariance_px2
     tables.misfit[own], tables.n_pixels[own] = dots.misfit, results[..., kernels.N_PIXELS]
     tables.blur_px[own] = dots.blur_px
+    tables.contrast[own] = dots.contrast
 
 
 def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, first: int) -> Mask:

@@ -71,6 +71,32 @@ def test_corners_have_no_bias(views):
         assert np.abs(mean).max() < 4 * sigma.max() + 5e-4  # rays 1/6 px apart: their grid leaves some 5e-4 px
 
 
+def lit(image, added, fall_off):
+    """Exact grey values under light that falls off across the image by a part, with a gleam of so many grey values."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    gleam = added * np.exp(-0.5 * ((x - 210) ** 2 + (y - 150) ** 2) / 60.0**2)
+    return image * (1 - fall_off * np.hypot(x, y) / 400) + gleam
+
+
+def test_added_light_shifts_no_corner(board_drawer, monkeypatch):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board, (10, 12, 7))
+    image, true = board_drawer(CAMERA, R, t, board, sub=6), truth(board, R, t)
+
+    def found(grey):
+        return find_corners(np.rint(16 * grey).astype(np.uint16), (9, 6)).points
+
+    def shift(added):
+        return np.sqrt(np.mean((found(lit(image, added, fall_off=0.15)) - plain) ** 2, axis=0)).max()
+
+    plain = found(image)
+    assert np.abs(plain - true).max() < 0.01  # the premise
+    assert shift(added=0.0) < 5e-4
+    assert shift(added=30.0) < 1e-3  # the noise of a good image shifts a corner by 0.004 px
+    monkeypatch.setattr(corner_fit, "CORNERS_FOR_DEGREE", ())
+    assert shift(added=30.0) > 5e-3
+
+
 def test_noise_and_blur_are_measured(views):
     for view, _ in views:
         a, b = view.noise

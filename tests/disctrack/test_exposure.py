@@ -10,9 +10,11 @@ from disctrack import frames, measure_pairs, read_recording, rolling
 from disctrack.errors import RecordingError
 from disctrack.render import render_disc
 from disctrack.track import exposure as smears
+from disctrack.track import template_pull
 from disctrack.track.dots import NoiseModel, locate_on_plane
-from disctrack.track.exposure import Pull, shift_by_exposure
+from disctrack.track.exposure import shift_by_exposure
 from disctrack.track.pose import marker_pixels
+from disctrack.track.template_pull import Pull
 from disctrack.track.tracking import TrackingSettings
 from disctrack.trajectory import FrameStatus
 
@@ -132,8 +134,10 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs, monkeypatc
     given = R[:, 4], q[:, 4, :3], np.arange(N) / rate, np.array([1, 1]) / rate, rig, disc, (pull, pull)
     found = smears.shift_by_exposure(*given)
     expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, 10000, noise, 0.7)
-    of_ellipses = smears._response
-    monkeypatch.setattr(smears, "_response", lambda *of: np.repeat(of_ellipses(*of)[:, -1:], len(smears.SHAPES), 1))
+    of_ellipses = template_pull._response
+    monkeypatch.setattr(
+        template_pull, "_response", lambda *of: np.repeat(of_ellipses(*of)[:, -1:], len(template_pull.SHAPES), 1)
+    )
     round_dots = smears.shift_by_exposure(*given)
     circles = np.array([round_dots[frame, camera, dot] for frame, dot, (camera,) in oblique])
     size = np.sqrt(np.mean(expected**2))

@@ -232,8 +232,8 @@ def board_image(camera, plan, R, t, rng):
 
     def side(v):
         cell = v / a
-        near = np.rint(cell)
-        return np.clip(2 * (cell - near) * a / w, -1, 1) * np.where(near % 2 == 0, 1, -1)
+        near, spans = np.rint(cell), np.hypot(*np.gradient(cell))  # of a sub-pixel, wider where the board is slanted
+        return np.clip(2 * (cell - near) / spans, -1, 1) * np.where(near % 2 == 0, 1, -1)
 
     black = 0.5 + 0.5 * side(x) * side(y)
     beyond = np.maximum(np.maximum(-a - x, x - long - a), np.maximum(-a - y, y - short - a))

@@ -129,6 +129,7 @@ def tracked(px, R, t, times, rig, frame_rate):
         misfit=np.ones((n, 2, m), np.float32),
         n_pixels=np.full((n, 2, m), 300.0, np.float32),
         blur_px=np.full((n, 2, m), np.nan, np.float32),
+        contrast=np.full((n, 2, m), np.nan, np.float32),
         R=R.copy(),
         t=t.copy(),
         frame_status=np.full(n, FrameStatus.MEASURED, np.uint8),

@@ -1,0 +1,166 @@
+"""What a dot's template takes for a shift of the dot: the answer of its least squares to a change of the image.
+
+The template (`dots`) fits centre and slope of the light to a band of pixels about the edge. A change of the image that
+it has no name for goes, in part, into the centre: by how much depends on the size and shape of the dot's image, its
+blur, contrast and noise, and is tabulated here. Odd changes only: size, blur and grey values take up the even ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from calibration.arrays import Array
+from disctrack.track.dots import NoiseModel
+
+BAND = 3.0  # blurs
+ACROSS, AROUND = 60, 32  # nodes of an edge
+SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
+
+
+class Pull(NamedTuple):
+    """What a camera's templates see of an edge."""
+
+    blur_px: float  # sigma of the edge
+    light: tuple[float, float]  # grey value of the paper, and the dots' contrast with it
+    noise: NoiseModel
+
+
+def pulls_by_exposure(radius: float, affine: Array, pull: Pull) -> Array:
+    """(n, m, 8) shifts by an exposure, over T^2 / 24 and products of velocity v and growth G (see `exposure`).
+
+    radius [m] of the dots; affine (n, m, 2, 2) [px/m] from their plane to the image; NaN where it is. Axes 1, 2 are the
+    image's long and short one. The first four numbers are of a shift along axis 1, by v1 G11, v1 G22, v2 G12, v2 G21;
+    the others along axis 2, by v2 G11, v2 G22, v1 G12, v1 G21: the others vanish by symmetry.
+    """
+    return _tabulated(radius, affine, pull, _edge_smeared)
+
+
+def pulls_by_contrast(radius: float, affine: Array, pull: Pull) -> Array:
+    """(n, m, 2) [px^2] shifts along the long and the short axis by the gradient of the contrast; arguments as above."""
+    return _tabulated(radius, affine, pull, _contrast_graded)
+
+
+def _tabulated(radius: float, affine: Array, pull: Pull, changes: Changes) -> Array:
+    """What `_response` tells of dots of this size, interpolated."""
+    long, short = half_axes(affine)
+    size, shape = radius * np.sqrt(long * short), short / long
+    known = np.isfinite(size)
+    if not known.any():
+        return np.full((*size.shape, 1), np.nan)
+    sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
+    table = _response(sizes, pull, changes)
+    T = _between(table, sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
+    return np.where(known[..., None], T, np.nan)
+
+
+def turned_to_axes(affine: Array) -> Array:
+    """(..., 2, 2) rotations of the image into the long and the short axis of the images of a circle by these maps."""
+    xx, yy, xy = _second_moments(affine)
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)
+    c, s = np.cos(turn), np.sin(turn)
+    return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+
+
+class _Band(NamedTuple):
+    """The template's pixels about an edge, by the distance d from it and the angle round the dot."""
+
+    d: Array  # (ACROSS,) [px]
+    seen: Array  # (ACROSS,) share of the dot
+    first: Array  # (ACROSS,) derivative of the grey values over the paper's by d
+    second: Array
+    n: tuple[Array, Array]  # (sizes, SHAPES, AROUND) outward normal, along the long and the short axis
+    u: tuple[Array, Array]  # [px] place of the edge
+    bend: Array  # [1/px]
+
+
+Changes = Callable[[_Band, int], Array]  # of an image, odd along axis 0 or 1: (k, sizes, SHAPES, AROUND, ACROSS)
+
+
+def _response(sizes: Array, pull: Pull, changes: Changes) -> Array:
+    """(sizes, SHAPES, 2 k) what the template takes for a shift, along the long axis (k numbers) and the short one.
+
+    sizes : [px] root of the half axes' product. Least squares over the template's band of pixels, weighted by their
+    noise, of centre and slope of the light together; what else is fitted (size, blur, grey values) is even about the
+    centre.
+    """
+    sigma, (level, contrast) = pull.blur_px, pull.light
+    d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, ACROSS)  # as `_kernels` selects its pixels
+    seen = 0.5 * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])
+    edge = 1.0 - contrast * seen
+    first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+    angle = 2 * np.pi * (np.arange(AROUND) + 0.5) / AROUND
+    cos, sin = np.cos(angle), np.sin(angle)
+    a, b = (sizes[:, None, None] * SHAPES[:, None] ** power for power in (-0.5, 0.5))  # (sizes, shapes, angles)
+    speed = np.hypot(b * cos, a * sin)  # of the outline with the angle
+    normal, edge_at, bend = (b * cos / speed, a * sin / speed), (a * cos, b * sin), a * b / speed**3
+    band = _Band(d, seen, first, -d / sigma**2 * first, normal, edge_at, bend)
+    weight = np.clip(1 + bend[..., None] * d, 0.0, None) * speed[..., None] / pull.noise.variance(level * edge)
+    found = []
+    for axis in range(2):
+        place = band.u[axis][..., None] + band.n[axis][..., None] * d
+        design = np.stack([-first * band.n[axis][..., None], place * edge])
+        weighted = (design * weight).reshape(2, *a.shape[:2], -1)
+        flat = design.reshape(2, *a.shape[:2], -1)
+        data = changes(band, axis)
+        products = np.einsum("ixyk,jxyk->xyij", weighted, flat)
+        rhs = np.einsum("ixyk,jxyk->xyij", weighted, data.reshape(len(data), *a.shape[:2], -1))
+        found.append(np.linalg.solve(products, rhs)[..., 0, :])
+    return np.concatenate(found, axis=-1)
+
+
+def _contrast_graded(band: _Band, axis: int) -> Array:
+    """See `gleam`: by a contrast that grows by 1 per px along the axis."""
+    place = band.u[axis][..., None] + band.n[axis][..., None] * band.d
+    return np.asarray(-place * band.seen)[None]
+
+
+def _edge_smeared(band: _Band, axis: int) -> Array:
+    """See `exposure`: products of v and G as listed: n.v, t.v and n.Gu, t.Gu, with how they change along the edge."""
+    (n1, n2), (u1, u2), bend = band.n, band.u, band.bend
+    t1, t2 = -n2, n1
+    of_v = {1: (n1, t1, bend * t1), 2: (n2, t2, bend * t2)}
+    of_G = {}
+    for i, j in ((1, 1), (2, 2), (1, 2), (2, 1)):
+        u, tangent = (u1, t1) if j == 1 else (u2, t2)
+        n, t = (n1, t1) if i == 1 else (n2, t2)
+        of_G[i, j] = n * u, t * u, bend * t * u + n * tangent
+    own, other = (1, 2) if axis == 0 else (2, 1)
+    changes = []
+    for v, (i, j) in ((own, (1, 1)), (own, (2, 2)), (other, (1, 2)), (other, (2, 1))):
+        (vn, vt, dvn), (gn, gt, dgn) = of_v[v], of_G[i, j]
+        at, squared = 2 * (vt * dgn + gt * dvn) - 2 * bend * vt * gt, 2 * vn * gn
+        changes.append(band.first * at[..., None] + band.second * squared[..., None])
+    return np.stack(changes)
+
+
+def _between(table: Array, sizes: Array, size: Array, shape: Array) -> Array:
+    """The table (sizes, SHAPES, k) at dots of any number: linear in the size and in the logarithm of the shape."""
+    width = max(sizes[-1] - sizes[0], 1e-9 * sizes[0])
+    x = np.clip((size - sizes[0]) / width, 0.0, 1.0) * (len(sizes) - 1)
+    y = np.clip(np.log(shape / SHAPES[0]) / np.log(SHAPES[-1] / SHAPES[0]), 0.0, 1.0) * (len(SHAPES) - 1)
+    i, j = np.minimum(x.astype(int), len(sizes) - 2), np.minimum(y.astype(int), len(SHAPES) - 2)
+    x, y = (x - i)[..., None], (y - j)[..., None]
+    low, high = ((1 - y) * table[k, j] + y * table[k, j + 1] for k in (i, i + 1))
+    return np.asarray((1 - x) * low + x * high)
+
+
+def _second_moments(affine: Array) -> tuple[Array, Array, Array]:
+    """xx, yy and xy of the images of a unit circle by maps (..., 2, 2)."""
+    xx, yy = (affine[..., i, 0] ** 2 + affine[..., i, 1] ** 2 for i in range(2))
+    return xx, yy, (affine[..., 0, :] * affine[..., 1, :]).sum(axis=-1)
+
+
+def half_axes(affine: Array) -> tuple[Array, Array]:
+    """The long and the short one of the images of a unit circle by maps (..., 2, 2)."""
+    xx, yy, xy = _second_moments(affine)
+    long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
+    return long, np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0]) / long
+
+
+def plane_to_image(J: Array, R: Array) -> Array:
+    """(n, 2, m, 2, 2) [px/m] disc's plane -> image: a step in the plane moves a dot as it moves the disc."""
+    return np.asarray(J[..., :3] @ R[:, None, None, :, :2])

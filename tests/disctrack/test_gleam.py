@@ -1,0 +1,89 @@
+"""Light that is added to the image: its gradient shifts templates, and the dots' contrasts tell by how much."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from disctrack import frames, rolling
+from disctrack.track.dots import NoiseModel, locate_on_plane
+from disctrack.track.gleam import shift_by_gleam
+from disctrack.track.pose import marker_pixels
+from disctrack.track.template_pull import Pull
+
+N, DARK, PAPER, NOISE = 24, 8000.0, 50000.0, NoiseModel(1e4, 8.0)
+
+
+def drawn(centre, affine):
+    """Grey values (64, 64) of a dot, an ellipse of half axes `affine` (2, 2) [px], rays 1/6 px apart, blurred."""
+    axis = (np.arange(64 * 6) + 0.5) / 6 - 0.5
+    u = (np.stack(np.meshgrid(axis, axis), axis=-1) - centre) @ np.linalg.inv(affine).T
+    distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(affine))) * 6
+    cover = gaussian_filter(np.clip(distance + 0.5, 0, 1), 0.6 * 6).reshape(64, 6, 64, 6).mean((1, 3))
+    return PAPER - (PAPER - DARK) * cover
+
+
+@pytest.fixture(scope="module")
+def located(rendered_pairs):
+    """Contrast and shift of the left camera's dots under light that falls off, and under that with a gleam."""
+    rig, disc = rendered_pairs.rig, rendered_pairs.disc
+    start = rolling.steady_precession(np.radians(15), disc, 9.81)
+    q = rolling.simulate(rolling.Model(disc, 9.81), start, times=np.arange(N) / 200).q
+    q[:, :2] += np.array([0.032, 0.02]) - q[:, :2].mean(axis=0)
+    R, t = frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
+    pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
+    affine = 0.5 * disc.marker_diameter * (J[:, 0, :, :, :3] @ R[:, None, :, :2])
+    middle = pixels[:, 0].mean(axis=(0, 1))
+    y, x = np.mgrid[:64, :64]
+    found = {}
+    for kind, gleam in (("falls off", 0.0), ("gleam", 3000.0)):
+        contrast, shift = np.full((N, 2, disc.n_markers), np.nan, np.float32), np.zeros((N, disc.n_markers, 2))
+        for frame in range(N):
+            for dot in range(disc.n_markers):
+                centre, A = pixels[frame, 0, dot], affine[frame, dot]
+                window = np.round(centre) - 31
+                plain = drawn(centre - window, A)
+                place = np.stack([x, y], axis=-1) + window - middle
+                added = gleam * np.exp(-0.5 * np.sum((place - [30, -20]) ** 2, axis=-1) / 70.0**2)
+                H = np.eye(3)
+                H[:2, :2], H[:2, 2] = A, centre - window
+                images = plain, plain * (1 - 4e-4 * place @ [1.0, 0.5]) + added
+                of_plain, of_lit = (
+                    locate_on_plane(np.rint(image).astype(np.uint16), H, np.zeros((1, 2)), 1.0, noise=NOISE)
+                    for image in images
+                )
+                shift[frame, dot] = (of_lit.pixels - of_plain.pixels)[0]
+                contrast[frame, 0, dot] = of_lit.contrast[0]
+        found[kind] = contrast, shift
+    pull = Pull(0.65, (PAPER, 1 - DARK / PAPER), NOISE)
+    return found, lambda contrast: shift_by_gleam(R, t, contrast, rig, disc, (pull, pull))
+
+
+def test_a_gleam_shifts_dots_and_their_contrasts_tell_by_how_much(located):
+    found, told = located
+    contrast, shift = found["gleam"]
+    given = told(contrast)
+    assert np.sqrt(np.mean(shift**2)) > 0.002  # px
+    # single dots scatter with the place of their edge among the pixels
+    assert np.sqrt(np.mean((given[:, 0] - shift) ** 2)) < 0.2 * np.sqrt(np.mean(shift**2))
+    assert not given[:, 1].any()  # the camera in which no dot was seen
+
+
+def test_light_that_falls_off_shifts_nothing(located):
+    found, told = located
+    contrast, shift = found["falls off"]
+    assert np.sqrt(np.mean(shift**2)) < 1e-4  # px; single ones 5e-4, where another pixel counts to the edge
+    assert np.abs(told(contrast)).max() < 2e-4
+
+
+def test_flicker_and_dots_of_different_ink_are_no_gradient(located, rng):
+    found, told = located
+    contrast = found["gleam"][0]
+    uneven = contrast + 0.03 * rng.normal(size=(N, 1, 1)) + 0.03 * rng.normal(size=contrast.shape[2])
+    assert np.abs(told(uneven.astype(np.float32)) - told(contrast)).max() < 2e-4  # px
+
+
+def test_a_disc_at_rest_or_a_single_dot_tells_nothing(located):
+    _, told = located
+    contrast = np.full((N, 2, 6), np.nan, np.float32)
+    contrast[:, :, 2] = 0.8
+    assert not told(contrast).any()
