@@ -24,7 +24,7 @@ from disctrack.readers.blocks import PairBlock
 from disctrack.track import following, pose
 from disctrack.track.arrangement import arrangement_found
 from disctrack.track.assembly import Taken, Tracking, TrackingSettings, assemble
-from disctrack.track.doubts import LIE_OFF, MOVED, ONE_SIDED
+from disctrack.track.doubts import LIE_OFF, LOWEST_POINT, MOVED, ONE_SIDED
 from disctrack.track.following import (
     Follower,
     Image,
@@ -49,6 +49,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
+NO_TOLERANCE = 1e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
 PAIRS_TRIED = 12  # where no disc is found, for what else is wrong: some more than the refinement of a rig takes
 STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
@@ -132,8 +133,9 @@ def track(
             told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
             tracking = replace(tracking, doubts=(told, *tracking.doubts))
     # in doubt only here: dots found elsewhere than declared are what the second look above is for
-    misplaced = (text for text in tracking.warnings if text.startswith(LIE_OFF))
-    return replace(tracking, doubts=(*tracking.doubts, *misplaced))
+    apart = tracking.table is not None and abs(tracking.table.plane[0]) > NO_TOLERANCE
+    wrong = (LIE_OFF, LOWEST_POINT) if apart else (LIE_OFF,)
+    return replace(tracking, doubts=(*tracking.doubts, *(t for t in tracking.warnings if t.startswith(wrong))))
 
 
 def _followed(

@@ -159,6 +159,15 @@ def test_a_dot_declared_a_millimetre_off_is_found_and_named(clip):
     assert not any("dots lie off" in text for text in clip.untouched.warnings)
 
 
+@pytest.mark.parametrize(("thicker", "in_doubt"), [(2.0, True), (1.05, False)])
+def test_a_thickness_declared_millimetres_off_puts_the_result_in_doubt(clip, thicker, in_doubt):
+    """Every height is off by half of it; three tenths of a millimetre are told, and in the sigmas."""
+    found = measure(clip.images, clip.rig, replace(clip.disc, half_thickness=thicker * clip.disc.half_thickness))
+    told = [text for text in found.warnings if text.startswith("the disc's lowest point")]
+    assert told
+    assert found.doubts == (tuple(told) if in_doubt else ())
+
+
 def test_dots_declared_by_a_ruler_are_located_as_those_declared_right(clip):
     """What the template is made for must not pull: the images are the same, and so is their noise."""
     off = 0.1 * np.random.default_rng(3).normal(size=(clip.disc.n_markers, 2))
