@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.arrays import Array, Mask
-from disctrack.diagnosis.engine.fit import Fit, fit
+from disctrack.diagnosis.engine.fit import Fit, fit, triangle
 from disctrack.diagnosis.engine.system import Quantity, Subset, System, Values
 
 TRAIN_FRACTION = 0.65  # of the time
@@ -51,10 +51,11 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
         return HeldOut(train, test, np.inf, float(n_data), -np.inf, n_data)
     root = _square_root(train.covariance)
     B = derivative @ root
-    inner = np.eye(B.shape[1]) + B.T @ B
-    projected = B.T @ residual
-    quadratic = residual @ residual - projected @ np.linalg.solve(inner, projected)
-    log_density = -0.5 * (quadratic + np.linalg.slogdet(inner)[1])
+    # R of [B, residual] over [1, 0]: its squares, which a run-away motion would make singular, are never formed
+    k = B.shape[1]
+    R = triangle(np.block([[B, residual[:, None]], [np.eye(k), np.zeros((k, 1))]]))
+    quadratic = R[k, k] ** 2 if R.shape[0] > k else 0.0
+    log_density = -0.5 * (quadratic + 2 * np.sum(np.log(np.abs(np.diag(R)[:k]))))
     expected = n_data + float(np.sum(B * B))
     return HeldOut(train, test, float(residual @ residual), expected, float(log_density), n_data)
 

@@ -216,9 +216,12 @@ class _Search:
         if self._at_noise(after.fit):
             return True
         excess = [trial.fit.chi_square / self.noise - trial.fit.degrees_of_freedom for trial in (before, after)]
-        free = [(t.held_out.chi_square / self.noise - t.held_out.expected) for t in (before, after) if t.held_out]
+        held = [t.held_out for t in (before, after) if t.held_out]
+        free = [h.chi_square / self.noise - h.expected for h in held]
+        # where next to nothing moves in what was kept back, no model errs there: what it lacks elsewhere is the measure
+        at_stake = max(free[0], excess[0] * held[0].n_data / max(before.fit.n_data, 1))
         share = self.settings.unexplained_share
-        return excess[1] < share * excess[0] and free[1] < share * free[0]
+        return excess[1] < share * excess[0] and free[1] < share * at_stake
 
     def threshold(self, k: int) -> float:
         """Gain with k quantities that noise reaches with the allowed probability, over all candidates."""
@@ -345,7 +348,10 @@ class _Search:
         trials.sort(key=lambda item: self._criterion(item[1]))
         chosen: Trial | None = None
         obvious: Trial | None = None
-        for extra, trial in trials[: self.settings.judged]:
+        for rank, (extra, trial) in enumerate(trials):
+            # where fits have several minima the best of them may stand no free run, and the next ones do
+            if rank >= self.settings.judged and (chosen or obvious or not self.rough):
+                break
             if not self._enough(trial, extra):
                 continue
             judged = self._judged(current, trial)
