@@ -842,3 +842,41 @@ def test_a_number_of_the_equations_may_have_the_name_of_a_terms_own(rng):
     mine = Term("mine", {"v": "-own_k*x**3 - k*own_b*x"}, parameters={"k": 0.0, "b": 0.0})
     found = formulas(equations, [mine], {"x": "x"})
     assert {s.name for s in found.rates[1].free_symbols} >= {"k", "term1_k", "term1_b"}
+
+
+@pytest.mark.parametrize("at_rest", [True, False])
+def test_a_sensor_that_lags_shows_the_rest_before_the_first_sample_where_that_is_said(rng, at_rest):
+    """A heater is switched on at the first sample: what went on before it is not the heated motion run backwards."""
+    time, lag, sigma = np.arange(90) * 2.0, 12.0, 0.02
+    heated = 20 + 30 * (1 - np.exp(-np.maximum(time - lag, 0) / 40))  # closed form
+    run = Run(time, {"T": heated + sigma * rng.standard_normal(90)}, sigma=sigma, known={"T": 20.0}, at_rest=at_rest)
+    answer = diagnose(
+        Equations({"T": "(20 + g - T)/tau"}, {"g": 28.0, "tau": 45.0}), run,
+        [terms.sensor_lag("T"), terms.quadratic("T"), terms.sensor_drift("T")],
+    )  # fmt: skip
+    if at_rest:
+        assert answer.found == ("lag_T",)
+        assert within(answer, "lag_T.tau", lag)
+        assert within(answer, "tau", 40.0)
+    else:
+        assert answer.verdict == "unexplained"
+        assert answer.after["T"].rms > 10 * sigma
+
+
+def test_a_gain_of_the_wrong_sign_is_passed_through_nought(rng):
+    """A valve that drives a resonance: Gauss-Newton ends where with a gain of nought nothing moves."""
+    time = np.arange(600) * 0.05
+    push = np.interp(time, np.arange(0, 31, 1.5), np.sign(np.sin(7.3 * np.arange(21) ** 1.3)))
+    course = CubicSpline(time, push)
+    truth = motion(
+        lambda t, y: [y[2], -6.0 * course(t) - 6.0 * y[2] - 0.4 * y[1], 3 * y[1] - 1.2 * y[2] - 2 * y[0]],
+        [0.0, 0.0, 0.0], time,
+    )[1]  # fmt: skip
+    equations = Equations(
+        {"q": "r", "p": "k*u - l*r - e*p", "r": "3*p - c*r - s*q"},
+        {"k": 3.0, "l": 3.0, "e": 1.0, "c": 0.5, "s": 1.0}, inputs=["u"], observed={"y": "p"},
+    )  # fmt: skip
+    run = Run(time, {"y": truth + 0.01 * rng.standard_normal(600)}, sigma=0.01, inputs={"u": push})
+    answer = diagnose(equations, run, [terms.coulomb("r"), terms.constant("r")])
+    assert answer.verdict == "nothing missing"
+    assert all(within(answer, name, v) for name, v in {"k": -6, "l": 6, "e": 0.4, "c": 1.2, "s": 2}.items())

@@ -107,6 +107,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
     pointer : (groups,) how many samples are filled in
     returns : DONE, or why not; number of steps. Where the equations have become stiff it stops (STIFF_CHANGES), with z,
         span, largest and pointer as they are there: `_stiff_kernel.integrate` goes on from these, and this from its.
+        After max_steps (TOO_MANY_STEPS) it may be called again with them, too.
     """
     N, n_p = len(z), len(p)
     k = len(columns)
@@ -140,6 +141,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         if attempts > max_steps or step < 1e-15 * max(abs(t), 1e-3):
             if last and remaining <= 0:
                 break
+            span[0], span[2] = t, h
             return TOO_MANY_STEPS, steps
         for s in range(1, 12):
             for i in range(N):

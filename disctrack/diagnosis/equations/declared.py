@@ -130,6 +130,7 @@ class Run:
     groups : what the run belongs to, by kind of group: {"ball": "golf"}; a `Parameter(per="ball")` is one of each ball
     noise : noise that remembers, of every channel, in place of sigma
     fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run)
+    at_rest : True where nothing moved before the first sample: a sensor that lags then shows what it shows there
     """
 
     time: ArrayLike
@@ -144,6 +145,7 @@ class Run:
     groups: Mapping[str, str] = field(default_factory=dict)
     noise: SmoothNoise | None = None
     fit_until: float | None = None
+    at_rest: bool = False
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ class Samples:
     groups: Mapping[str, str]  # by kind, "run" among them
     noise: SmoothNoise | None = None
     fit_until: float | None = None
+    at_rest: bool = False  # before the first sample
 
     @property
     def name(self) -> str:
@@ -175,7 +178,7 @@ class Samples:
         own = number == 0
         return replace(
             self, stretch=number, time=self.time[rows], data=self.data[rows], sigma=self.sigma[rows],
-            start=self.start if own else {}, known=self.known if own else {},
+            start=self.start if own else {}, known=self.known if own else {}, at_rest=self.at_rest and own,
         )  # fmt: skip
 
 
@@ -246,7 +249,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
     knots, pieces = _inputs(equations, run, name, time - time[0])
     return Samples(
         name, 0, time - time[0], data, sigma, knots, pieces, dict(run.constants), dict(run.start), known_states,
-        {**run.groups, "run": name}, run.noise, run.fit_until,
+        {**run.groups, "run": name}, run.noise, run.fit_until, run.at_rest,
     )  # fmt: skip
 
 

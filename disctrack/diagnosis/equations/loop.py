@@ -89,7 +89,7 @@ def _word_of_patience(samples: list[Samples]) -> Iterator[None]:
 def _shorter(samples: Sequence[Samples]) -> str:
     count = sum(len(s.time) for s in samples)
     text = f"the search goes on after {PATIENCE:.0f} s; there are {count} samples"
-    a_turn = min((turn(s) / float(np.median(np.diff(s.time))) for s in samples), default=0.0)
+    a_turn = min((min(turn(s), _pace(s)) / float(np.median(np.diff(s.time))) for s in samples), default=0.0)
     if a_turn > 2 * ENOUGH_A_TURN:
         every = int(a_turn / ENOUGH_A_TURN)
         return f"{text}, {a_turn:.0f} a turn. One in {every} tells nearly as much, sooner: Run(time[::{every}], ...)."

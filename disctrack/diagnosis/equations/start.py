@@ -4,6 +4,7 @@ Over many turns of an oscillation chi-square has many minima; over half a turn i
 is led to longer and longer windows stays in it, for as long as the model can follow at all.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy import signal
 from scipy.optimize import least_squares
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.fit import fit
+from disctrack.diagnosis.engine.fit import fit, prior_rows
 from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Samples
@@ -25,6 +26,8 @@ NOISY = 2.0  # variance over that stated, up to which a residual may be noise: s
 _LEASH = 0.3  # relative change of a parameter from window to window, of which none is surprised
 _FAR = 1.0  # relative change of a parameter from its declared value, which is said to be right to some 30 %
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
+_ATTEMPTS = 100  # steps of a fit to all data at once
+_NOWHERE = 1e8  # residual of what has no value
 _INSTANTS = 24  # at which the sizes of the states are looked at
 
 
@@ -181,12 +184,52 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
         for q in parameters
     )
     states = tuple(q for q in system.base if q.name.startswith("state."))
-    values = declared | fit(system, (*states, *tied), declared, max_iterations=30).values
-    ends = [misfit(system, v) for v in (values, found.values)]
+    enough = LOST if found.followed >= min(turn(s) for s in system.stretches) else LOOSE
+    led_to = misfit(system, found.values)
     if not found.whole and max(shift, default=0.0) >= _FAR:  # what led so far off and then lost the motion is no start
         found = replace(found, values=found.values | {q.name: declared.get(q.name, q.null) for q in parameters})
-    enough = LOST if found.followed >= min(turn(s) for s in system.stretches) else LOOSE
-    return Start(values, found.duration, found.duration) if ends[0] < min(ends[1], enough) else found
+    attempts = [lambda: fit(system, (*states, *tied), declared, max_iterations=30).values]
+    if not system.promoted:  # for one term after the other it would take too long
+        attempts.append(lambda: at_once(system, declared))
+    for attempt in attempts:
+        values = declared | attempt()
+        if misfit(system, values) < min(led_to, enough):
+            return Start(values, found.duration, found.duration)
+    return found
+
+
+def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, float]:
+    """All quantities fitted to all data within a region of trust that grows and shrinks with its success.
+
+    Gauss-Newton's halved steps end where a parameter far off (a gain of the wrong sign) has to pass through values with
+    which nothing moves.
+    """
+    names = [q.name for q in system.base]
+    null = np.array([q.null for q in system.base])
+    lower, upper = (np.array([getattr(q, side) for q in system.base]) for side in ("lower", "upper"))
+    size = np.maximum(np.abs(null), [q.scale for q in system.base])
+    start = np.clip([declared.get(name, q.null) for name, q in zip(names, system.base, strict=True)], lower, upper)
+    latest: dict[bytes, tuple[Array, Array]] = {}
+
+    def both(x: Array) -> tuple[Array, Array]:
+        if x.tobytes() not in latest:
+            values = dict(declared) | dict(zip(names, x.tolist(), strict=True))
+            residual, derivative = system.linearise(values, names)
+            right, matrix = prior_rows(system.base, values)
+            latest.clear()
+            latest[x.tobytes()] = (
+                np.concatenate([residual.ravel(), right]),
+                np.vstack([derivative.reshape(residual.size, -1), matrix]),
+            )
+        return latest[x.tobytes()]
+
+    if not all(np.isfinite(part).all() for part in both(start)):
+        return dict(declared)
+    found = least_squares(
+        lambda x: np.nan_to_num(both(x)[0], nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE), start,
+        lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=_ATTEMPTS,
+    )  # fmt: skip
+    return dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
 
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:

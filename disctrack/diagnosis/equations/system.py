@@ -19,7 +19,9 @@ from disctrack.diagnosis.equations.formulas import Formulas
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
-LEAST_STEPS, STEPS_PER_SAMPLE, MAX_STEPS = 20_000, 50, 400_000  # after which a motion is given up: mostly it ran away
+LEAST_STEPS, STEPS_PER_SAMPLE, MAX_STEPS = 20_000, 50, 400_000  # after which a motion is given up
+LOOK_AFTER = 0.1  # of these steps it is looked at, and given up if it ran away: it is then ...
+RAN_AWAY = 1e6  # ... times larger than all its states are
 FIRST_SHARE = 0.65  # of every stretch: what is fitted to it is judged on the rest
 
 
@@ -231,6 +233,10 @@ class EquationSystem:
         if not self.formulas.is_late:
             return np.zeros((self._w, 0, 0)), [0] * self._w, s.time[None].copy()
         late, by_number = self.formulas.lateness(s.time, p)
+        if s.at_rest:  # what was shown before the motion began is what is shown as it begins
+            before = s.time + late <= s.time[0]
+            late = np.where(before, s.time[0] - s.time, late)
+            by_number = np.where(before[:, None], 0.0, by_number)
         groups: list[int] = []
         group_of = []
         for c in range(self._w):
@@ -283,11 +289,18 @@ def followed(
     out = np.empty((*times.shape, len(z)))
     at, largest, pointer = np.array([*span, 0.0]), np.zeros(k), np.zeros(len(times), np.int64)
     left = min(max(LEAST_STEPS, STEPS_PER_SAMPLE * times.shape[1]), MAX_STEPS)
+    portion = int(LOOK_AFTER * left)
     with np.errstate(all="ignore"):
         while True:
             done, steps = kernel.integrate(
-                rhs, z, p, columns, at, n, knots, pieces, sizes, TOLERANCE, left, largest, pointer, times, out
-            )
+                rhs, z, p, columns, at, n, knots, pieces, sizes, TOLERANCE, min(portion, left), largest, pointer,
+                times, out,
+            )  # fmt: skip
+            if done == kernel.TOO_MANY_STEPS and steps > 0 and left > portion:
+                if np.abs(z[:n]).max() > RAN_AWAY * sizes.max():
+                    return None
+                left -= portion
+                continue
             left -= steps
             if done == kernel.STIFF_CHANGES:
                 _stiff_kernel.prepare()
