@@ -880,3 +880,41 @@ def test_a_gain_of_the_wrong_sign_is_passed_through_nought(rng):
     answer = diagnose(equations, run, [terms.coulomb("r"), terms.constant("r")])
     assert answer.verdict == "nothing missing"
     assert all(within(answer, name, v) for name, v in {"k": -6, "l": 6, "e": 0.4, "c": 1.2, "s": 2}.items())
+
+
+def test_few_samples_far_apart_of_a_reaction_whose_way_back_is_missing(rng):
+    """Nine instants, from minutes to hours, of four substances: one of them shows little but what is missing.
+
+    Differences from sample to sample would be the reaction's own: noise is told from divided ones.
+    """
+    time = np.array([0, 1.2, 3.1, 4.9, 7.8, 10.7, 15.0, 22.6, 36.4])
+    course = motion(
+        lambda t, y: [-0.09 * y[0], 0.06 * y[0], 0.03 * y[0] - 0.27 * y[2] + 0.04 * y[3], 0.27 * y[2] - 0.04 * y[3]],
+        [100.0, 0.0, 0.0, 0.0], time,
+    )  # fmt: skip
+    seen = course + 0.1 * rng.standard_normal(course.shape)
+    assert 0.05 < fast_part([y[1:] for y in seen[[2, 3]]], [time[1:]] * 2) < 0.4
+    seen[:, 0] = np.nan
+    run = Run(time, dict(zip("abcd", seen, strict=True)), known={"a": 100.0, "b": 0.0, "c": 0.0, "d": 0.0})
+    equations = Equations(
+        {"a": "-(p + q)*a", "b": "p*a", "c": "q*a - r*c", "d": "r*c"}, {"p": 0.05, "q": 0.035, "r": 0.3}
+    )
+    back = Term("back", {"c": "k*d", "d": "-k*d"}, parameters={"k": Parameter(0.0, lower=0.0)})
+    answer = diagnose(equations, run, [back, terms.sensor_offset("c"), terms.force("a", "-a**2", "second_order")])
+    assert answer.found == ("back",)
+    assert within(answer, "back.k", 0.04)
+
+
+@pytest.mark.parametrize("wrong", [(20, 55), ()])
+def test_single_samples_far_off_are_told(rng, wrong):
+    """A car rolls out; its speed is read once a second, and twice wrongly."""
+    time = np.arange(120.0)
+    speed = motion(lambda t, v: [-0.12 - 3.5e-4 * v[0] ** 2], [33.0], time)[0] + 0.02 * rng.standard_normal(120)
+    speed[list(wrong)] += 4.0
+    answer = diagnose(
+        Equations({"v": "-a"}, {"a": 0.2}, units={"v": "m/s"}), Run(time, {"v": speed}), [terms.quadratic("v")]
+    )
+    assert answer.found == ("quadratic_v",)
+    told = [note for note in answer.notes if "farther off" in note]
+    assert len(told) == bool(wrong)
+    assert all("run1 at 20 s, run1 at 55 s" in note for note in told)

@@ -24,6 +24,8 @@ from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
 
+OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
+HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
 FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
 
 
@@ -76,7 +78,7 @@ class Answer:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the data and on what they do not tell."""
-        return (*self.asked.notes, *self._what_helps_most(), *self._not_white())
+        return (*self.asked.notes, *self._what_helps_most(), *self._not_white(), *self._far_off())
 
     def _what_helps_most(self) -> list[str]:
         """Where no term is named: those that gain most, and what they leave."""
@@ -109,6 +111,25 @@ class Answer:
             f"what is left is as large as the noise but has a memory ({chance}): something smaller is missing besides, "
             "or the noise changes with time"
         ]
+
+    def _far_off(self) -> list[str]:
+        """Single samples that what is left of all others does not reach: they make noise and sigmas too large."""
+        if self.verdict == "unexplained":
+            return []
+        notes = []
+        predicted = self.predicted(self.diagnosis.after)
+        for c, channel in enumerate(self.system.formulas.channels):
+            left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
+            limit = OUTLIER * float(np.nanmedian(np.concatenate(left))) / HALF_WITHIN
+            off = [(s.run, float(t)) for (s, _), r in zip(predicted, left, strict=True) for t in s.time[r > limit]]
+            if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
+                some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")
+                lie = "1 lies" if len(off) == 1 else f"{len(off)} lie"
+                notes.append(
+                    f"{lie} farther off in {channel} than {OUTLIER:.0f} times the scatter of the others ({some}): "
+                    "where the sensor erred, write NaN, and noise and sigmas fall"
+                )
+        return notes
 
     @property
     def found(self) -> tuple[str, ...]:

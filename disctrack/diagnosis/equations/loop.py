@@ -473,7 +473,9 @@ def _with_memory(
     if base is None or not base.converged:
         return None, None, ""
     noise = float(share * size**2)
-    again = diagnose(remembering, base.values, replace(settings, noise=noise), system.training, diagnosis)
+    scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
+    known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
+    again = diagnose(remembering, base.values, known, system.training, diagnosis)
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or remembering), coefficients, text

@@ -11,6 +11,11 @@ from disctrack.diagnosis.engine.system import System, Values, Wrapped
 from disctrack.diagnosis.equations.declared import Samples
 
 _ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them
+ENOUGH_DIFFERENCES, FEWEST_DIFFERENCES = (
+    8,
+    3,
+)  # by which a channel's noise is told, where samples are even and where not
+UNEVEN = 3.0  # of the spacings: nine in ten are no longer than so many times the one in ten that is shortest
 MAX_MEMORY = 24  # samples over which noise may remember
 
 
@@ -22,7 +27,7 @@ def with_noise(samples: Sequence[Samples]) -> list[Samples]:
         if not open_:
             continue
         values = [found[i].data[:, c] for i in open_]
-        sigma = max(fast_part(values), step_of(values) / np.sqrt(12.0))
+        sigma = max(fast_part(values, [found[i].time for i in open_]), step_of(values) / np.sqrt(12.0))
         for i in open_:
             columns = found[i].sigma.copy()
             columns[:, c] = sigma
@@ -30,14 +35,27 @@ def with_noise(samples: Sequence[Samples]) -> list[Samples]:
     return found
 
 
-def fast_part(values: Sequence[Array]) -> float:
-    """Standard deviation of white noise on smooth signals, from differences in time."""
+def fast_part(values: Sequence[Array], times: Sequence[Array] | None = None) -> float:
+    """Standard deviation of white noise on smooth signals, from differences in time.
+
+    times : of the values; few or unevenly spaced ones are differenced as they lie in time
+    """
     estimates, counts = [], []
-    for order in _ORDERS:
-        parts = [np.diff(v, order) for v in values if len(v) > order]
+    present = [np.isfinite(v) for v in values]
+    if times is not None and _sparse(times, present):
+        differences = [
+            [_divided(t[p], v[p], order) for t, v, p in zip(times, values, present, strict=True)] for order in _ORDERS
+        ]
+        fewest = FEWEST_DIFFERENCES
+    else:
+        differences = [
+            [np.diff(v, order) / np.sqrt(comb(2 * order, order)) for v in values if len(v) > order] for order in _ORDERS
+        ]
+        fewest = ENOUGH_DIFFERENCES
+    for parts in differences:
         all_ = np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
-        if len(all_) >= 8:
-            estimates.append(float(np.sqrt(np.mean(all_**2) / comb(2 * order, order))))
+        if len(all_) >= fewest:
+            estimates.append(float(np.sqrt(np.mean(all_**2))))
             counts.append(len(all_))
     # the first order in which no more of the motion is left than its own scatter: higher ones scatter more
     best = next(
@@ -46,6 +64,23 @@ def fast_part(values: Sequence[Array]) -> float:
     )
     size = max((float(np.nanmax(np.abs(v))) for v in values if np.isfinite(v).any()), default=1.0)
     return max(best, 1e-9 * size, 1e-300)
+
+
+def _sparse(times: Sequence[Array], present: Sequence[Mask]) -> bool:
+    """Are there so few values, or so unevenly spaced ones, that differences from sample to sample mean little?"""
+    spacings = [np.diff(t[p]) for t, p in zip(times, present, strict=True) if p.sum() > 1]
+    uneven = any(np.quantile(d, 0.9) > UNEVEN * np.quantile(d, 0.1) for d in spacings)
+    return uneven or sum(len(d) for d in spacings) < ENOUGH_DIFFERENCES + max(_ORDERS)
+
+
+def _divided(time: Array, values: Array, order: int) -> Array:
+    """Divided differences, as large as the noise of one value."""
+    if len(time) <= order:
+        return np.zeros(0)
+    t, y = (np.lib.stride_tricks.sliding_window_view(x, order + 1) for x in (time, values))
+    apart = (t[:, :, None] - t[:, None, :]) / (t[:, -1:, None] - t[:, :1, None]) + np.eye(order + 1)
+    weight = 1.0 / np.prod(apart, axis=2)
+    return np.asarray(np.sum(weight * y, axis=1) / np.linalg.norm(weight, axis=1), float)
 
 
 def step_of(values: Sequence[Array]) -> float:
