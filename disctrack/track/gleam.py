@@ -27,9 +27,10 @@ POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
 OF_CONTRAST = 400  # frames at most that the polynomial is fitted to
 LEAST = 20  # frames
 OUTLYING = 4.0  # robust sigmas
-# Standard deviations of what one term adds to the contrast over the dots' path: the likeliest of these is the prior, so
-# that noise and what the dots leave open shift nothing; and it must be likelier than no gradient by this much
-PRIORS = 10.0 ** np.arange(-4.0, -0.4, 0.5)
+# Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
+# likeliest is the prior, so that noise, and large terms that cancel where the dots are, shift nothing. It must be
+# likelier than no gradient by this much
+PRIORS = (0.01, 0.03, 0.1, 0.3, 1.0)
 LIKELIER = 6.0  # of natural logarithms
 AT_ONCE = 4096  # poses
 
@@ -106,7 +107,7 @@ def _likeliest(A: Array, b: Array) -> tuple[Array, float]:
     best = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ rhs
     noise = max(float(b @ b - rhs @ best) / max(len(b) - 2 * A.shape[1], 1), 1e-14)
     found, likeliest = np.zeros(A.shape[1]), -np.inf
-    for prior in PRIORS:
+    for prior in np.array(PRIORS) * np.sqrt(np.mean(b**2)):
         matrix = np.eye(A.shape[1]) + prior**2 / noise * normal
         coefficients = prior**2 / noise * np.linalg.solve(matrix, rhs)
         likelier = 0.5 * (float(rhs @ coefficients) / noise - float(np.linalg.slogdet(matrix)[1]))
