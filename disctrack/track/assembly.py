@@ -24,7 +24,7 @@ from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, wi
 from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.side_by_side import side_by_side
-from disctrack.track.slips import slips_in_words
+from disctrack.track.slips import LEFT_OUT, delay_of_right, slips_in_words
 from disctrack.track.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
 from disctrack.track.template_pull import Pull
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
@@ -95,6 +95,8 @@ def assemble(
     as_built, faults, outlying = _shared(tables, first.setup, settings, workers)
     fits = _fit_all(tables, as_built, settings.reject_outliers, workers)
     fits, systematic, scatter = _scattered(fits, tables, faults, outlying)
+    seen = fits, tables.pixels, tables.covariance_px2, as_built.rig, as_built.disc.marker_centres_body
+    delay = partial(delay_of_right, *seen, np.flatnonzero(fits.converged))
     fits, verdicts, slips = _judged(fits, tables, as_built, repeated, outlying, taken, workers)
     fits, systematic, as_built, table = _on_the_table(fits, systematic, as_built, settings.table)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
@@ -104,7 +106,9 @@ def assemble(
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    warnings = (*exposure.warnings, *warnings_of(first, faults, scatter, poses, table, trajectory))
+    warnings = (*exposure.warnings, *warnings_of(first, faults, scatter, poses, table, trajectory, delay))
+    if any(LEFT_OUT in text for text in slips):  # which is why each camera is believed alone
+        warnings = tuple(text for text in warnings if not text.startswith(ONE_SIDED))
     return Tracking(
         trajectory=trajectory,
         noise=first.law.noise,

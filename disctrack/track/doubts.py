@@ -1,5 +1,7 @@
 """What a run says about its own result: what makes it worse, and what puts it in question."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calibration.arrays import Array, Mask
@@ -18,6 +20,8 @@ FAULTY = 2.0  # times the noise that residuals must reach before cameras or cloc
 DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
+LATE = 0.9  # share of the square of a misfit that a delay explains, from which on it is its cause
+HARDLY = 0.3  # and below which it has no part in it: what a camera that moved leaves looks a little like one
 SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is worth a word
 ONE_SIDED = "the dots of only one camera make sense"
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
@@ -64,7 +68,7 @@ def off_the_table_in_words(trajectory: Trajectory) -> str:
     return (
         f"{LOWEST_POINT} lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
         f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
-        "this recording, the cameras moved together, or the disc is in the air"
+        "this recording, a camera or both moved since it, or the disc is in the air"
     )
 
 
@@ -100,6 +104,24 @@ def _shaken_in_words(poses: PoseScatter, trajectory: Trajectory) -> str:
     )
 
 
+def _cause_in_words(ahead: float, explained: float, frame_rate: float) -> str:
+    """What makes the two cameras contradict each other in all frames: a delay moves dots as they are fast."""
+    if explained < LATE:
+        lags = "" if explained < HARDLY else ", or one lags"
+        return (
+            f"a camera moved or was refocused since the calibration{lags} (a delay between the two would explain "
+            f"{100 * explained:.0f} % of it). disctrack diagnose tells which and by how much; calibrate again"
+        )
+    early, late = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
+    told = f"{abs(ahead):.2f} frames ({1e3 * abs(ahead) / frame_rate:.2f} ms)"
+    whole = round(abs(ahead))
+    again = f": number its images higher by {whole}" if whole and abs(abs(ahead) - whole) < 0.1 * whole else ""
+    return (
+        f"the {early} camera is {told} ahead of the {late} one, which explains {100 * explained:.0f} % of it{again}. "
+        "Check the synchronisation; disctrack diagnose measures a constant delay"
+    )
+
+
 def warnings_of(
     follower: Follower,
     faults: SharedFaults | None,
@@ -107,8 +129,12 @@ def warnings_of(
     poses: PoseScatter,
     table: TableFromDisc | None,
     trajectory: Trajectory,
+    delay: Callable[[], tuple[float, float]],
 ) -> tuple[str, ...]:
-    """One sentence each."""
+    """One sentence each.
+
+    delay : frame periods by which the right camera is ahead, and the share of the dots' misfit that this explains
+    """
     warnings = []
     own = scatter.whole if faults is None else max(1.0, faults.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
@@ -135,8 +161,7 @@ def warnings_of(
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
         warnings.append(
             f"{MISFIT} by {np.sqrt(scatter.whole / own):.1f} times their own "
-            f"scatter ({systematic_px:.3f} px): a camera moved, was refocused or lags since the calibration. "
-            "disctrack diagnose tells which; calibrate again, or check the synchronisation"
+            f"scatter ({systematic_px:.3f} px): {_cause_in_words(*delay(), trajectory.frame_rate)}"
         )
     elif scatter.noise > 4.0:
         warnings.append(
@@ -151,7 +176,8 @@ def warnings_of(
         warnings.append(
             f"{LOWEST_POINT} does not roll on the board's table: {table.sentence}. They differ by more than "
             "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
-            "is, the cameras moved together since the table view, or a long exposure is not declared (exposure_us)"
+            "is, a camera moved up or down by about twice as much since the calibration (or both together), or a long "
+            "exposure is not declared (exposure_us)"
         )
     if off := off_the_table_in_words(trajectory):
         warnings.append(off)

@@ -5,6 +5,7 @@ To first order they are displaced by their velocity in the image times the delay
 makes up for is no sign of it.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -20,6 +21,7 @@ from disctrack.track.pose import PoseFits, marker_pixels, whitening
 SHORTEST = 4  # frames: a gleam or a hand is told by the frames' own status
 LEFT_OUT = "it left out"
 REFUSED = "are refused: the dots of the two cameras contradict each other"
+THROUGHOUT = 3  # stretches with one and the same delay
 EXPLAINED, TOLD = 0.9, 0.5  # of the square of the misfit: by a slip; or by no delay at all, below
 
 
@@ -49,11 +51,18 @@ def slips_in_words(
             slips[-1][2].append(delay)
         else:
             slips.append((list(range(first, end)), ahead, [delay]))
+    gap = 0  # frames
+    # images that are left out one after the other add up: where the same number is missing again and again, the frames
+    # between, few of them measured by both cameras, only happen to agree
+    if len(slips) >= THROUGHOUT and len({ahead for _, ahead, _ in slips}) == 1:
+        gap = max(after[0][0] - before[0][-1] for before, after in itertools.pairwise(slips))
+        rows, told = [i for part, _, _ in slips for i in part], [delay for _, _, part in slips for delay in part]
+        slips = [(rows, slips[0][1], told)]
     said = []
     for k, (rows, ahead, delays) in enumerate(slips):
         camera, other = CAMERAS[::-1] if ahead > 0 else CAMERAS
         always = k == 0 and (
-            rows[0] == 0 or (rows[0] >= SHORTEST and _as_late(delay_of, np.arange(rows[0]), ahead, fits))
+            rows[0] <= gap or (rows[0] >= SHORTEST and _as_late(delay_of, np.arange(rows[0]), ahead, fits))
         )
         said.append(
             f"frames {ranges([pairs[i] for i in rows])} {REFUSED}, as if the {camera} camera were "
@@ -96,6 +105,8 @@ def delay_of_right(
         _, J = marker_pixels(fits.R_world_body[i : i + 1], fits.t_world_body[i : i + 1], rig, centres)
         W = whitening(covariance_px2[i][seen])
         tangent = (W @ J[0][seen]).reshape(-1, 6)
+        if not np.isfinite(tangent).all():  # a pose that ran away
+            continue
         r, v = ((W @ part[seen][..., None]).reshape(-1) for part in (residual, velocity))
         r, v = (part - tangent @ np.linalg.lstsq(tangent, part, rcond=None)[0] for part in (r, v))
         top, between, bottom = top + r @ r, between + r @ v, bottom + v @ v

@@ -49,7 +49,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
-NO_TOLERANCE = 1e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
+NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
 PAIRS_TRIED = 12  # where no disc is found, for what else is wrong: some more than the refinement of a rig takes
 STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction

@@ -220,8 +220,20 @@ def test_a_camera_turned_a_little_is_one_fault_and_not_a_trembling_table_too(cli
     dR = frames.rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.8, 0.0]))
     rig = replace(clip.rig, R_right_left=dR @ clip.rig.R_right_left, t_right_left=dR @ clip.rig.t_right_left)
     found = measure(clip.images, rig, clip.disc)
-    assert any("a camera moved, was refocused or lags" in text for text in found.warnings)
+    assert any("a camera moved or was refocused since the calibration (a delay" in text for text in found.warnings)
     assert not any("trembles" in text for text in found.warnings)
+
+
+@pytest.mark.parametrize(("late", "early"), [("left", "right"), ("right", "left")])
+def test_cameras_that_are_one_frame_out_of_step_are_named_and_no_camera_has_moved(clip, late, early):
+    first, second = (slice(None, -1), slice(1, None)) if late == "left" else (slice(1, None), slice(None, -1))
+    images = np.stack([clip.images[first, 0], clip.images[second, 1]], axis=1)
+    told = " ".join(measure(images, clip.rig, clip.disc).doubts)
+    found = re.search(rf"the {early} camera is ([0-9.]+) frames \([0-9.]+ ms\) ahead of the {late} one", told)
+    assert found, told
+    assert abs(float(found[1]) - 1.0) < 0.05
+    assert "number its images higher by 1" in told
+    assert "moved" not in told
 
 
 def test_no_camera_is_said_to_have_moved_where_none_did(clip):
