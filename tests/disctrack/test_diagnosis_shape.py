@@ -1,5 +1,6 @@
 """The exponent or scale of a law that was found is measured where the recording determines it, and only there."""
 
+import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose, diagnose_trajectory
@@ -7,6 +8,8 @@ from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.disc.motion import motion_candidates
 from disctrack.diagnosis.engine.fit import fit
 from disctrack.diagnosis.engine.shape import profiled, refine_shapes
+from disctrack.diagnosis.trials.hidden_effects import hidden_effect
+from disctrack.diagnosis.trials.rates import draw, together, trajectory_of
 from tests.oracles.measured_disc import measured
 
 
@@ -57,3 +60,27 @@ def test_the_pivoting_rate_at_which_creep_begins_is_measured():
     fit_ = result.after_fit
     assert abs(fit_.values["pivoting_contensou.omega_s"] - 4.0) < 4 * fit_.sigma("pivoting_contensou.omega_s")
     assert "pivoting_contensou.a" not in fit_.names  # without slip its radius does nothing
+
+
+@pytest.mark.slow
+def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
+    """The flat's place has to be looked for, and only an effect that stands in for it is met by the search."""
+    rng = np.random.default_rng([2014, 32])
+    planted = together([hidden_effect("rim_flat").plant(1e-5, rng), hidden_effect("distortion").plant(0.05, rng)])
+    trajectory = trajectory_of(draw(2014, planted, 500.0), planted)
+    model = declared_model(trajectory).model
+    every = {c.name: c for c in DiscSystem(trajectory, model).candidates}
+
+    def found(*names):
+        system = DiscSystem(trajectory, model, tuple(every[name] for name in names))
+        diagnosis = diagnose(system, system.start())
+        assert {f.candidate.name for f in diagnosis.found} == {"right_distortion", "inertia_product"}
+        return refine_shapes(system, diagnosis)[0]
+
+    answer = found("right_distortion", "inertia_product", "rim_flat")
+    assert [f.candidate.name for f in answer.found] == ["right_distortion", "rim_flat"]
+    for name, true in (("rim_flat.depth", 1e-5), ("rim_flat.width", 0.15), ("right_distortion.k1", -0.05)):
+        assert abs(answer.after.values[name] - true) < 3 * answer.after.sigma(name)
+    without = found("right_distortion", "inertia_product")  # noise is left there, too
+    assert [f.candidate.name for f in without.found] == ["right_distortion", "inertia_product"]
+    assert answer.after.cost < without.after.cost - 30.0

@@ -16,7 +16,7 @@ from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, fit
 from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.score import Linearisation, score
-from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
+from disctrack.diagnosis.engine.search import CLASS_GAIN, FAINT, Diagnosis, Found, Tried
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System, TrialGivenUp, hurried
 
 MAX_TRIALS = 24  # values of a shape at which the rest is refitted
@@ -161,6 +161,30 @@ def _second_trial(system: System, diagnosis: Diagnosis) -> Diagnosis:
             continue
         if answer is not None and _length(system, answer) < chosen:
             best, chosen = answer, _length(system, answer)
+    return _with_one_looked_for(system, diagnosis, best)
+
+
+def _with_one_looked_for(system: System, diagnosis: Diagnosis, best: Diagnosis) -> Diagnosis:
+    """An effect whose place has to be looked for in that of one of several, if that is the shorter answer; else `best`.
+
+    At its null such an effect has no derivative, so that the search never meets it. Beside another effect, a faint one
+    that a flat of the rim makes is an inertia's or a pattern's off centre.
+    """
+    if diagnosis.verdict != "found" or len(diagnosis.found) < 2:
+        return best
+    taken = {f.candidate.name for f in diagnosis.found}
+    for found in diagnosis.found:
+        if found.candidate.kind != "motion" or found.gain > FAINT:
+            continue
+        kept = tuple(f for f in diagnosis.found if f is not found)
+        for candidate in system.candidates:
+            if not candidate.sought or candidate.name in taken:
+                continue
+            with suppress(TrialGivenUp):
+                answer = _with_free_shape(system, diagnosis, candidate, kept)
+                # of two that describe the same, the one that needed no looking for
+                if answer is not None and _length(system, answer) < _length(system, best) - CLASS_GAIN:
+                    best = answer
     return best
 
 
@@ -185,8 +209,14 @@ def _started(system: System, base: Fit, candidate: Candidate, shape: dict[str, f
     return fit(system, (*base.quantities, *candidate.quantities), base.values | shape, MAX_STARTED)
 
 
-def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate) -> Diagnosis | None:
+def _with_free_shape(
+    system: System, diagnosis: Diagnosis, candidate: Candidate, kept: tuple[Found, ...] = ()
+) -> Diagnosis | None:
+    """The answer with this effect and its shape in place of all that was found but for `kept`; None if it is none."""
     base, before = diagnosis.before, diagnosis.held_out_before
+    if kept:
+        base = _without_others(system, diagnosis, kept)
+        before = _held_out(system, diagnosis, base)
     starts = [dict(zip(_names(candidate.shape), s, strict=True)) for s in system.starts(candidate, base.values)]
     fits = []
     for shape in starts or _grid(candidate):
@@ -197,7 +227,8 @@ def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate)
     system = hurried(system, ALONG)
     first = min(fits, key=lambda f: f.cost)
     excess = [f.chi_square / diagnosis.noise - f.degrees_of_freedom for f in (base, first)]
-    if not excess[1] < WORTH_A_SHAPE * excess[0]:
+    # beside others little may exceed the noise: there it is to describe more than what it stands in for
+    if not (first.cost < diagnosis.after.cost if kept else excess[1] < WORTH_A_SHAPE * excess[0]):
         return None
     expected = {q.name: _first_order(system, first, q) for q in candidate.shape}
     free = tuple(q for q in candidate.shape if np.isfinite(expected[q.name]))
@@ -222,7 +253,7 @@ def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate)
         Tried(t.candidate, t.score, float(gain), float(held_gain), "chosen, with its shape free")
         if t.candidate.name == candidate.name
         else replace(t, reason="explains less than the law that was chosen")
-        if t.reason == "chosen"
+        if t.reason == "chosen" and t.candidate.name not in {f.candidate.name for f in kept}
         else t
         for t in diagnosis.tried
     )
@@ -230,9 +261,17 @@ def _with_free_shape(system: System, diagnosis: Diagnosis, candidate: Candidate)
         diagnosis,
         verdict="found",
         reason=reason,
-        found=(found,),
+        found=(*kept, found),
         after=fitted,
         held_out_after=held,
         tried=tried,
         partial=(),
     )
+
+
+def _without_others(system: System, diagnosis: Diagnosis, kept: Sequence[Found]) -> Fit:
+    """The fit with these of the effects that were found, and without the others."""
+    quantities = {q.name: q for q in diagnosis.before.quantities}
+    quantities |= {q.name: q for f in kept for q in f.candidate.quantities}
+    null = {q.name: q.null for f in diagnosis.found for q in f.candidate.quantities if q.name not in quantities}
+    return fit(system, tuple(quantities.values()), diagnosis.after.values | null)
