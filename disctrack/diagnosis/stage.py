@@ -262,7 +262,9 @@ def _beyond_the_catalogue(
     law = replace(law, rivals=_rivals(best, [a for a in answers if a is not best], diagnosis, explained))
     judged = _judged(diagnosis, system)
     saved = known - best.length
-    if not (fitted.converged and saved > 0) or _one_alone_does(plain, diagnosis, of_motion, best):
+    # of two that are as good, what is known; a sum of known effects, or one that was looked for, has no such credit
+    enough = ALIKE if explained and of_motion and len(diagnosis.found) == 1 and not looked_for else 0.0
+    if not (fitted.converged and saved > enough) or _one_alone_does(plain, diagnosis, of_motion, best):
         return None, (), _also(diagnosis, law, fitted)
     rows = training_rows(system, diagnosis.settings.train_fraction)
     held = held_out(judged, fitted.quantities, fitted.values, rows)
@@ -413,7 +415,8 @@ def _rivals(
             rivals.append((replace(other.law, values=other.fit.values), share))
             rivals += [(law, share * its) for law, its in other.law.rivals]
     if explained:
-        rivals.append((replace(best.law, values=diagnosis.after.values), odds(diagnosis.after)))
+        nothing = replace(best.law, families=(), values=diagnosis.after.values)  # beside known effects
+        rivals.append((nothing, odds(diagnosis.after)))
     return tuple((law, share) for law, share in rivals if share > UNLIKELY)
 
 

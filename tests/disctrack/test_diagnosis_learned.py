@@ -227,3 +227,20 @@ def test_a_law_that_a_found_effect_describes_alone_is_that_effect(monkeypatch, a
     if asked:
         fit_ = result.after_fit
         assert abs(fit_.values["table_tilt.tilt_x"] - 2e-3) < 3 * fit_.sigma("table_tilt.tilt_x")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("credit", [stage.ALIKE, 0.0])
+def test_a_law_that_describes_no_more_than_a_known_effect_is_told_beside_it(monkeypatch, credit):
+    """A weak spring: over so short a way a tilted table, and a force of constant size in one number less.
+
+    Control: where what is known has no credit, a law "that the catalogue does not name" is ahead by 0.65 of chi-square.
+    """
+    monkeypatch.setattr(stage, "ALIKE", credit)
+    options = {"nutation_deg": 0.5, "n": 150, "theta_deg": 10.0, "omega3": 1.0, "declared_rate": 500.0}
+    result = diagnose_trajectory(measured({"spring.k": 0.05}, seed=11, rig_seed=5, **options), separate=False)
+    assert (result.learned is None) == bool(credit)
+    if credit:
+        (found,) = result.diagnosis.found
+        assert "spring" in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
+        assert any("a single law beside the catalogue describes the data too" in note for note in result.notes)

@@ -114,7 +114,7 @@ def test_a_sum_or_a_law_with_rivals_of_another_form_is_taken_for_another_s():
     assert form_misfit.form_is_another(alone) == form_misfit.SELDOM
     assert form_misfit.form_is_another(law(("angle", "M_n"), ("hum", "X_n"))) == 1.0
     assert form_misfit.form_is_another(alone, {"kz"}) == 1.0
-    for rival in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n"))):
+    for rival in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n")), law()):  # the last: known effects alone
         assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=[(rival, 1.0)])) == pytest.approx(0.5)
     same = [(law(("angle", "M_n")), 1.0)]  # a variation of the same idea, whose course is in the sigma anyway
     assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=same)) == form_misfit.SELDOM

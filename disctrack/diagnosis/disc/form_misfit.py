@@ -134,7 +134,8 @@ def form_is_another(law: LearnedLaw, beside: Collection[str] = ()) -> float:
     """
     if len(law.families) + len(beside) > 1:
         return 1.0
-    others = sum(odds for rival, odds in law.rivals if not _kinds(rival) <= _kinds(law))
+    own = _kinds(law)
+    others = sum(odds for rival, odds in law.rivals if not rival.families or not _kinds(rival) <= own)
     return max(SELDOM, others / (1.0 + others))
 
 
