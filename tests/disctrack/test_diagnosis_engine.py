@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
 from disctrack.diagnosis.engine.fit import compress, fit, solve_bounded, triangle
 from disctrack.diagnosis.engine.held_out import held_out, training_rows
 from disctrack.diagnosis.engine.score import Linearisation, angle, score_all
+from disctrack.diagnosis.engine.search import _Search
 from disctrack.diagnosis.engine.system import GivenUp, TrialGivenUp
 from disctrack.diagnosis.engine.whiteness import ljung_box, no_memory, whiteness
 
@@ -375,3 +377,18 @@ def test_a_fit_that_crawls_is_ended_only_where_it_must_not_crawl():
     assert not not_so.converged
     assert patient.n_iterations == 30
     assert not_so.n_iterations == 3
+
+
+@pytest.mark.parametrize(("ahead", "worth"), [((40.0, 15.0), True), ((40.0, 60.0), False), ((4000.0, 60.0), True)])
+def test_what_rests_while_it_is_kept_back_does_not_speak_against_a_name(ahead, worth):
+    """Chi-square of 1000 fitted and 100 kept samples before and after: little is at stake where nothing moves."""
+    search = object.__new__(_Search)
+    search.noise, search.settings = 1.0, Settings()
+    trials = [
+        SimpleNamespace(
+            fit=SimpleNamespace(chi_square=c, degrees_of_freedom=1000, reduced_chi_square=c / 1000, n_data=1000),
+            held_out=SimpleNamespace(chi_square=100 + h, expected=100.0, n_data=100),
+        )
+        for c, h in zip((11_000.0, 1_400.0), ahead, strict=True)
+    ]
+    assert search._worth_naming(*trials) is worth

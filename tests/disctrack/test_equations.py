@@ -918,3 +918,39 @@ def test_single_samples_far_off_are_told(rng, wrong):
     told = [note for note in answer.notes if "farther off" in note]
     assert len(told) == bool(wrong)
     assert all("run1 at 20 s, run1 at 55 s" in note for note in told)
+
+
+@pytest.mark.parametrize("friction", [1.2, 0.0])
+def test_a_friction_that_stops_an_arm_is_led_to_over_growing_windows(rng, friction):
+    """Under a sensor that wanders a little; from a motion without friction no step leads to one that stops."""
+    time = np.arange(0, 9, 0.015)
+    x = motion(
+        lambda t, y: [y[1], -49 * y[0] - 0.6 * y[1] - friction * np.tanh(y[1] / 1e-3)], [0.5, 0.0], time[:360]
+    )[0]  # fmt: skip
+    x = np.concatenate([x, np.full(240, x[-1])]) if friction else 0.5 * np.exp(-0.3 * time) * np.cos(7 * time)
+    run = Run(time, {"x": x + 1e-3 * np.sin(2 * time) + 1e-4 * rng.standard_normal(600)}, sigma=1e-4)
+    answer = diagnose(
+        Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 45.0, "c": 0.5}), run, [terms.coulomb("v"), terms.constant("v")]
+    )
+    assert answer.verdict == "unexplained"
+    assert answer.found == (("coulomb_v",) if friction else ())
+
+
+def test_a_long_motion_goes_on_where_it_was_looked_at(monkeypatch):
+    """In a tenth of the steps it is asked whether it ran away; what did is given up there."""
+    time = np.arange(0, 400.0, 1.0)
+    run = Run(time, {"x": np.cos(10 * time)}, sigma=1.0)
+    system = EquationSystem(
+        formulas(Equations({"x": "v", "v": "-w**2*x"}, {"w": 10.0}), (), {"x": "x"}),
+        loop.with_noise(checked(Equations({"x": "v", "v": "-w**2*x"}, {"w": 10.0}), [run])), np.array([1.0, 10.0]), {},
+    )  # fmt: skip
+    values = {"state.x[run1]": 1.0, "state.v[run1]": 0.0}
+    seen = []
+    for share in (1.0, 0.013):
+        monkeypatch.setattr("disctrack.diagnosis.equations.system.LOOK_AFTER", share)
+        seen.append(system.linearise(values, ["w", "state.x[run1]"]))
+    for whole, in_portions in zip(*seen, strict=True):
+        assert_allclose(in_portions, whole, rtol=0, atol=1e-6 * np.abs(whole).max())
+    assert_allclose(seen[0][0][:-1, 0], 0.0, atol=1e-6)
+    monkeypatch.setattr("disctrack.diagnosis.equations.system.RAN_AWAY", 0.5)
+    assert system.predictions(values) == [None]

@@ -37,6 +37,7 @@ OBVIOUS = 5.0  # times the gain that noise alone does not reach
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
+NOT_CONVERGED = "its refit does not converge"
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
 SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
@@ -590,7 +591,7 @@ class _Search:
             bound = "" if found else _bounds(score)
             return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}{bound}"
         if trial and not trial.fit.converged:
-            return "its refit does not converge"
+            return NOT_CONVERGED
         if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
             return "the free run over held-out data does not improve"
         than_chosen = "less than what was chosen" if found else "too little of what is missing"

@@ -13,7 +13,16 @@ from scipy.linalg import qr
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, compress, fit, solve_bounded
 from disctrack.diagnosis.engine.held_out import held_out
-from disctrack.diagnosis.engine.search import CLASS_GAIN, Diagnosis, Found, Rival, Settings, Tried, diagnose
+from disctrack.diagnosis.engine.search import (
+    CLASS_GAIN,
+    NOT_CONVERGED,
+    Diagnosis,
+    Found,
+    Rival,
+    Settings,
+    Tried,
+    diagnose,
+)
 from disctrack.diagnosis.engine.shape import refine_shapes
 from disctrack.diagnosis.engine.significance import wald
 from disctrack.diagnosis.engine.system import Quantity, System
@@ -45,6 +54,7 @@ ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is lef
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 PATIENCE = 60.0  # [s] of a search without a word
 ENOUGH_A_TURN = 40  # samples of a turn: more of them tell little more than the noise of each
+MOST_LED = 2  # terms with which a fit is led anew over growing windows
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
@@ -186,10 +196,29 @@ def _searched(
         share = len(system.candidates) / (len(system.candidates) + scans)
         settings = replace(settings, false_alarm=settings.false_alarm * share)
     diagnosis = diagnose(system, values, settings, system.training)
+    if (anew := _led_with_terms(system, diagnosis)) is not None:
+        diagnosis = diagnose(system, diagnosis.before.values, settings, system.training, anew)
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
     return sharper, diagnose(sharper, diagnosis.before.values, settings, sharper.training, diagnosis)
+
+
+def _led_with_terms(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis | None:
+    """A better description with a term whose refit did not converge: led to it over growing windows; None: none is.
+
+    Of an arm that friction stops, no step leads from a motion that goes on for ever to the instant at which it stops.
+    """
+    if diagnosis.verdict != "unexplained" or diagnosis.found:
+        return None
+    stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
+    best, lowest = None, (diagnosis.nearest or diagnosis.before).cost
+    for t in sorted(stuck, key=lambda t: -t.score)[:MOST_LED]:
+        promoted = system.with_(promoted=(*system.promoted, t.candidate.name))
+        fitted = fit(promoted, promoted.base, led(promoted, guessed(system)[0]).values)
+        if fitted.converged and fitted.cost < lowest:
+            best, lowest = replace(diagnosis, partial=(t.candidate,), nearest=fitted), fitted.cost
+    return best
 
 
 def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
