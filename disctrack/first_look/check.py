@@ -24,7 +24,7 @@ from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.readers.blocks import PairBlock, iter_pair_blocks
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.dots import locate_on_disc
-from disctrack.track.doubts import LOWEST_POINT, MISFIT
+from disctrack.track.doubts import LIE_OFF, LOWEST_POINT, MISFIT
 from disctrack.track.own_scatter import without_shared_faults
 from disctrack.track.stage import ImagePairs, check_rig, open_pairs
 from disctrack.track.summary import left_out
@@ -234,7 +234,10 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
     )
     for kind, text in (told | doubts).items():
         if not (out_of_step and text.startswith(OF_A_LAG)):
-            seen.say(*(("fix", "cameras") if kind in doubts else ("look", "physics")), text)
+            declared = text.startswith((LIE_OFF, LOWEST_POINT))
+            seen.say(
+                *(("fix", "declaration" if declared else "cameras") if kind in doubts else ("look", "physics")), text
+            )
 
 
 def _without_numbers(text: str) -> str:

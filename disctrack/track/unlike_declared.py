@@ -4,6 +4,7 @@ One camera alone numbers the dots, on any scale and of any size. What both see o
 the rig, to some 0.2 mm: enough to say which declared number is wrong, and what it should be.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +47,16 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
 
     pair : (2, height, width), images of the left and the right camera
     """
-    seen = _seen_dots(pair, rig, disc)
-    if seen is None:
+    several = list(_seen_dots(pair, rig, disc))
+    if not several:
         return ""
+    seen = max(several, key=lambda found: found.which.sum())
     if abs(np.log(seen.scale)) > SIDE_TOLERANCE:
         return _scale_in_words(seen.scale)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
-    diameter = disc.marker_diameter * float(np.median(np.sqrt(seen.areas / _areas(seen, R, rig, disc))))
+    # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
+    sizes = [np.median(np.sqrt(found.areas / _areas(found, R, rig, disc))) for found in several]
+    diameter = disc.marker_diameter * float(np.median(sizes))
     if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
         return f"[markers] diameter_mm is about {1e3 * diameter:.2g}, not {1e3 * disc.marker_diameter:g}"
     if not seen.which.all() or seen.misfit_px > MEETING_PX:
@@ -61,7 +65,8 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
     return misplaced_in_words(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
 
 
-def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> SeenDots | None:
+def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
+    """By the searches for blobs of several sizes, as far as they find dots."""
     for diameter in DOT_DIAMETERS_PX:
         blobs = np.stack([seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)])
         which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
@@ -74,8 +79,7 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> SeenDots | None:
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
-            return SeenDots(which, points, blobs[:, which, 2], scale, misfit)
-    return None
+            yield SeenDots(which, points, blobs[:, which, 2], scale, misfit)
 
 
 def _distances(points: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
