@@ -228,7 +228,7 @@ FAULTS = {
     "gravity in mm": (lambda f: declare(f, "g_m_s2 = 9.81", "g_m_s2 = 9810.0"), "if it was given in mm/s^2", 1),
     "wrong square": (lambda f: declare(f, "square_mm = 6.0", "square_mm = 6.1"), "square_mm = 6.1 would be 6;", 1),
     "short side first": (lambda f: declare(f, "[9, 6]", "[6, 9]"), "would be [9, 6]", 1),
-    "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "lowest point", 0),
+    "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "lowest point", 1),
     "cameras exchanged": (
         lambda f: declare(declare(f, 'left = "left/', 'left = "_') or f, 'right = "right/', 'right = "left/')
         or declare(f, 'left = "_', 'left = "right/'), "left and right are exchanged", 1,
