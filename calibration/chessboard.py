@@ -16,6 +16,8 @@ from calibration.grey_levels import level_step
 
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
 MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
+LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
+MOST_UNEVEN = 1.6  # a square to the next one: perspective and lenses stay below 1.3, a line passed over gives 2
 MOST_FURTHER = 3  # lines of corners beyond those declared that are counted: straight on, whatever the perspective
 MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
 
@@ -65,7 +67,32 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
             f"no board of {columns} x {rows} inner corners: it must be wholly in view with a light rim round it, "
             "and the counts must be those of the INNER corners"
         )
-    values = np.ascontiguousarray(grey, dtype=np.float64)
+    view = _view_at(start, np.ascontiguousarray(grey, dtype=np.float64), inner_corners)
+    return view if isinstance(view, BoardNotFound) else in_file_units(view, step, notes)
+
+
+def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
+    """Inner corners (long side, short side) of the whole chessboard in an image of grey values, of whatever size.
+
+    thorough : OpenCV's exhaustive search, 0.3 s for 1280 x 720; without it parts of a board are often all it sees
+    """
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | (cv2.CALIB_CB_EXHAUSTIVE if thorough else 0)
+    stretched = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+    found, corners, squares = cv2.findChessboardCornersSBWithMeta(stretched, (3, 3), flags)
+    if not found or squares is None or squares.size < LEAST_CORNERS:
+        return None
+    rows, columns = squares.shape[:2]
+    points = np.asarray(corners, np.float64).reshape(rows, columns, 2)
+    if rows > columns:
+        rows, columns, points = columns, rows, points.transpose(1, 0, 2)
+    if not _even(points):
+        return None
+    view = _view_at(points.reshape(-1, 2), np.ascontiguousarray(grey, dtype=np.float64), (columns, rows))
+    return None if isinstance(view, BoardNotFound) else (columns, rows)
+
+
+def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> CornerView | BoardNotFound:
+    """The view whose corners lie within about a pixel of `start` (n, 2), in any of the board's orders."""
     rough = _orient(start, values, inner_corners)
     if isinstance(rough, BoardNotFound):
         return rough
@@ -76,9 +103,7 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
             f"or bent, or {inner_corners[0]} x {inner_corners[1]} is not the number of its inner corners"
         )
     beyond = _larger_board(values, view, inner_corners)
-    if beyond:
-        return BoardNotFound(beyond)
-    return in_file_units(view, step, notes)
+    return BoardNotFound(beyond) if beyond else view
 
 
 def in_file_units(view: CornerView, step: int, notes: tuple[str, ...]) -> CornerView:
@@ -104,8 +129,10 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(grey, inner_corners, None, flags)
+    found = found and _even(corners.reshape(*inner_corners[::-1], 2))
     if not found and thorough:
         found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
+        found = found and _even(corners.reshape(*inner_corners[::-1], 2))
     if not found and thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
         finer = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
         found, corners = cv2.findChessboardCorners(finer, inner_corners, None, flags)
@@ -118,6 +145,15 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
         return None
     points = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     return points if len(points) == inner_corners[0] * inner_corners[1] else None
+
+
+def _even(grid: NDArray) -> bool:
+    """Whether no line of corners (rows, columns, 2) was passed over: finders take a part of a board for all of it."""
+    for along in (grid, grid.swapaxes(0, 1)):
+        step = np.median(np.linalg.norm(np.diff(along, axis=0), axis=-1), axis=1)
+        if len(step) > 1 and (np.abs(np.diff(np.log(np.maximum(step, 1e-9)))) > np.log(MOST_UNEVEN)).any():
+            return False
+    return True
 
 
 def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Array | BoardNotFound:
@@ -203,4 +239,4 @@ def _crosses(grey: Array, line: Array, axes: Array, least: float) -> bool:
     return bool(np.mean(np.maximum(saddle, opposite) > least) > 0.7)
 
 
-__all__ = ["BoardNotFound", "CornerView", "board_orders", "find_corners", "grey_values"]
+__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values"]

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
-from calibration.chessboard import SEARCH_SIZE, BoardNotFound, CornerView, find_corners, grey_values
+from calibration.chessboard import SEARCH_SIZE, BoardNotFound, CornerView, board_in, find_corners, grey_values
 from calibration.stereo import Progress, located
 from disctrack.calibrate.dot_target import DotView, find_dots, on_common_lattice
 
 TargetView = CornerView | BoardNotFound
 VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's
-LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
 LEAST_VIEWS = 2  # that must show the whole board
+SIZES_TRIED = 3  # of those that several images seem to show
+COMMON_SIZE = (9, 6)  # asked for where no size is seen: OpenCV's own board
 REFUSED_TRIED = 4  # images without the declared board in which another is looked for, a quarter of a second each
 
 
@@ -55,21 +56,26 @@ def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[t
 
     largest : [px] larger images are reduced to that: OpenCV's search takes 0.3 s at 800 x 600, 5.5 s at 4000 x 3000
     """
-    counts: Counter[tuple[int, int]] = Counter()
-    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
     greys = [_reduced(grey_values(image)[0], largest) for image in images]
-    for grey in greys:
-        stretched = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
-        found, _, squares = cv2.findChessboardCornersSBWithMeta(stretched, (3, 3), flags)
-        if found and squares is not None and squares.size >= LEAST_CORNERS:
-            short, long = sorted(squares.shape[:2])
-            counts[long, short] += 1
-    # part of a board is often taken for one: of sizes seen twice the largest, and then what `calibrate` itself finds
-    for size, _ in sorted(counts.items(), key=lambda item: (item[1] < LEAST_VIEWS, -item[0][0] * item[0][1])):
-        seen = sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in greys)
-        if seen >= min(LEAST_VIEWS, len(images)):
-            return size, seen
-    return None, 0
+    seen: dict[tuple[int, int], int] = {}
+    for thorough in (False, True):
+        sizes = [board_in(grey, thorough) for grey in greys]
+        counts = Counter(size for size in sizes if size)
+        often = [size for size, n in counts.most_common(SIZES_TRIED) if n >= LEAST_VIEWS] or list(counts)[:SIZES_TRIED]
+        # a shadow hides a line of the board, a rim passes for one more: the whole board is what most corners are on
+        seen |= {size: counts[size] + _found(size, greys, sizes) for size in often}
+        if 2 * max(seen.values(), default=0) >= len(images):
+            break
+    else:
+        seen.setdefault(COMMON_SIZE, _found(COMMON_SIZE, greys, sizes))
+    best = max(seen, key=lambda size: seen[size] * size[0] * size[1])
+    return (best, seen[best]) if seen[best] >= min(LEAST_VIEWS, len(images)) else (None, 0)
+
+
+def _found(size: tuple[int, int], greys: Sequence[NDArray], sizes: Sequence[tuple[int, int] | None]) -> int:
+    """How many images of another size, or of none, show a board of this one where it is asked for."""
+    others = [grey for grey, found in zip(greys, sizes, strict=True) if found != size]
+    return sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in others)
 
 
 def _reduced(grey: NDArray, largest: int) -> NDArray:

@@ -93,9 +93,12 @@ def look_into(folder: Path) -> FolderContent:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
         notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
     if frames is views:
+        columns, rows = inner_corners or (9, 6)
         raise RecordingError(
             f"{folder}: {frames.left.pattern} and {frames.right.pattern} show a chessboard, and nothing else is there. "
-            "Give the folder that holds the recording, with the chessboard views in a folder inside it."
+            "Put the cameras' frames of the disc beside them. The cameras alone: disctrack calibrate "
+            f"--left '{folder / frames.left.pattern}' --right '{folder / frames.right.pattern}' "
+            f"--corners {columns}x{rows} --square-mm SIDE -o rig.h5"
         )
     left, right = frames.left.open(folder), frames.right.open(folder, "right")
     rate, source = _frame_rate(left, right)

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import BoardNotFound, CalibrationError, CornerView
+from calibration import BoardNotFound, CalibrationError, CornerView, chessboard
 from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target, target_of
 from calibration.camera import Camera
 from calibration.charuco import find_charuco
 from disctrack.calibrate import targets
 from disctrack.calibrate.circles import find_circles
 from disctrack.calibrate.stage import calibrate_recording
-from disctrack.calibrate.targets import other_board
+from disctrack.calibrate.targets import board_size, other_board
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
 
@@ -316,6 +316,37 @@ def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_decl
     blank = np.random.default_rng(2).integers(0, 255, image.shape).astype(np.uint8)
     # the images in which the declared board is are not looked at, and most of them having it is enough
     assert not other_board([image] * 4 + [blank] * 5, [found] * 4 + [refused] * 5, Board((10, 7), 8e-3))
-    assert len(searched) == 8
+    assert len(searched) == 12  # four quickly, and again thoroughly
     assert not other_board([image] * 12, [found] * 7 + [refused] * 5, Board((10, 7), 8e-3))
-    assert len(searched) == 8
+    assert len(searched) == 12
+
+
+@pytest.mark.parametrize(
+    ("sizes", "chosen"),
+    [
+        (9 * [(9, 6)] + 3 * [(9, 7)], (9, 6)),  # the rim passes for one more line in a few
+        (3 * [(8, 6)] + 4 * [(9, 6)] + 5 * [None], (9, 6)),  # a hand on the board in some
+        (12 * [None], None),
+        (11 * [None] + [(10, 6)], None),  # seen once
+    ],
+)
+def test_the_board_is_the_size_that_most_corners_are_on(monkeypatch, sizes, chosen):
+    images = [np.full((4, 4), i, np.uint8) for i in range(len(sizes))]
+    monkeypatch.setattr(targets, "board_in", lambda grey, thorough: sizes[grey[0, 0]])
+    refused = BoardNotFound("no board")
+    shown = lambda grey, size: object() if sizes[grey[0, 0]] and size == chosen else refused  # noqa: E731
+    monkeypatch.setattr(targets, "find_corners", shown)
+    n = sum(size is not None for size in sizes) if chosen else 0
+    assert board_size(images) == (chosen, n)
+
+
+def test_corners_of_which_whole_lines_were_passed_over_are_no_board(rng):
+    """As OpenCV's finder returned them in photographs of a dim board of 11 x 8: rows 0, 4, 6 and 7."""
+    i, j = np.meshgrid(np.arange(11.0), np.arange(8.0))
+    w = 1 + 0.04 * j + 0.02 * i  # seen obliquely from near: nearest squares 1.9 times as large as the farthest
+    grid = np.stack([50 * i / w, 50 * j / w], axis=-1) + rng.normal(0, 1, (8, 11, 2))
+    assert chessboard._even(grid)
+    assert chessboard._even(grid[:3, :3])
+    for rows in ([0, 4, 6, 7], [0, 1, 3], [0, 2, 3, 4, 5, 6, 7]):
+        assert not chessboard._even(grid[rows])
+        assert not chessboard._even(grid[rows].swapaxes(0, 1))
