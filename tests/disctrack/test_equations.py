@@ -954,3 +954,27 @@ def test_a_long_motion_goes_on_where_it_was_looked_at(monkeypatch):
     assert_allclose(seen[0][0][:-1, 0], 0.0, atol=1e-6)
     monkeypatch.setattr("disctrack.diagnosis.equations.system.RAN_AWAY", 0.5)
     assert system.predictions(values) == [None]
+
+
+DRAGS = {  # by case: force on the fall, what is claimed, and seed, duration [s] and noise [m]
+    "of a magnet in a wide tube": (lambda v: 18 * v / (1 + (v / 0.4) ** 2), (), (5, 1.2, 2e-4)),
+    "of a magnet in a short tube": (lambda v: 18 * v / (1 + (v / 0.4) ** 2), (), (1, 0.5, 2e-4)),
+    "of two known terms": (lambda v: 2 * v + 1.2 + 0.4 * v**2, {"quadratic_v", "coulomb_v"}, (5, 1.2, 2e-4)),
+}
+
+
+@pytest.mark.parametrize("drag", DRAGS)
+def test_terms_that_undo_each_other_are_not_named(drag):
+    """Drag by eddy currents falls with speed: springs and drags a hundred times gravity make it with opposite signs."""
+    force, claimed, (seed, duration, noise) = DRAGS[drag]
+    rng = np.random.default_rng(seed)
+    time = np.sort(np.unique(np.r_[0, rng.uniform(0, duration, 150)]))
+    h = motion(lambda t, y: [y[1], 9.81 - force(y[1])], [0.0, 0.0], time)[0]
+    h = np.round((h + noise * rng.standard_normal(len(time))) / 5e-4) * 5e-4
+    h[40:52] = np.nan
+    falling = Equations({"h": "v", "v": "g - c*v"}, {"c": 15.0}, constants={"g": 9.81}, units={"h": "m"})
+    answer = diagnose(falling, Run(time, {"h": h}, known={"h": (0.0, 1e-3), "v": (0.0, 1e-2)}))
+    same = {f.candidate.name: {r.candidate.name for r in f.cannot_be_told_from} for f in answer.diagnosis.found}
+    assert answer.verdict == ("found" if claimed else "unexplained")
+    assert all(any(name in {n, *others} for n, others in same.items()) for name in claimed)
+    assert len(same) == len(claimed) or (not claimed and len(same) == 1)

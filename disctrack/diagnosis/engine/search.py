@@ -30,6 +30,7 @@ from disctrack.diagnosis.engine.system import (
     beginnings,
     hurried,
     several_minima,
+    undo_each_other,
 )
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
@@ -427,10 +428,12 @@ class _Search:
         return (trial.fit.converged or rough) and trial.gain > enough and not self._incredible(trial, extra)
 
     def _incredible(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
-        """Is an amount at the limit of what is ever met, or do two faults of the measurement undo each other?"""
+        """Is an amount at the limit of what is ever met, or do forces or faults of the measurement undo each other?"""
         values = trial.fit.values
         limits = [(values[q.name], q) for c in extra if c.kind == "measurement" for q in c.quantities]
         if any(v != q.null and not q.lower < v < q.upper for v, q in limits):
+            return True
+        if undo_each_other(self.system, trial.candidates, values, self.fits[frozenset()].values):
             return True
         faults = [c for c in trial.candidates if c.kind == "measurement"]
         if len(faults) < 2:
@@ -485,7 +488,8 @@ class _Search:
                 swapped = list(trial.candidates)
                 swapped[position] = better.candidate
                 new = replace(trial, candidates=tuple(swapped), fit=better.fit, held_out=self._held_out(better.fit))
-                if self._log_density(new) > self._log_density(trial) - CLASS_GAIN / 2 * self.noise:
+                undone = undo_each_other(self.system, swapped, better.fit.values, self.fits[frozenset()].values)
+                if not undone and self._log_density(new) > self._log_density(trial) - CLASS_GAIN / 2 * self.noise:
                     trial = new
                     found = self._rivals(trial, position)
             rivals[trial.candidates[position].name] = [r for r in found if r.loss < CLASS_GAIN]

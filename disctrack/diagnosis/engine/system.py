@@ -117,6 +117,15 @@ def beginnings(system: System) -> Sequence[System]:
     return tuple(getattr(system, "beginnings", ()))
 
 
+def undo_each_other(system: System, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
+    """Do some of these effects undo each other, or what the model has? Not where the system does not say so.
+
+    values, before : as fitted with and without them
+    """
+    of = getattr(system, "undo_each_other", None)
+    return of is not None and bool(of(candidates, values, before))
+
+
 class Wrapped:
     """A system as another sees it: all as it is, but for what a subclass changes."""
 
@@ -157,6 +166,10 @@ class Wrapped:
     def several_minima(self) -> bool:
         """As the system's: may fits of the same quantities end in different minima?"""
         return several_minima(self._system)
+
+    def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
+        """As the system's."""
+        return undo_each_other(self._system, candidates, values, before)
 
     def hurried(self, share: float) -> Wrapped:
         """As the system's."""
