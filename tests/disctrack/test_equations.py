@@ -978,3 +978,20 @@ def test_terms_that_undo_each_other_are_not_named(drag):
     assert answer.verdict == ("found" if claimed else "unexplained")
     assert all(any(name in {n, *others} for n, others in same.items()) for name in claimed)
     assert len(same) == len(claimed) or (not claimed and len(same) == 1)
+
+
+@pytest.mark.parametrize(("ratio", "place"), [(10, 0.25), (10, 0.1), (2, 0.25), (0, 0.0)])
+def test_a_stop_many_times_stiffer_than_the_spring_is_found(rng, ratio, place):
+    """The model loses the motion at the first blow: other terms lead on, and are nothing beside the stop."""
+    time, k = 0.015 * np.arange(600), 49.0
+    stop = lambda x: ratio * k * max(x - place, 0.0) if ratio else 30 * x**3  # noqa: E731
+    x = motion(lambda t, y: [y[1], -k * y[0] - 0.3 * y[1] - stop(y[0])], [0.5, 0.0], time, max_step=0.005)[0]
+    run = Run(time, {"x": x + 2e-4 * rng.standard_normal(600)}, sigma=2e-4)
+    offered = [terms.end_stop("v", "x"), terms.coulomb("v"), terms.cubic_spring("v", "x"),
+               terms.asymmetric_spring("v", "x")]  # fmt: skip
+    answer = diagnose(Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 45.0, "c": 0.2}), run, offered)
+    assert answer.verdict == "found"
+    assert answer.found == (("stop_x",) if ratio else ("cubic_spring_x",))
+    truth = {"stop_x.k": ratio * k, "stop_x.place": place} if ratio else {"cubic_spring_x.k": 30.0}
+    assert all(within(answer, name, value) for name, value in truth.items())
+    assert "Missing: " in str(answer)

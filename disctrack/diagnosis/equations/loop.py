@@ -140,6 +140,13 @@ def _asked(
     if leading:
         term, way = next(iter(leading.items()))
         system, diagnosis = _whole(system.with_(promoted=(term,)), (term,), way.values, settings)
+        others = tuple(f.candidate.name for f in diagnosis.found[1:])
+        if others and _wald(diagnosis.found[0].candidate.names, diagnosis.after) <= diagnosis.found[0].threshold:
+            # it led to those that take its place
+            values = _without(diagnosis.after.values, (term,))
+            leading = {others[0]: replace(way, values=values)}
+            system, diagnosis = _whole(system.with_(promoted=others), others, values, settings)
+            notes[-1] = f"the fit goes by way of {term}, which is nothing beside what was found"
         if diagnosis.found[0].gain > diagnosis.found[0].threshold:
             diagnosis = _with_equals(system, diagnosis, leading)
         else:  # it showed the way, no more: from where it leads the equations follow by themselves
@@ -235,13 +242,15 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
     names = [q.name for q in system.base]
     amounts = {c.name: c for c in system.with_(aims={}).candidates if any(n.startswith(f"{c.name}.") for n in f.along)}
     best: dict[str, tuple[float, dict[str, float]]] = {}
+    # a term that every fit has keeps its limit: without an aim no fit would move it
+    kept = {n: v for n, v in system.aims.items() if n.partition(".")[0] in system.promoted}
     for share in (np.arange(SCANNED) + 0.5) / SCANNED:
         tried = {}
         for i, name in enumerate(f.along):
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
             bounds = f.fitted[name][1]
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
-        there = system.with_(aims=tried)
+        there = system.with_(aims=kept | tried)
         asked = [*names, *(n for c in amounts.values() for n in c.names)]
         residual, derivative = there.linearise(values, asked)
         right, matrix = compress(residual, derivative)
@@ -253,7 +262,7 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             if gain > best.get(c.name, (0.0, {}))[0]:
                 limits = {n: v for n, v in tried.items() if n.startswith(f"{c.name}.")}
                 best[c.name] = gain, limits | dict(zip(c.names, amounts_there.tolist(), strict=True))
-    return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
+    return system.with_(aims=kept | {n: v for _, aims in best.values() for n, v in aims.items()})
 
 
 def _first_order(right: Array, base: Array, columns: Array, quantities: Sequence[Quantity]) -> tuple[float, Array]:
