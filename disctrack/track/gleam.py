@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
+from numpy.typing import NDArray
 
 from calibration.arrays import Array, Array32, Mask
 from calibration.camera import StereoRig
@@ -26,6 +27,7 @@ DEGREE = 4  # of the polynomial: a gleam as wide as the disc's path
 POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
 OF_CONTRAST = 400  # frames at most that the polynomial is fitted to
 LEAST = 20  # frames
+SAME = 1 / 16  # of a dot's diameter, about a pixel
 OUTLYING = 4.0  # robust sigmas
 # Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
 # likeliest is the prior, so that noise, and large terms that cancel where the dots are, shift nothing. It must be
@@ -45,7 +47,8 @@ def shift_by_gleam(
     """
     n = len(R)
     shift = np.zeros((n, 2, disc.n_markers, 2))
-    chosen = np.unique(np.linspace(0, n - 1, min(n, OF_CONTRAST)).astype(int))
+    apart = _apart(R, t, disc)
+    chosen = apart[np.unique(np.linspace(0, len(apart) - 1, min(len(apart), OF_CONTRAST)).astype(int))]
     pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
     fields = [_Field.fitted(pixels[:, c], np.asarray(contrast[chosen, c], float)) for c in (0, 1)]
     for first in range(0, n if any(fields) else 0, AT_ONCE):
@@ -59,6 +62,15 @@ def shift_by_gleam(
                 along *= pulls_by_contrast(0.5 * disc.marker_diameter, affine[:, camera], pull)
                 shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
+
+
+def _apart(R: Array, t: Array, disc: Disc) -> NDArray[np.intp]:
+    """Frames between which the dots went on by SAME of their diameter: what one at rest is off by repeats in all."""
+    places = np.einsum("nij,mj->nmi", R, disc.marker_centres_body) + t[:, None]
+    places = places[known := np.flatnonzero(np.isfinite(places).all(axis=(1, 2)))]
+    steps = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=-1).mean(axis=1)
+    path = np.floor(np.cumsum(steps) / (SAME * disc.marker_diameter))
+    return known[np.unique(path, return_index=True)[1]]
 
 
 class _Field:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, rolling
@@ -55,7 +56,11 @@ def located(rendered_pairs):
                 contrast[frame, 0, dot] = of_lit.contrast[0]
         found[kind] = contrast, shift
     pull = Pull(0.65, (PAPER, 1 - DARK / PAPER), NOISE)
-    return found, lambda contrast: shift_by_gleam(R, t, contrast, rig, disc, (pull, pull))
+
+    def told(contrast, frames=slice(None)):
+        return shift_by_gleam(R[frames], t[frames], contrast[frames], rig, disc, (pull, pull))
+
+    return found, told
 
 
 def test_a_gleam_shifts_dots_and_their_contrasts_tell_by_how_much(located):
@@ -80,6 +85,16 @@ def test_flicker_and_dots_of_different_ink_are_no_gradient(located, rng):
     contrast = found["gleam"][0]
     uneven = contrast + 0.03 * rng.normal(size=(N, 1, 1)) + 0.03 * rng.normal(size=contrast.shape[2])
     assert np.abs(told(uneven.astype(np.float32)) - told(contrast)).max() < 2e-4  # px
+
+
+def test_what_a_resting_disc_repeats_is_no_evidence(located, rng):
+    """Copies of the first and last frame, each with one error of the contrasts, that outnumber the motion."""
+    found, told = located
+    contrast = found["falls off"][0] + 0.003 * rng.normal(size=(N, 1, 6)).astype(np.float32)
+    rests = np.r_[np.zeros(100, int), np.arange(N), np.full(100, N - 1)]
+    assert_array_equal(told(contrast, rests), told(contrast)[rests])
+    assert not told(contrast, np.zeros(200, int)).any()
+    assert told(np.full_like(contrast, np.nan)).shape == (N, 2, 6, 2)
 
 
 def test_a_disc_at_rest_or_a_single_dot_tells_nothing(located):
