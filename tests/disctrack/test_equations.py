@@ -995,3 +995,46 @@ def test_a_stop_many_times_stiffer_than_the_spring_is_found(rng, ratio, place):
     truth = {"stop_x.k": ratio * k, "stop_x.place": place} if ratio else {"cubic_spring_x.k": 30.0}
     assert all(within(answer, name, value) for name, value in truth.items())
     assert "Missing: " in str(answer)
+
+
+def beyond_play(x, play):
+    return x - np.clip(x, -play / 2, play / 2)
+
+
+@pytest.mark.parametrize(("play", "friction"), [(0.05, 0.0), (0.2, 0.0), (0.0, 0.0), (0.0, 0.15)])
+def test_play_of_a_spring_is_found_with_its_width(rng, play, friction):
+    """Controls: neither nothing nor dry friction, which also takes more of small swings, is called a play."""
+    time = 0.015 * np.arange(600)
+    rates = lambda t, y: [y[1], -49 * beyond_play(y[0], play) - 0.3 * y[1] - friction * np.tanh(y[1] / 1e-4)]  # noqa: E731
+    x = motion(rates, [0.5, 0.0], time, max_step=0.005)[0]
+    run = Run(time, {"x": x + 2e-4 * rng.standard_normal(600)}, sigma=2e-4)
+    offered = [terms.backlash("v", "x", "k"), terms.coulomb("v"), terms.cubic_spring("v", "x"),
+               terms.end_stop("v", "x"), terms.quadratic("v")]  # fmt: skip
+    answer = diagnose(Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 45.0, "c": 0.2}), run, offered)
+    assert answer.found == (("backlash_x",) if play else ("coulomb_v",) if friction else ())
+    assert answer.verdict == ("found" if play or friction else "nothing missing")
+    if play:
+        assert within(answer, "backlash_x.play", play)
+        assert within(answer, "k", 49.0)
+
+
+def test_play_of_a_coupling_acts_on_both_parts(rng):
+    """Two driven parts of unequal mass; what the play takes from one is missing on the other, too."""
+    time = 0.01 * np.arange(500)
+    push = lambda t: 3 * np.sin(2 * t) + 2 * np.sin(5.1 * t)  # noqa: E731
+
+    def rates(t, y):
+        held = 60 * beyond_play(y[0] - y[2], 0.01)
+        return [y[1], push(t) - 0.4 * y[1] - held - 4 * y[0], y[3], 2 * held - 0.5 * y[3]]
+
+    y = motion(rates, [0.0, 0.0, 0.0, 0.0], time, max_step=0.005)[[0, 2]] + 5e-4 * rng.standard_normal((2, 500))
+    parts = Equations(
+        {"x": "v", "y": "w", "v": "u - b*v - k*(x - y) - s*x", "w": "k*(x - y)/m - c*w"},
+        {"k": 50.0, "b": 0.3, "s": 3.5, "c": 0.4}, constants={"m": 0.5}, inputs=["u"],
+    )  # fmt: skip
+    run = Run(time, {"x": y[0], "y": y[1]}, inputs={"u": push(time)}, sigma=5e-4)
+    answer = diagnose(parts, run, [terms.backlash("v", "x - y", "k", {"w": "-k/m"}), terms.coulomb("v")])
+    assert answer.found == ("backlash_x_y",)
+    assert answer.verdict == "found"
+    assert within(answer, "backlash_x_y.play", 0.01)
+    assert within(answer, "k", 60.0)

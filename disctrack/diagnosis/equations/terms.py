@@ -5,7 +5,7 @@ a term is added. `v` is a velocity, `x` its coordinate; both may be formulas. A 
 so that formulas which are handed in mean the equations' numbers of the same name.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -78,6 +78,20 @@ def end_stop(v: str, x: str, side: int = 1, name: str = "") -> Term:
     beyond = f"{side}*own_k*Max({side}*(({x}) - own_place), 0)"
     return Term(name or f"stop_{x}", {v: f"-({beyond})"}, parameters={"k": Parameter(0.0, lower=0.0), "place": place},
                 title=f"stop on {x}")  # fmt: skip
+
+
+def backlash(v: str, x: str, stiffness: str, onto: Mapping[str, str] | None = None, name: str = "") -> Term:
+    """Play of a spring or coupling that is declared without: within half the play to either side it does nothing.
+
+    x : its deflection, a coordinate or a difference ("x - y"), nought in the middle of the play
+    stiffness : its factor in the equation of v, which has -stiffness*x
+    onto : by other velocities that it acts on, its factor there: {"w": "-k/m"} where their equation has +k/m*x
+    """
+    idle = f"Min(abs({x}), own_play/2)*sign({x})"
+    rates = {u: f"({factor})*{idle}" for u, factor in {v: stiffness, **(onto or {})}.items()}
+    label = "".join(c if c.isalnum() else "_" for c in x.replace(" ", ""))
+    return Term(name or f"backlash_{label}", rates, parameters={"play": Parameter(0.0, lower=0.0)},
+                title=f"play in {x}")  # fmt: skip
 
 
 def overflow(equations: Equations, level: str, into: str = "", name: str = "") -> Term:
