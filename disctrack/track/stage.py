@@ -177,8 +177,8 @@ def measure(
     findings = {
         **found,
         "notes": [*pairs.notes, *exposure_source, *found["notes"]],
-        "warnings": list(dict.fromkeys([*pairs.warnings, *pairs.doubts, *tracking.doubts, *tracking.warnings])),
-        "doubts": [*pairs.doubts, *tracking.doubts],
+        "warnings": list(dict.fromkeys([*pairs.warnings, *pairs.doubts, *found["warnings"]])),
+        "doubts": [*pairs.doubts, *found["doubts"]],
         "unreadable": [image.reason for image in unreadable],
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),
@@ -195,8 +195,8 @@ def findings_of(tracking: Tracking) -> dict[str, Any]:
     return {
         "notes": [tracking.exposure.note] if tracking.exposure.note else [],
         "exposure_s": list(tracking.exposure.seconds),
-        "warnings": list(tracking.warnings),
-        "doubts": [],
+        "warnings": list(dict.fromkeys([*tracking.doubts, *tracking.warnings])),
+        "doubts": list(tracking.doubts),
         "unreadable": [],
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],

@@ -1,5 +1,7 @@
 """The way in for frames in memory and for a live loop, and how results show themselves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,16 @@ def test_arrays_give_to_the_last_bit_what_files_give(taken):
         for name in ("q", "pose_covariance", "markers_px", "time", "frame_status"):
             assert np.array_equal(getattr(found.trajectory, name), getattr(by_files.trajectory, name)), name
     assert found.findings["noise"] == by_files.findings["noise"]
+
+
+def test_what_puts_a_result_in_doubt_is_told_of_arrays_too(taken):
+    declared, rig, images, by_files = taken
+    assert by_files.findings["doubts"] == []
+    centres = declared.disc.marker_centres_body + np.array([[3e-4, 0, 0], *np.zeros((declared.disc.n_markers - 1, 3))])
+    wrong = replace(declared.disc, marker_centres_body=centres)
+    found = disctrack.measure_pairs(images, rig, wrong, declared.frame_rate).findings
+    assert any("dots lie off the places declared" in doubt for doubt in found["doubts"])
+    assert set(found["doubts"]) <= set(found["warnings"])
 
 
 @pytest.mark.parametrize(
