@@ -14,6 +14,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 import disctrack
 from disctrack.diagnosis.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, loop, terms
@@ -213,6 +214,20 @@ def test_noise_that_remembers_is_no_effect_and_widens_sigmas():
         assert any("remembers" in note or "what is left" in note for note in answer.notes)
     assert claims == 0
     assert np.sqrt(np.mean(np.square(pulls))) < 2.0  # of five standard normals: exceeded once in 10 000
+
+
+def test_many_times_the_declared_noise_is_no_noise_whatever_it_remembers():
+    x = swinging(lambda x, v: 0.0)
+    white = np.random.default_rng(1).standard_normal(len(TIME) + 100)
+    noise = SIGMA * lfilter([np.sqrt(1 - 0.6**2)], [1.0, -0.6], white)[100:]
+    for size, sigma, verdict in (
+        (10, SIGMA, "unexplained"),
+        (3, SIGMA, "nothing missing"),
+        (10, None, "nothing missing"),
+    ):
+        answer = diagnose(OSCILLATOR, Run(TIME, {"x": x + size * noise}, sigma=sigma), FIVE)
+        assert answer.verdict == verdict
+        assert ("no sensor's noise" in answer.diagnosis.reason) == (verdict == "unexplained")
 
 
 def test_parameters_may_be_off_by_a_factor_of_two(rng):

@@ -47,6 +47,7 @@ BLUNT = 0.1  # of chi-square, by which a sharper jump may move the motion: numbe
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
 MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
+NO_SENSOR = 5.0  # times the declared noise: nobody knows a sensor so badly
 FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 SCANNED = 8  # values along the motion that are tried for a limit
@@ -167,7 +168,8 @@ def _asked(
     judged: System = diagnosis.judged or system
     memory = None
     if settings.noise is None:
-        again, memory, remark = _with_memory(system, diagnosis, settings)
+        sensor_known = all(np.isfinite(s.sigma).all() for s in given)
+        again, memory, remark = _with_memory(system, diagnosis, settings, sensor_known)
         if again is not None:
             diagnosis, judged = again, again.judged or judged
             notes.append(remark)
@@ -483,9 +485,12 @@ def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, flo
 
 
 def _with_memory(
-    system: EquationSystem, diagnosis: Diagnosis, settings: Settings
+    system: EquationSystem, diagnosis: Diagnosis, settings: Settings, sensor_known: bool
 ) -> tuple[Diagnosis | None, Array | None, str]:
-    """Search again with noise that remembers, where what is left of the best model does."""
+    """Search again with noise that remembers, where what is left of the best model does.
+
+    sensor_known : all noise was declared; what is left may be larger than that, but not as it pleases
+    """
     if diagnosis.held_out_before is None:
         return None, None, ""
     residual, _ = system.linearise(diagnosis.after.values, [])
@@ -500,6 +505,7 @@ def _with_memory(
     shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
     # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
+    as_noise &= not (sensor_known and size > NO_SENSOR)
     remembering = Remembering(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
     if diagnosis.verdict == "unexplained" and (base is None or not base.converged):
