@@ -128,23 +128,29 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, corners = cv2.findChessboardCorners(grey, inner_corners, None, flags)
-    found = found and _even(corners.reshape(*inner_corners[::-1], 2))
-    if not found and thorough:
-        found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
-        found = found and _even(corners.reshape(*inner_corners[::-1], 2))
-    if not found and thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
+    grid = _all_lines(cv2.findChessboardCorners(grey, inner_corners, None, flags), inner_corners)
+    if grid is None and thorough:
+        thoroughly = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
+        grid = _all_lines(thoroughly, inner_corners)
+    if grid is None and thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
         finer = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
-        found, corners = cv2.findChessboardCorners(finer, inner_corners, None, flags)
-        if found:
+        grid = _all_lines(cv2.findChessboardCorners(finer, inner_corners, None, flags), inner_corners)
+        if grid is not None:
             scale *= 2.0
         else:
             fine = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-            found, corners = cv2.findChessboardCornersSB(grey, inner_corners, None, fine)
-    if not found or corners is None:
+            grid = _all_lines(cv2.findChessboardCornersSB(grey, inner_corners, None, fine), inner_corners)
+    return None if grid is None else (grid.reshape(-1, 2) + 0.5) / scale - 0.5
+
+
+def _all_lines(answer: tuple[bool, NDArray | None], inner_corners: tuple[int, int]) -> Array | None:
+    """A finder's corners (rows, columns, 2) [px]; None where it found none, or passed over a line of them."""
+    found, corners = answer
+    columns, rows = inner_corners
+    if not found or corners is None or len(corners) != columns * rows:
         return None
-    points = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
-    return points if len(points) == inner_corners[0] * inner_corners[1] else None
+    grid = np.asarray(corners, np.float64).reshape(rows, columns, 2)
+    return grid if _even(grid) else None
 
 
 def _even(grid: NDArray) -> bool:

@@ -4,8 +4,9 @@ A value that no file tells stands as a comment with FILL IN: the declaration is 
 guess of ours becomes a measurement.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,9 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
 def look_into(folder: Path) -> FolderContent:
     """What the frames of a folder tell. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
+    shows_once = cache(partial(_shows_the_board_once, folder))  # seconds, for large images
     pairs, parts = pair_cameras(sequences), None
-    if _may_be_one_camera(folder, pairs, sequences) and (half := _side_by_side(folder, sequences)):
+    if _may_be_one_camera(pairs, sequences, shows_once) and (half := _side_by_side(folder, sequences)):
         width, height = half
         parts = [0, 0, width, height], [width, 0, width, height]
         pairs = [CameraPair(sequence, sequence, named=True) for sequence in sequences]
@@ -87,7 +89,7 @@ def look_into(folder: Path) -> FolderContent:
     candidates = [pair for pair in pairs if pair is not views] or pairs
     lengths = {id(pair): _length(folder, pair.left) for pair in candidates}
     frames = max(candidates, key=lambda pair: lengths[id(pair)])
-    if views is None and parts is None and _shows_the_board_once(folder, frames):
+    if views is None and parts is None and shows_once(frames):
         raise _no_two_cameras(folder, sequences)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
@@ -134,11 +136,13 @@ def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
     )
 
 
-def _may_be_one_camera(folder: Path, pairs: list[CameraPair], sequences: list[Sequence]) -> bool:
+def _may_be_one_camera(
+    pairs: list[CameraPair], sequences: list[Sequence], shows_once: Callable[[CameraPair], bool]
+) -> bool:
     """Is a sequence without a partner, or are partners unlike? Where all are two and two there are two cameras."""
     if any(pair.named for pair in pairs):
         return False
-    return 2 * len(pairs) < len(sequences) or any(_shows_the_board_once(folder, pair) for pair in pairs)
+    return 2 * len(pairs) < len(sequences) or any(map(shows_once, pairs))
 
 
 def _shows_the_board_once(folder: Path, pair: CameraPair) -> bool:

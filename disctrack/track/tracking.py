@@ -128,8 +128,8 @@ def track(
     far = bool(tracking.doubts) and max(tracking.systematic_px) > FAR_PX
     if (contradicted or far) and not left_out:
         of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
-        first = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))[0]
-        if arranged := _arrangement(read_blocks, rig, disc, pairs[first:]):
+        rows = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))
+        if len(rows) and (arranged := _arrangement(read_blocks, rig, disc, pairs[rows[0] :])):
             told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
             tracking = replace(tracking, doubts=(told, *tracking.doubts))
     # in doubt only here: dots found elsewhere than declared are what the second look above is for

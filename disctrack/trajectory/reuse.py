@@ -30,7 +30,7 @@ def remember(folder: Path, origin: str, lines: Sequence[str], files: Sequence[Pa
 def reusable(folder: Path, origin: str) -> list[str] | None:
     """What was said of the results in the folder, if they are all there and of this origin; None otherwise."""
     try:
-        content = json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))
+        content = _content(folder)
         whole = content["origin"] == origin and all((folder / name).is_file() for name in content["files"])
         return [str(line) for line in content["summary"]] if whole else None
     except (OSError, ValueError, KeyError, TypeError):
@@ -39,13 +39,14 @@ def reusable(folder: Path, origin: str) -> list[str] | None:
 
 def refuse_other(report: Path, overwrite: bool) -> None:
     """Raise OutputError where there is a report that may not be replaced, with what sets it apart from a new one."""
-    other = ""
+    other, here = "", software_version()
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # what does not say who made it
-        made_by, here = (
-            json.loads((report.parent / FILE_NAME).read_text(encoding="utf-8"))["version"],
-            software_version(),
-        )
+        made_by = _content(report.parent)["version"]
         other = f", made by version {made_by} (this is {here})"
         if made_by == here:
             other = ", made from another trajectory, or with other settings"
     refuse_existing(report, overwrite, other)
+
+
+def _content(folder: Path) -> Any:
+    return json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))

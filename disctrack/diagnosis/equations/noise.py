@@ -11,10 +11,8 @@ from disctrack.diagnosis.engine.system import System, Values, Wrapped
 from disctrack.diagnosis.equations.declared import Samples
 
 _ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them
-ENOUGH_DIFFERENCES, FEWEST_DIFFERENCES = (
-    8,
-    3,
-)  # by which a channel's noise is told, where samples are even and where not
+ENOUGH_DIFFERENCES = 8  # by which a channel's noise is told
+FEWEST_DIFFERENCES = 3  # the same of few or uneven samples
 UNEVEN = 3.0  # of the spacings: nine in ten are no longer than so many times the one in ten that is shortest
 MAX_MEMORY = 24  # samples over which noise may remember
 
