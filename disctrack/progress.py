@@ -71,11 +71,23 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
 @contextlib.contextmanager
 def stage(what: str) -> Iterator[None]:
     """Name the stage and its age while it lasts (terminals only), and write a line with its time when it ends well."""
+    with steps(what):
+        yield
+
+
+@contextlib.contextmanager
+def steps(what: str) -> Iterator[Callable[[str], None]]:
+    """As `stage`; yields a function that is told which step begins, for terminals to show with the stage's age."""
     began, over = time.perf_counter(), threading.Event()
+    now = [what]
 
     def tick() -> None:
         while not over.wait(1.0):
-            _show(f"{what} ... {time.perf_counter() - began:.0f} s")
+            _show(f"{now[0]} ... {time.perf_counter() - began:.0f} s")
+
+    def say(step: str) -> None:
+        now[0] = f"{what}: {step}"
+        _show(f"{now[0]} ...")
 
     _show(f"{what} ...")
     ticking = threading.Thread(target=tick, daemon=True) if sys.stderr.isatty() else None
@@ -83,20 +95,13 @@ def stage(what: str) -> Iterator[None]:
         ticking.start()
     try:
         with timed(what):
-            yield
+            yield say
     finally:
         over.set()
         if ticking is not None:
             ticking.join()
         _show("")
     _tell(began, what)
-
-
-@contextlib.contextmanager
-def steps(what: str) -> Iterator[Callable[[str], None]]:
-    """Function that is told which step begins; terminals show it, and the line at the end gives the time of all."""
-    with stage(what):
-        yield lambda step: _show(f"{what}: {step} ...")
 
 
 @contextlib.contextmanager

@@ -1,13 +1,15 @@
 """`disctrack diagnose`: which effect does the model lack?"""
 
 import argparse
+import contextlib
 from pathlib import Path
 
 from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.together.stage import run_together
-from disctrack.progress import stage
+from disctrack.errors import TrajectoryFileError
+from disctrack.progress import stage, steps
 from disctrack.readers.blocks import default_threads
 from disctrack.track import summary
 from disctrack.trajectory.reuse import origin_of, remember, reusable
@@ -48,8 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _together(arguments: argparse.Namespace) -> int:
     """One answer for several files."""
     for path in arguments.trajectory:
-        outputs.tell_stale(path)
-    with stage(f"diagnose {len(arguments.trajectory)} recordings together"):
+        with contextlib.suppress(TrajectoryFileError):  # told of below
+            outputs.tell_stale(path)
+    with steps(f"diagnose {len(arguments.trajectory)} recordings together") as step:
         outcome = run_together(
             arguments.trajectory,
             arguments.output,
@@ -58,7 +61,9 @@ def _together(arguments: argparse.Namespace) -> int:
             reuse=not arguments.overwrite,
             settle=arguments.plan,
             processes=arguments.jobs or default_threads(),
+            progress=step,
         )
     files = [outputs.relative(file) for file in outcome.files]
     print("\n".join([*outcome.summary, *summary.file_lines(files)]))
-    return DONE
+    unusable = [f"{len(outcome.unusable)} recording(s) could not be used"] if outcome.unusable else []
+    return outputs.tell_shortcomings(unusable)

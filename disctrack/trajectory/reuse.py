@@ -16,8 +16,12 @@ FILE_NAME = "made_from.json"
 
 def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:
     """SHA-256 (hex) of what a result is made from. Raises TrajectoryFileError."""
-    content = [read_setup(trajectory).fingerprint, dict(settings), software_version()]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return hash_of([read_setup(trajectory).fingerprint, dict(settings)])
+
+
+def hash_of(content: Any) -> str:
+    """SHA-256 (hex) of something of JSON's types, and of the version."""
+    return hashlib.sha256(json.dumps([content, software_version()], sort_keys=True).encode()).hexdigest()
 
 
 def remember(folder: Path, origin: str, lines: Sequence[str], files: Sequence[Path]) -> None:

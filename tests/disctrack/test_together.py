@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import Settings, diagnose
 from disctrack.diagnosis.engine.fit import fit
-from disctrack.diagnosis.together.covariates import hypotheses
+from disctrack.diagnosis.together.covariates import alike, hypotheses
 from disctrack.diagnosis.together.crew import Crew
 from disctrack.diagnosis.together.fitting_in import Blocks, apart
 from disctrack.diagnosis.together.joint import JointSystem
@@ -155,6 +155,56 @@ def test_the_sigma_of_an_exponent_is_its_scatter_however_small_the_law_s_constan
     assert np.mean(numbers[:, 0]) == pytest.approx(0.6, abs=4 * np.std(numbers[:, 0]) / np.sqrt(300))
     constant = np.array([next(h for h in of if "power" in h.text).numbers["constant"] for of in drawn])
     assert np.std(constant[:, 0]) == pytest.approx(np.mean(constant[:, 1]), rel=0.15)
+
+
+FOUR = ("mass", "radius", "thickness", "density of the air")
+
+
+@pytest.mark.parametrize("n", [4, 8, 20])
+def test_of_a_law_that_is_the_same_for_all_no_dependence_is_told(rng, n):
+    """Four covariates that have nothing to do with it: 200 draws, one in a hundred by chance."""
+    sigma = 4e-10 * rng.uniform(0.5, 2, n)
+    false = 0
+    for _ in range(200):
+        covariates = {name: rng.uniform(0.5, 2, n).tolist() for name in FOUR}
+        kinds = {"surface": rng.choice(["steel", "glass"], n).tolist()}
+        drawn = 4e-8 + sigma * rng.standard_normal(n)
+        false += hypotheses(drawn, np.diag(sigma**2), covariates, kinds)[0].text != "the same for all"
+    assert false <= 7  # 2 are expected; 8 or more once in a thousand
+
+
+def test_a_surface_and_a_power_of_the_mass_are_told_together_and_from_each_alone(rng):
+    mass = np.array([0.5, 1.0, 1.5, 0.5, 1.0, 1.5, 0.8])
+    glass = np.array([0, 0, 0, 1, 1, 1, 1])
+    covariates = {"mass": mass.tolist(), "radius": [1.0, 1.1, 0.9, 1.0, 0.9, 1.1, 1.2]}
+    kinds = {"surface": np.where(glass, "glass", "steel").tolist()}
+    sigma = np.full(7, 4e-10)
+    both, surface, power = "in proportion to a power of the mass, with a constant for each surface", (
+        "a value for each surface"), "in proportion to a power of the mass"  # fmt: skip
+    for exponent, on_glass, text in ((0.5, 0.7, both), (0.0, 0.7, surface), (0.5, 1.0, power)):
+        values = 4e-8 * mass**exponent * np.where(glass, on_glass, 1.0) + sigma * rng.standard_normal(7)
+        best, *others = hypotheses(values, np.diag(sigma**2), covariates, kinds)
+        assert best.text == text
+        assert best.holds
+        assert not next(h for h in others if h.text == "the same for all").holds
+        if exponent:
+            found, spread = best.numbers["exponent of the mass"]
+            assert abs(found - exponent) < 3 * spread
+        if on_glass != 1.0:
+            assert {"constant (glass)", "constant (steel)"} <= best.numbers.keys()
+
+
+def test_covariates_that_go_together_are_told_as_rivals_and_values_without_a_rule_as_such(rng):
+    """Discs of one plate: the mass goes with the square of the radius."""
+    radius = np.array([0.7, 0.9, 1.0, 1.3])
+    covariates = {"mass": (radius**2).tolist(), "radius": radius.tolist()}
+    sigma = 0.01 * np.ones(4)
+    found = hypotheses(radius + 0.01 * rng.standard_normal(4), np.diag(sigma**2), covariates)
+    assert {found[0].text, *(h.text for h in alike(found))} == {
+        "in proportion to a power of the radius", "in proportion to a power of the mass",
+    }  # fmt: skip
+    assert not any("mass and" in h.text or "radius and" in h.text for h in found)  # which nothing could tell apart
+    assert not hypotheses(np.array([1.0, 2.0, 0.5, 1.8]), np.diag(sigma**2), covariates)[0].holds
 
 
 @pytest.mark.slow

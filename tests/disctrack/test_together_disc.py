@@ -94,6 +94,30 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
     assert "more than once" in capsys.readouterr().err
 
 
+def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagnosed(tmp_path, capsys):
+    for seed in range(2):
+        trajectory = measured(seed=50 + seed, n=60, theta_deg=5.0 + seed, declared_rate=RATE, rig_seed=RIG)
+        write_trajectory(tmp_path / f"{seed}.h5", trajectory, Provenance(f"run {seed}", {"frames": str(seed)}, {}))
+    (tmp_path / "empty.h5").write_bytes(b"")
+    (tmp_path / "cut.h5").write_bytes((tmp_path / "0.h5").read_bytes()[:9000])
+    names = ["0.h5", "empty.h5", "1.h5", "cut.h5"]
+    words = ["diagnose", *(str(tmp_path / name) for name in names), "-o", str(tmp_path / "out"), "-j", "1"]
+    for _ in range(2):  # the second time the result is used again
+        assert main(words) == 3
+        told = capsys.readouterr()
+        assert "2 recordings together (2 left out): nothing is missing" in told.out
+        assert "empty.h5 was left out" in told.out
+        assert "cut.h5 was left out" in told.out
+        assert "2 recording(s) could not be used" in told.err
+    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert [name.rpartition("/")[2] for name in document["unusable"]] == ["empty.h5", "cut.h5"]
+    assert "empty.h5" in (tmp_path / "out" / "diagnosis.html").read_text()
+    assert main([*words[:3], "-o", str(tmp_path / "other")]) == 1  # one alone is not many
+    assert "empty.h5" in capsys.readouterr().err
+    assert main([*words[:2], str(tmp_path / "mistyped.h5")]) == 1
+    assert "mistyped.h5" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_planned_recording_brings_what_it_brings_when_it_is_made():
     first = measured(seed=1, n=120, theta_deg=6.0, omega3=1.0, declared_rate=RATE, rig_seed=RIG)

@@ -1,15 +1,18 @@
-"""How does the coefficient of a law depend on what was declared: on nothing, on a power of the mass, on the air?"""
+"""How does the coefficient of a law depend on what was declared: on nothing, on the surface, on a power of the mass?"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
 from calibration.arrays import Array
 
-LEVEL = 0.01  # probability below which a hypothesis is refused
+LEVEL = 0.01  # probability below which a hypothesis is refused, and with which chance alone brings a dependence forth
+SAME = 1e-6  # smallest part of a covariate's logarithms that the others, and the constants, leave: less is no other
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,8 @@ class Hypothesis:
     numbers: dict[str, tuple[float, float]]  # constant and exponent with their standard deviations
     chi_square: float
     degrees: int
-    criterion: float  # chi-square and the price of its numbers (Bayesian information criterion over the groups)
+    criterion: float  # chi-square and the price of its numbers
+    parts: int  # covariates and kinds that it goes by
 
     @property
     def p_value(self) -> float:
@@ -33,41 +37,85 @@ class Hypothesis:
         return self.degrees <= 0 or self.p_value > LEVEL
 
 
-def hypotheses(values: Array, covariance: Array, covariates: Mapping[str, Sequence[float]]) -> list[Hypothesis]:
-    """Constant, and in proportion to a power of each covariate that differs between the groups; the best first.
+def hypotheses(
+    values: Array,
+    covariance: Array,
+    covariates: Mapping[str, Sequence[float]],
+    kinds: Mapping[str, Sequence[str]] | None = None,
+) -> list[Hypothesis]:
+    """Constant, or a constant for each surface or disc; in proportion to powers of covariates; the best first.
 
     values (g,), covariance (g, g) : of the coefficient in each group, fitted together
     covariates : by name, one number per group
-    Generalised least squares, exact to first order of the groups' uncertainties.
+    kinds : "surface" (or "disc") -> which one it is in each group
+    Generalised least squares, exact to first order of the groups' uncertainties. A number costs what the best of so
+    many hypotheses gains by chance with a probability of `LEVEL`: a dependence is put first where it gains more.
     """
     n = len(values)
     unit = float(np.mean(np.abs(values))) or 1.0  # a friction of 1e-8 m s^2 beside an exponent: numbers of one size
     root = np.linalg.cholesky(covariance / unit**2)
+    shapes = list(_shapes(n, covariates, kinds or {}))
+    price = max(float(np.log(n)), float(stats.chi2.isf(LEVEL / max(len(shapes) - 1, 1), 1)))
 
-    def tested(text: str, shape: Mapping[str, Array | float]) -> Hypothesis:
-        """Shape : covariate over its geometric mean, by its exponent's name, or with a given exponent."""
-        free = {k: np.asarray(v) for k, v in shape.items()}
+    def tested(kind: str, names: Sequence[str], level: NDArray[np.intp], powers: Array) -> Hypothesis:
+        """Level : (g,) which of the constants.   powers (k, g) : logarithms of covariates over geometric means."""
+        constants = int(level.max()) + 1
+
+        def power(x: Array) -> Array:
+            return np.asarray(np.exp(x[constants:] @ powers), float)
 
         def misfit(x: Array) -> Array:
-            model = x[0] * np.exp(sum((a * np.log(f) for a, f in zip(x[1:], free.values(), strict=True)), np.zeros(n)))
-            return np.asarray(np.linalg.solve(root, values / unit - model), float)
+            return np.asarray(np.linalg.solve(root, values / unit - x[level] * power(x)), float)
 
-        start = np.array([float(np.mean(values)) / unit, *np.zeros(len(free))])
-        found = least_squares(misfit, start)
-        units = np.array([unit, *np.ones(len(free))])
+        def derivative(x: Array) -> Array:
+            by_number = np.column_stack([level[:, None] == np.arange(constants), powers.T * x[level][:, None]])
+            return -np.asarray(np.linalg.solve(root, by_number * power(x)[:, None]), float)
+
+        of_level = [float(np.mean(values[level == i])) / unit for i in range(constants)]
+        found = least_squares(misfit, np.array([*of_level, *np.zeros(len(powers))]), derivative)
+        units = np.array([*[unit] * constants, *np.ones(len(powers))])
         spread = units * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
-        numbers = {
-            k: (float(v), float(s)) for k, v, s in zip(["constant", *free], units * found.x, spread, strict=True)
-        }
-        chi_square = float(2 * found.cost)
-        return Hypothesis(text, numbers, chi_square, n - len(start), chi_square + len(start) * float(np.log(n)))
+        labels = kinds[kind] if kinds and kind else []
+        which = [f"constant ({labels[int(np.argmax(level == i))]})" if kind else "constant" for i in range(constants)]
+        called = [*which, *(f"exponent of the {name}" for name in names)]
+        numbers = {k: (float(v), float(s)) for k, v, s in zip(called, units * found.x, spread, strict=True)}
+        chi_square, k = float(2 * found.cost), len(called)
+        parts = len(names) + bool(kind)
+        return Hypothesis(_text(kind, names), numbers, chi_square, n - k, chi_square + k * price, parts)
 
-    answers = [tested("the same for all", {})]
-    for name, numbers in covariates.items():
-        x = np.asarray(numbers, float)
-        if not (np.isfinite(x).all() and (x > 0).all()) or np.ptp(np.log(x)) < 1e-6:
+    return sorted((tested(*shape) for shape in shapes), key=lambda h: h.criterion)
+
+
+def _text(kind: str, names: Sequence[str]) -> str:
+    if not names:
+        return f"a value for each {kind}" if kind else "the same for all"
+    powers = " and of the ".join(names)
+    return f"in proportion to a power of the {powers}" + (f", with a constant for each {kind}" if kind else "")
+
+
+def _shapes(
+    n: int, covariates: Mapping[str, Sequence[float]], kinds: Mapping[str, Sequence[str]]
+) -> Iterator[tuple[str, tuple[str, ...], NDArray[np.intp], Array]]:
+    """Kind and covariates of each hypothesis that n groups test; which constant, and logarithms, by group."""
+    usable = {k: x for k, v in covariates.items() if np.isfinite(x := np.asarray(v, float)).all() and (x > 0).all()}
+    logarithms: dict[str, Array] = {k: np.log(x) - np.mean(np.log(x)) for k, x in usable.items()}
+    names: list[tuple[str, ...]] = [(), *((k,) for k in logarithms), *combinations(logarithms, 2)]
+    for kind in ("", *kinds):
+        labels = list(kinds[kind]) if kind else [""] * n
+        level = np.asarray(np.unique(labels, return_inverse=True)[1], np.intp)
+        constants = int(level.max()) + 1
+        if kind and not 1 < constants < n:
             continue
-        relative = x / np.exp(np.mean(np.log(x)))
-        if n > 2:
-            answers.append(tested(f"in proportion to a power of the {name}", {f"exponent of the {name}": relative}))
-    return sorted(answers, key=lambda h: h.criterion)
+        for chosen in names:
+            powers = np.array([logarithms[k] for k in chosen]).reshape(-1, n)
+            columns = np.column_stack([level[:, None] == np.arange(constants), powers.T]).astype(float)
+            small = np.linalg.svd(columns, compute_uv=False).min() <= SAME * np.sqrt(n)
+            if not chosen or (not small and n > columns.shape[1]):
+                yield kind, chosen, level, powers
+
+
+def alike(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those that describe the values as well as the first one, in as many numbers: nobody can tell which it is."""
+    best, *rest = found
+    near = best.chi_square + float(stats.chi2.isf(LEVEL, 1))
+    return [h for h in rest if h.degrees == best.degrees and h.chi_square < near and best.degrees > 0 and h.holds]

@@ -5,7 +5,7 @@ the search over effects is made with the summed evidence, and recordings that do
 out. The cost is linear in the number of recordings.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +62,7 @@ class Dependence:
 
     quantity: str
     unit: str
+    by: str  # what sets the groups apart: "surface", "disc and surface", ...
     groups: dict[str, tuple[float, float]]  # value and standard deviation
     hypotheses: tuple[Hypothesis, ...]
 
@@ -76,6 +77,7 @@ class TogetherDiagnosis:
     bounds: tuple[Bound, ...]
     dependences: tuple[Dependence, ...]
     notes: tuple[str, ...]
+    unusable: tuple[str, ...] = ()  # recordings that were left out unheard, as they could not be read or fitted
     plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
 
     @property
@@ -91,10 +93,12 @@ def diagnose_together(
     processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
     settle: bool = False,
+    unread: Mapping[str, str] | None = None,
 ) -> TogetherDiagnosis:
     """What does the model lack, of all recordings together?
 
     model : as `diagnose_trajectory`
+    unread : further recordings that are told of as left out, and why
     processes : among which the recordings are dealt out; the answer does not depend on their number
     settle : also compute which further recording would settle what is left open
     Raises AnalysisError where fewer than two recordings can be used.
@@ -107,15 +111,16 @@ def diagnose_together(
         told = crew.call("told", [()] * len(items))
         reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
         kept = [i for i in range(len(items)) if i not in reasons]
-        _enough(kept, recordings, reasons)
+        _enough(kept, recordings, reasons, unread or {})
         crew.keep(kept)
         members: list[Member] = []
         refitted = crew.call("with_systematic", [(s,) for s in in_common([told[i] for i in kept])])
         reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
         members = [m for m in refitted if not isinstance(m, DiscTrackError)]
         kept = [i for i in kept if i not in reasons]
+        unusable = (*(recordings[i].name for i in reasons), *(unread or {}))
         for round_ in range(ROUNDS + 1):
-            _enough(kept, recordings, reasons)
+            _enough(kept, recordings, reasons, unread or {})
             crew.keep(kept)
             system, diagnosis = _search(members, crew, settings, progress)
             most = len(members) - (2 * len(items) + 2) // 3 if round_ < ROUNDS else 0
@@ -128,18 +133,24 @@ def diagnose_together(
             kept = [i for k, i in enumerate(kept) if k not in out]
         progress("each recording against the others")
         diagnosis, alone = _with_memory(system, diagnosis, crew)
-        by_recording = _of_recordings(items, kept, reasons, system, diagnosis, alone)
+        by_recording = (
+            *_of_recordings(items, kept, reasons, system, diagnosis, alone),
+            *(OfRecording(name, {}, reason) for name, reason in (unread or {}).items()),
+        )
         bounds = _bounds(system, diagnosis)
         proposed = _plan(system, diagnosis, bounds, crew) if settle else None
     dependences = _dependences(system, diagnosis)
     notes = _notes(by_recording)
-    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, notes, proposed)
+    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, notes, unusable, proposed)
 
 
-def _enough(kept: Sequence[int], recordings: Sequence[Recorded], reasons: dict[int, str]) -> None:
+def _enough(
+    kept: Sequence[int], recordings: Sequence[Recorded], reasons: Mapping[int, str], unread: Mapping[str, str]
+) -> None:
     if len(kept) >= 2:
         return
-    said = "; ".join(f"{recordings[i].name}: {reason}" for i, reason in list(reasons.items())[:5])
+    told = {recordings[i].name: reason for i, reason in reasons.items()} | dict(unread)
+    said = "; ".join(f"{name}: {reason}" for name, reason in list(told.items())[:5])
     raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
 
 
@@ -311,9 +322,9 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
         q = after.quantities[index[0]]
         if np.isfinite(q.prior_sigma):  # a tolerance, no law
             continue
-        tested = hypotheses(values, covariance, sharing.covariates_of(local))
+        tested = hypotheses(values, covariance, sharing.covariates_of(local), sharing.kinds_of(local))
         shown = {g: (after.values[n], after.sigma(n)) for g, n in groups.items()}
-        found.append(Dependence(local, q.unit, shown, tuple(tested)))
+        found.append(Dependence(local, q.unit, " and ".join(sharing.differing(q)), shown, tuple(tested)))
     return tuple(found)
 
 

@@ -14,6 +14,7 @@ from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.output import declared_json, effect_json, tried_json
 from disctrack.diagnosis.pages.report import tried_table
 from disctrack.diagnosis.pages.words import effect_text, quantity_text
+from disctrack.diagnosis.together.covariates import Hypothesis, alike
 from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.diagnosis.together.sharing import EACH
 from disctrack.files.json_text import plain
@@ -88,12 +89,25 @@ def _laws(d: Diagnosis) -> list[str]:
 
 def _dependence(x: Dependence) -> str:
     best = x.hypotheses[0]
-    refused = [h.text for h in x.hypotheses if not h.holds]
-    exponents = ", ".join(f"{k} {v:.3g} +- {s:.2g}" for k, (v, s) in best.numbers.items() if k != "constant")
-    text = f"{x.quantity}: {best.text}" + (f" ({exponents})" if exponents else "")
-    if best.degrees > 0:
-        text += f", p = {best.p_value:.2g}"
+    refused = [h.text for h in x.hypotheses if not h.holds and h.parts < 2]  # the others are in the page's table
+    if not best.holds:
+        text = f"{x.quantity}: a value for each {x.by}"
+        text += ", by no rule that was tested" if len(x.hypotheses) > 1 else ""
+    else:
+        text = f"{x.quantity}: {best.text}{_exponents(best)}"
+        text += f", p = {best.p_value:.2g}" if best.degrees > 0 else ""
+        text += "".join(f"; or {h.text}{_exponents(h)}: cannot be told apart here" for h in alike(x.hypotheses))
     return text + (f"; refused: {'; '.join(refused)}" if refused else "")
+
+
+def _unit(number: str, x: Dependence) -> str:
+    return x.unit if number.startswith("constant") else "1"
+
+
+def _exponents(h: Hypothesis) -> str:
+    exponents = {k: vs for k, vs in h.numbers.items() if not k.startswith("constant")}
+    said = ", ".join(f"{k} {quantity_text(*vs, '1')}" for k, vs in exponents.items())
+    return f" ({said})" if said else ""
 
 
 def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
@@ -114,12 +128,14 @@ def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
         "notes": list(answer.notes),
         "effects": [effect_json(f, d.after) for f in d.found],
         **both,
+        "unusable": list(answer.unusable),
         "recordings": [_recording_json(r) for r in answer.recordings],
         "bounds": [_bound_json(b) for b in answer.bounds],
         "dependences": [
             {
                 "quantity": x.quantity,
                 "unit": x.unit,
+                "by": x.by,
                 "groups": {g: {"value": v, "sigma": s} for g, (v, s) in x.groups.items()},
                 "hypotheses": [
                     {
@@ -213,7 +229,7 @@ def _dependence_table(x: Dependence) -> str:
     rows = [
         (
             h.text,
-            ", ".join(f"{k} {quantity_text(*vs, x.unit if k == 'constant' else '1')}" for k, vs in h.numbers.items()),
+            ", ".join(f"{k} {quantity_text(*vs, _unit(k, x))}" for k, vs in h.numbers.items()),
             f"{h.chi_square:.3g} / {h.degrees}",
             f"{h.p_value:.2g}" if h.degrees > 0 else "",
             "holds" if h.holds else "refused",
@@ -229,10 +245,11 @@ def _dependence_table(x: Dependence) -> str:
 
 
 def _recordings(answer: TogetherDiagnosis) -> str:
-    kinds = [k for k in ("disc", "surface", "rig", "air") if len({r.labels[k] for r in answer.recordings}) > 1]
+    read = [r for r in answer.recordings if r.labels]
+    kinds = [k for k in ("disc", "surface", "rig", "air") if len({r.labels[k] for r in read}) > 1]
     rows, classes = [], []
     for r in answer.recordings:
-        cells = [r.name, *(r.labels[k] for k in kinds)]
+        cells = [r.name, *(r.labels.get(k, "") for k in kinds)]
         if r.fits_in is None or r.alone is None:
             cells += ["", "", "", r.reason]
         else:

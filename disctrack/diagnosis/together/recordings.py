@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from calibration.arrays import Array
+from disctrack.analyse.declaration import contradictions, density
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.large_faults import find_large
 from disctrack.diagnosis.disc.model_file import PAPER, Declared, declared_model
@@ -27,7 +28,7 @@ from disctrack.diagnosis.engine.system import Quantity, Values
 from disctrack.diagnosis.together.reduction import Reduced, Reduction
 from disctrack.diagnosis.together.sharing import Member
 from disctrack.disc import Disc
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.trajectory import MarkerStatus, Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
 
@@ -301,5 +302,19 @@ def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Sy
 
 
 def build(item: Item) -> DiscMember:
-    """For a `Crew`."""
-    return DiscMember(item)
+    """For a `Crew`. Raises AnalysisError where it cannot be used, with what was declared that may be why."""
+    trajectory = item.recorded.trajectory
+    heavy = density(trajectory.disc)
+    if heavy:  # laws in proportion to the load would fit it all the same
+        raise AnalysisError(heavy[0].sentence)
+    try:
+        return DiscMember(item)
+    except Exception as error:
+        try:
+            wrong = contradictions(trajectory)
+        except Exception:  # nothing can be said of it, and that is not why it could not be used
+            wrong = ()
+        if not wrong:
+            raise
+        reason = str(error) if isinstance(error, DiscTrackError) else "the rolling model cannot be fitted to it alone"
+        raise AnalysisError("; ".join([reason, *(w.sentence for w in wrong)])) from error

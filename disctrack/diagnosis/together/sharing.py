@@ -65,14 +65,29 @@ class Sharing:
                 found[name] = [n.pop() for n in numbers]
         return found
 
+    def kinds_of(self, local: str) -> dict[str, list[str]]:
+        """Which disc, surface, ... each group of this quantity has, for those kinds that two groups have in common."""
+        groups = [[self.members[i] for i in of] for of in self._sharers[local].values()]
+        found = {}
+        for kind in dict.fromkeys(k for group in groups for m in group for k in m.labels):
+            labels = [{m.labels.get(kind, "") for m in group} for group in groups]
+            if all(len(one) == 1 for one in labels):
+                of_group = [one.pop() or f"no {kind} declared" for one in labels]
+                if 1 < len(set(of_group)) < len(groups):
+                    found[kind] = of_group
+        return found
+
     def _grouped(self, i: int, local: str, group: str, shared: str) -> None:
         self._groups.setdefault(local, {})[group] = shared
         self._sharers.setdefault(local, {}).setdefault(group, []).append(i)
 
     def group(self, member: Member, q: Quantity) -> str:
         """Which of the groups that share a quantity like this the member belongs to; empty where there is one only."""
-        kinds = [k for k in q.belongs_to if len({m.labels.get(k, "") for m in self.members}) > 1]
-        return ", ".join(member.labels.get(k, "") or f"no {k} declared" for k in kinds)
+        return ", ".join(member.labels.get(k, "") or f"no {k} declared" for k in self.differing(q))
+
+    def differing(self, q: Quantity) -> list[str]:
+        """What sets apart the groups that share a quantity like this: "disc", "surface", ..."""
+        return [k for k in q.belongs_to if len({m.labels.get(k, "") for m in self.members}) > 1]
 
     def _alone(self, member: Member, q: Quantity) -> bool:
         own = self.group(member, q)

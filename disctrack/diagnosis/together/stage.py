@@ -1,5 +1,6 @@
 """The stage: trajectory files in; one page, one diagnosis.json and one sentence out."""
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,12 +9,12 @@ from pathlib import Path
 from disctrack.diagnosis.disc.model_file import PAPER
 from disctrack.diagnosis.together.loop import TogetherDiagnosis, diagnose_together
 from disctrack.diagnosis.together.recordings import Recorded, read_recorded
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 from disctrack.trajectory.file import read_setup
-from disctrack.trajectory.reuse import origin_of, refuse_other, remember, reusable
+from disctrack.trajectory.reuse import hash_of, refuse_other, remember, reusable
 
 FOLDER = "together_diagnosis"
 
@@ -25,6 +26,7 @@ class TogetherOutcome:
     result: TogetherDiagnosis | None  # None where an earlier result of the same files was complete
     files: tuple[Path, ...]
     summary: tuple[str, ...]
+    unusable: tuple[str, ...] = ()  # recordings that could not be read, or not be fitted with the others
 
 
 def run_together(
@@ -42,8 +44,9 @@ def run_together(
 
     output : folder; without it `together_diagnosis` in the deepest folder that holds all files
     settle : also compute which further recordings would settle what is left open
+    Files that cannot be read are left out, and told of.
     reuse : an earlier result that is complete and of the same files, model and version
-    Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
+    Raises TrajectoryFileError where there is no such file, AnalysisError, SceneError, ModelError, OutputError.
     """
     from disctrack.diagnosis.together.output import as_json, figures, lines, whole_page
     from disctrack.pages.figures import draw, gallery  # matplotlib is wanted here only
@@ -57,15 +60,21 @@ def run_together(
     folder = Path(output) if output is not None else common_folder(paths) / FOLDER
     report = folder / "diagnosis.json"
     known = Path(model).read_text(encoding="utf-8") if Path(model).is_file() else model
-    made_from = {"model": known, "plan": settle, "files": [read_setup(p).fingerprint for p in paths]}
-    origin = origin_of(paths[0], made_from)
+    progress("reading")
+    read, unread = _read(paths)
+    if not read:
+        raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
+    made_from = {"model": known, "plan": settle, "files": [read_setup(p).fingerprint for p in read], "unread": unread}
+    origin = hash_of(made_from)
     told = reusable(folder, origin) if reuse else None
     if told is not None:
-        return TogetherOutcome(None, (report, folder / "diagnosis.html"), tuple(told))
+        document = json.loads(report.read_text(encoding="utf-8"))
+        pages = (report, folder / "diagnosis.html")
+        return TogetherOutcome(None, pages, tuple(told), tuple(document["unusable"]))
     refuse_other(report, overwrite)
     refuse_input(report)
-    recordings = _told_apart([read_recorded(p) for p in paths], paths)
-    result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle)
+    recordings = _told_apart(list(read.values()), list(read))
+    result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle, unread=unread)
     drawn = figures(result)
     files, pictures = draw(folder, drawn, ["png"])
     html = folder / "diagnosis.html"
@@ -73,7 +82,20 @@ def run_together(
     write_whole(report, json_file({"files": [str(p) for p in paths], **as_json(result)}))
     said = lines(result)
     remember(folder, origin, said, (report, html, *files))
-    return TogetherOutcome(result, (report, html, *files), tuple(said))
+    return TogetherOutcome(result, (report, html, *files), tuple(said), result.unusable)
+
+
+def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:
+    """Recordings by their files, and why others cannot be read: one spoilt file is no reason to lose the rest."""
+    read, unread = dict[Path, Recorded](), dict[str, str]()
+    for path in paths:
+        try:
+            read[path] = read_recorded(path)
+        except TrajectoryFileError as error:
+            if not path.is_file():  # mistyped
+                raise
+            unread[str(path)] = str(error).removeprefix(f"{path}: ")
+    return read, unread
 
 
 def common_folder(paths: Sequence[Path]) -> Path:
