@@ -64,9 +64,9 @@ def test_sigma_falls_with_the_root_of_the_number(rng):
 def test_a_run_of_another_disc_among_them_is_named(rng):
     items = runs(rng, 12, run_7={"rate": 0.87})
     system, found = answer(items)
-    assert apart(system, found.after, 0.005) == [7]
+    assert list(apart(system, found.after, 0.005)) == [7]
     system, found = answer(runs(rng, 12))
-    assert apart(system, found.after, 0.005) == []
+    assert list(apart(system, found.after, 0.005)) == []
 
 
 def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
@@ -76,7 +76,41 @@ def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
     system, found = answer(runs(rng, 9, **two))
     assert sorted(apart(system, found.after, 0.005)) == [6, 7]
     system, found = answer(runs(rng, 9, run_5=heavy, **two))
-    assert apart(system, found.after, 0.005) == [7]
+    assert list(apart(system, found.after, 0.005)) == [7]
+
+
+def named(items, **more):
+    system, _ = joint(items)
+    found = fit(system, system.base, system.sharing.start())
+    return apart(system, found, 0.005, **more), system.candidates
+
+
+def test_a_run_with_a_fault_that_no_shared_number_takes_is_named_with_the_fault(rng):
+    items = runs(rng, 12, run_7={"hum": 0.006})
+    alone, candidates = named(items)
+    assert alone == {}  # the rates agree
+    assert named(items, candidates=candidates)[0] == {7: "hum [hum]"}
+    everywhere = runs(rng, 12, **{f"run_{i}": {"hum": 0.006} for i in range(12)})
+    assert named(everywhere, candidates=candidates)[0] == {}  # it is in all: the search's to find
+    scattered = {f"run_{i}": {"hum": 0.006 * rng.standard_normal()} for i in range(12)}
+    assert named(runs(rng, 12, **scattered | {"run_7": {"hum": 0.006}}), candidates=candidates)[0] == {}
+    two, _ = named(runs(rng, 12, run_3={"hum": 0.006}, run_7={"growth": 0.02}), candidates=candidates)
+    assert two.keys() == {3, 7}
+    assert two[3] == "hum [hum]"
+
+
+def test_difference_in_an_effect_is_a_chi_square_and_names_nobody_by_chance(rng):
+    falls, false = [], 0
+    for _ in range(40):
+        system, _ = joint(runs(rng, 8))
+        found = fit(system, system.base, system.sharing.start())
+        falls += Blocks(system, found, system.candidates).differences(range(8)).values()
+        false += bool(apart(system, found, 0.005, candidates=system.candidates))
+    falls = np.array(falls)  # (320, candidates, 2)
+    assert_allclose(falls[..., 1], np.tile([1, 2, 1], (320, 1)))
+    # eight of seven are free; three standard errors
+    assert_allclose(falls[..., 0].mean(0) / [1, 2, 1], 1.0, atol=3 * np.sqrt(2 / 280))
+    assert false <= 3  # at most 0.4 are expected
 
 
 def test_difference_to_the_others_is_a_chi_square(rng):

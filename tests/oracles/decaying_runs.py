@@ -74,9 +74,11 @@ def runs(rng, n, drag=0.0, rate=0.8, **changed):
     """(name, data, labels, covariates, density) of n runs; changed: run_3={"rate": 0.9, "mass": 2.0, ...}."""
     items = []
     for i in range(n):
-        own = {"rate": rate, "drag": drag, "growth": 0.0, "mass": 1.0, "density": 1.0, **changed.get(f"run_{i}", {})}
+        own = {"rate": rate, "drag": drag, "growth": 0.0, "hum": 0.0, "mass": 1.0, "density": 1.0}
+        own |= changed.get(f"run_{i}", {})
         truth = {"state.a": 1 + 0.2 * rng.standard_normal(), "state.b": 0.1 * rng.standard_normal(),
-                 "friction.g": own["rate"], "drag.c": own["drag"], "growth.k": own["growth"]}  # fmt: skip
+                 "friction.g": own["rate"], "drag.c": own["drag"], "growth.k": own["growth"],
+                 "hum.c": own["hum"]}  # fmt: skip
         clean = -Decay(np.zeros_like(TIME), own["density"]).linearise(truth, [])[0][:, 0] * SIGMA
         labels = {"disc": f"{own['mass']:g} kg", "surface": "glass", "rig": "rig 1", "air": f"{own['density']:g}"}
         covariates = {"mass": own["mass"], "density": own["density"]}

@@ -1,18 +1,28 @@
-"""Which recordings do not fit the others?"""
+"""Which recordings do not fit the others?
+
+Two tests of each against all others. Of what they share: do the numbers that it determines differ from those that the
+others foretell? Of what the model does not hold: does an effect of the catalogue (a table that leans, a dot misprinted,
+a camera that was touched) have another size in it than in the others? Of an effect that the others do not see at all it
+may have any size, and nobody differs by it.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, prior_rows, triangle
+from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.joint import JointSystem
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
 SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit
 TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
+SEEN = 1e-6  # part of an effect's derivative that is left beside what is shared, from which on it is seen
+ALIKE = 10.0  # of chi-square, by which another effect tells less and may yet be the one
+NAMED = 3  # effects that one recording may differ by
 DETERMINED = 3.0  # sigmas that a prior's sigma makes in a recording, from which the recording itself tells of it
 
 
@@ -24,14 +34,22 @@ class FitsIn:
     degrees: int
     p_value: float
     chi_square: float  # of its data with the shared quantities
+    differs_by: str = ""  # the effect that has another size in it, where that tells most
 
 
 class Blocks:
     """Every recording's least-squares problem in the shared quantities, at one point."""
 
-    def __init__(self, system: JointSystem, fit: Fit) -> None:
-        """Fit : of the joint system."""
-        residual, derivative = system.linearise(fit.values, fit.names)
+    def __init__(self, system: JointSystem, fit: Fit, candidates: Sequence[Candidate] = ()) -> None:
+        """Fit : of the joint system.   candidates : that a recording may have in another size than the others."""
+        self.candidates = [c for c in candidates if not set(c.names) & set(fit.names)]
+        new = {q.name: q.null for c in self.candidates for q in c.quantities}
+        residual, every = system.linearise(new | fit.values, [*fit.names, *new])
+        derivative, self._by_candidate = every[..., : len(fit.names)], every[..., len(fit.names) :]
+        length = np.sqrt(np.sum(self._by_candidate**2, axis=(0, 1)))
+        self._by_candidate = self._by_candidate / np.where(length > 0, length, 1.0)
+        column = {name: i for i, name in enumerate(new)}
+        self._columns = [[column[n] for n in c.names] for c in self.candidates]
         free = [i for i, q in enumerate(fit.quantities) if q.lower < fit.values[q.name] < q.upper]
         self.names = tuple(fit.names[i] for i in free)
         self.right, self.matrix = residual, derivative[..., free]
@@ -67,6 +85,36 @@ class Blocks:
         p = float(stats.chi2.sf(statistic, degrees)) if degrees > 0 else 1.0
         return FitsIn(statistic, max(degrees, 0), p, float(self.chi_square[i]))
 
+    def differences(self, kept: Sequence[int]) -> dict[int, list[tuple[float, int]]]:
+        """Of each recording of `kept` and each candidate: fall of chi-square with a size of its own, and of degrees.
+
+        All that is shared is free; the candidate has one size for the others, which is its own size, too, before.
+        """
+        c, b = self._by_candidate.shape[-1], len(self.names)
+        rows = [np.concatenate([self.matrix[k], self._by_candidate[k], self.right[k][:, None]], axis=1) for k in kept]
+        prior = np.concatenate([self.prior[1], np.zeros((len(self.prior[0]), c)), self.prior[0][:, None]], axis=1)
+        before, after = [triangle(prior)], [np.zeros((0, b + c + 1))]
+        for block in rows[:-1]:
+            before.append(triangle(np.concatenate([before[-1], block])))
+        for block in rows[:0:-1]:
+            after.append(triangle(np.concatenate([after[-1], block])))
+        found = {}
+        for i, block, *rest in zip(kept, rows, before, reversed(after), strict=True):
+            others = np.concatenate(rest)
+            apart_, right = np.zeros((len(others), c)), others[:, b + c :]
+            theirs = np.concatenate([others[:, : b + c], apart_, right], axis=1)
+            mine = np.concatenate([block[:, :b], 0 * block[:, b:-1], block[:, b:]], axis=1)
+            left = triangle(np.concatenate([theirs, mine]))[b:, b:]  # what is shared takes its best values
+            found[i] = [self._difference(left, self._columns[k], c) for k in range(len(self.candidates))]
+        return found
+
+    def _difference(self, left: Array, columns: list[int], c: int) -> tuple[float, int]:
+        """Left : (m, 2 c + 1) by the candidates' sizes in the others, in the recording itself, and what is left."""
+        theirs, mine, right = left[:, columns], left[:, [c + j for j in columns]], left[:, -1]
+        one, rank_of_one = _least_seen(right, theirs + mine)
+        two, rank_of_two = _least_seen(right, np.concatenate([theirs, mine], axis=1))
+        return max(one - two, 0.0), rank_of_two - rank_of_one
+
 
 def _least(right: Array, matrix: Array, scale: Array) -> tuple[float, int]:
     """Smallest sum of squares of right - matrix x, and how many combinations of x the matrix determines."""
@@ -74,21 +122,66 @@ def _least(right: Array, matrix: Array, scale: Array) -> tuple[float, int]:
     return float(np.sum((right - matrix @ (scale * x)) ** 2)), int(rank)
 
 
-def apart(system: JointSystem, fit: Fit, level: float, most: int | None = None) -> list[int]:
-    """Recordings that do not fit the others, one after the other, the worst first.
+def _least_seen(right: Array, matrix: Array) -> tuple[float, int]:
+    """Smallest sum of squares of right - matrix x, and how many combinations of its columns, of size one, are seen."""
+    length = np.linalg.norm(matrix, axis=0)
+    seen = length > SEEN
+    U, singular, _ = np.linalg.svd(matrix[:, seen] / length[seen], full_matrices=False)
+    along = U[:, singular > SEEN].T @ right
+    return float(right @ right - along @ along), len(along)
+
+
+def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
+    """Each recording of `kept` against the others, by what is shared or by the candidates that tell most.
+
+    Where the candidates' sizes scatter over all recordings by more than the noise, as in every laboratory a little, a
+    recording has to stand out of that. p is the smaller of both tests', for the number of candidates.
+    """
+    found = {i: blocks.fits_in(i, kept) for i in kept}
+    if not blocks.candidates:
+        return found
+    falls = blocks.differences(kept)
+    scatter = []
+    for k in range(len(blocks.candidates)):
+        usual = [fall[k][0] / stats.chi2.median(fall[k][1]) for fall in falls.values() if fall[k][1] > 0]
+        scatter.append(max(1.0, float(np.median(usual))) if usual else 1.0)
+    for i, fall in falls.items():
+        told = [
+            (float(stats.chi2.sf(difference / scatter[k], degrees)), difference / scatter[k], degrees, k)
+            for k, (difference, degrees) in enumerate(fall)
+            if degrees > 0
+        ]
+        if not told:
+            continue
+        p, statistic, degrees, _ = min(told, key=lambda one: (one[0], -one[1]))
+        p = min(2.0 * len(blocks.candidates) * p, 1.0)
+        if (p, -statistic) < (found[i].p_value, -found[i].statistic):
+            # those that tell as much, the one with the fewest numbers first
+            alike = sorted((one for one in told if statistic - one[1] < ALIKE), key=lambda one: (one[2], -one[1]))
+            first, *others = (blocks.candidates[one[3]] for one in alike[:NAMED])
+            words = f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
+            found[i] = replace(found[i], statistic=statistic, degrees=degrees, p_value=p, differs_by=words)
+    return found
+
+
+def apart(
+    system: JointSystem, fit: Fit, level: float, most: int | None = None, candidates: Sequence[Candidate] = ()
+) -> dict[int, str]:
+    """Recordings that do not fit the others, the worst first, and what they differ by where an effect tells it.
 
     level : probability that one recording of many that do fit is named
     most : that may be taken away; a third of them, if not given
+    candidates : effects of which a recording may have another size than the others
     Each is judged by those that are left, to first order about a fit that the first one has moved: those that stand out
     by far less than it did have to be judged after another fit. Of two either of which fits without the other, as where
     nobody else has their disc, nobody knows which is wrong: both are named.
     """
     n = len(system.time)
-    blocks = Blocks(system, fit)
-    kept, named, first = list(range(n)), list[int](), 0.0
+    blocks = Blocks(system, fit, candidates)
+    kept, named, first = list(range(n)), dict[int, str](), 0.0
     most = n // 3 if most is None else most
     while len(kept) > 2 and len(named) < most:
-        judged = {i: blocks.fits_in(i, kept) for i in kept}
+        judged = against_the_others(blocks, kept)
         worst = max(judged, key=lambda i: (-judged[i].p_value, judged[i].statistic / max(judged[i].degrees, 1)))
         statistic = judged[worst].statistic
         if judged[worst].p_value * n > level or statistic < SPOILT * first:
@@ -98,14 +191,14 @@ def apart(system: JointSystem, fit: Fit, level: float, most: int | None = None) 
         twins = [i for i in alike if _either_fits(blocks, (i, worst), kept, level / n, SPOILT * first)]
         for i in (worst, *twins[:1])[: most - len(named)]:
             kept.remove(i)
-            named.append(i)
+            named[i] = judged[i].differs_by
     return named
 
 
 def _either_fits(blocks: Blocks, pair: tuple[int, int], kept: Sequence[int], level: float, small: float) -> bool:
     """Does each of the two fit those of `kept` but the other?   small : a statistic that tells nothing"""
     for i, other in (pair, pair[::-1]):
-        judged = blocks.fits_in(i, [k for k in kept if k != other])
+        judged = against_the_others(blocks, [k for k in kept if k != other])[i]
         if judged.p_value <= level and judged.statistic >= small:
             return False
     return True

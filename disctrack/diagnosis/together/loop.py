@@ -124,11 +124,12 @@ def diagnose_together(
             crew.keep(kept)
             system, diagnosis = _search(members, crew, settings, progress)
             most = len(members) - (2 * len(items) + 2) // 3 if round_ < ROUNDS else 0
-            out = apart(system, diagnosis.after, settings.false_alarm, most)
+            effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
+            out = apart(system, diagnosis.after, settings.false_alarm, most, effects)
             if not out:
                 break
-            for k in out:
-                reasons[kept[k]] = "does not fit the others"
+            for k, effect in out.items():
+                reasons[kept[k]] = "does not fit the others" + (f"; it differs by: {effect}" if effect else "")
             members = [m for k, m in enumerate(members) if k not in out]
             kept = [i for k, i in enumerate(kept) if k not in out]
         progress("each recording against the others")
