@@ -25,7 +25,7 @@ class Correlated:
 def correlated(fit: Fit, names: Sequence[str], among: Sequence[str], strong: float = STRONG) -> tuple[Correlated, ...]:
     """The strongest partner of each of `names`, from `among`; every pair once, and only where it is strong."""
     found: dict[frozenset[str], Correlated] = {}
-    index = {name: i for i, name in enumerate(fit.names)}
+    index = {name: i for i, name in enumerate(fit.shared)}
     for first in names:
         pairs = [pair for second in among if second != first and (pair := _pair(fit, index, first, second))]
         best = max(pairs, key=lambda p: abs(p.correlation), default=None)

@@ -1,7 +1,7 @@
 """Gauss-Newton with bounds and priors; it has never heard of discs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import special
@@ -10,6 +10,7 @@ from scipy.optimize import lsq_linear
 from calibration.arrays import Array
 from calibration.brief import Outline
 from disctrack.diagnosis.engine.nuisances import Projection, is_linear, projection
+from disctrack.diagnosis.engine.own import Head, Own
 from disctrack.diagnosis.engine.system import Quantity, System, Values
 
 MAX_ITERATIONS = 40
@@ -26,13 +27,21 @@ class Fit(Outline):
 
     quantities: tuple[Quantity, ...]
     values: dict[str, float]  # of all quantities fitted, and of those that were held
-    covariance: Array  # (k, k) of the fitted ones; zero rows for those that the data do not show
+    covariance: Array  # (k, k) of the `shared` ones; zero rows for those that the data do not show
     chi_square: float  # of the data alone
     penalty: float  # of the priors
     n_data: int
     converged: bool
     n_iterations: int
     promised: float = 0.0  # chi-square that one more full step would lower, were the prediction linear
+    heads: tuple[Head, ...] = ()  # of the quantities that blocks of rows have of their own
+    # of them by name: root (r,), and how it moves with the shared ones (k,); its variance is their sum's
+    own: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        """Fitted quantities that no block of rows has of its own."""
+        return tuple(q.name for q in self.quantities if not q.slot)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -56,8 +65,19 @@ class Fit(Outline):
 
     def sigma(self, name: str) -> float:
         """Standard deviation of one fitted quantity; at a bound, how far inside it the truth may lie (rms)."""
-        i = self.names.index(name)
+        if name in self.own:
+            root, by_shared = self.own[name]
+            return float(np.sqrt(root @ root + max(float(by_shared @ self.covariance @ by_shared), 0.0)))
+        if name not in self.shared:
+            return 0.0  # of a fit that never began
+        i = self.shared.index(name)
         return float(np.sqrt(max(self.covariance[i, i], 0.0)))
+
+    def covariance_with(self, name: str) -> Array:
+        """(names,) covariances of a shared quantity with all that are fitted."""
+        column = self.covariance[self.shared.index(name)]
+        found = dict(zip(self.shared, column, strict=True)) | {n: g @ column for n, (_, g) in self.own.items()}
+        return np.array([found[n] for n in self.names])
 
 
 def compress(residual: Array, derivative: Array, common: Projection | None = None) -> tuple[Array, Array]:
@@ -86,12 +106,14 @@ def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, A
     """Rows that priors add to a least-squares problem: (right side (p,), matrix (p, k))."""
     with_prior = [i for i, q in enumerate(quantities) if np.isfinite(q.prior_sigma)]
     matrix = np.zeros((len(with_prior), len(quantities)))
-    right = np.zeros(len(with_prior))
     for row, i in enumerate(with_prior):
-        q = quantities[i]
-        matrix[row, i] = 1.0 / q.prior_sigma
-        right[row] = (q.null - values[q.name]) / q.prior_sigma
-    return right, matrix
+        matrix[row, i] = 1.0 / quantities[i].prior_sigma
+    return prior_residual(quantities, values), matrix
+
+
+def prior_residual(quantities: Sequence[Quantity], values: Values) -> Array:
+    """(p,) null minus value, over its standard deviation, of those with a prior."""
+    return np.array([(q.null - values[q.name]) / q.prior_sigma for q in quantities if np.isfinite(q.prior_sigma)])
 
 
 def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Array:
@@ -130,34 +152,44 @@ def fit(
     for q in quantities:
         values[q.name] = q.null if is_linear(q) else float(np.clip(values[q.name], q.lower, q.upper))
     common = projection(system, quantities, values)
-    moved = [q for q in quantities if not is_linear(q)]
+    own = Own(system, quantities)
+    local = [q for block in own.blocks for q in block.quantities]
+    moved = [q for q in quantities if not (is_linear(q) or q.slot)]
     names = [q.name for q in moved]
+    asked = [*own.slots, *names]
     lower, upper = np.array([q.lower for q in moved]), np.array([q.upper for q in moved])
-    residual, derivative = system.linearise(values, names)
+    residual, derivative = system.linearise(values, asked)
     n_data = int(np.sum(system.weights))
     prior, prior_matrix = prior_rows(moved, values)
-    cost = _cost(residual, prior, derivative, common)
+    strain = prior_residual([*moved, *local], values)
+    cost = _cost(residual, strain, derivative, common)
     converged, iteration, crawled = False, 0, 0
     expected = float("inf")
     matrix, right = np.zeros((0, len(names))), np.zeros(0)
+    heads: tuple[Head, ...] = ()
     while np.isfinite(cost) and iteration < max_iterations:
         iteration += 1
-        right, matrix = compress(residual, derivative, common)
+        if local:
+            right, matrix, heads = own.reduced(residual, derivative, values)
+        else:
+            right, matrix = compress(residual, derivative, common)
         right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
         x = np.array([values[n] for n in names])
         step = solve_bounded(right, matrix, lower - x, upper - x)
-        expected = float(right @ right - np.sum((right - matrix @ step) ** 2))
+        expected = float(right @ right - np.sum((right - matrix @ step) ** 2)) + sum(h.gain for h in heads)
+        local_step = own.moved(heads, step)
         if expected < TOLERANCE * max(1.0, cost / n_data):
             converged = True
             break
         for halving in range(_HALVINGS):
             factor = 0.5**halving
             trial = values | dict(zip(names, np.clip(x + factor * step, lower, upper).tolist(), strict=True))
-            new_prior, _ = prior_rows(moved, trial)
-            if halving and not _cost(system.linearise(trial, ())[0], new_prior, NO_DERIVATIVE, common) < cost:
+            trial |= {name: values[name] + factor * change for name, change in local_step.items()}
+            new_strain = prior_residual([*moved, *local], trial)
+            if halving and not _cost(system.linearise(trial, ())[0], new_strain, NO_DERIVATIVE, common) < cost:
                 continue  # derivatives cost many times more, and a step that failed once may well fail again
-            new_residual, new_derivative = system.linearise(trial, names)
-            new_cost = _cost(new_residual, new_prior, new_derivative, common)
+            new_residual, new_derivative = system.linearise(trial, asked)
+            new_cost = _cost(new_residual, new_strain, new_derivative, common)
             if np.isfinite(new_cost) and new_cost < cost:
                 break
         else:
@@ -165,13 +197,14 @@ def fit(
             converged = bool(expected < max(0.1, 1e-7 * cost))
             break
         crawled = crawled + 1 if halving and cost - new_cost < CRAWLING * cost else 0
-        values, residual, derivative, prior, cost = trial, new_residual, new_derivative, new_prior, new_cost
+        values, residual, derivative, strain, cost = trial, new_residual, new_derivative, new_strain, new_cost
+        prior, _ = prior_rows(moved, values)
         if crawled == CRAWLED and not may_crawl:
             break
     covariance = covariance_within(matrix, right, np.array([values[n] for n in names]), lower, upper)
     chi_square, penalty = float(cost), 0.0
     if np.isfinite(cost):
-        penalty = float(prior @ prior)
+        penalty = float(strain @ strain)
         chi_square = cost - penalty
     if np.isfinite(cost) and common.names:
         flat = residual.reshape(-1, 1)
@@ -184,12 +217,15 @@ def fit(
         covariance = covariance[np.ix_(order, order)]
     elif common.names:
         covariance = np.zeros((len(quantities), len(quantities)))
-    return Fit(quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration, expected)
+    return Fit(
+        quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration, expected, heads,
+        own.known(heads),
+    )  # fmt: skip
 
 
 def no_fit(quantities: Sequence[Quantity], values: Values) -> Fit:
     """What became of a fit that was given up: nothing that any other could be worse than."""
-    k = len(quantities)
+    k = sum(not q.slot for q in quantities)
     return Fit(tuple(quantities), dict(values), np.zeros((k, k)), np.inf, 0.0, 0, False, 0)
 
 

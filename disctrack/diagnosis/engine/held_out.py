@@ -1,12 +1,14 @@
 """Fit on the first part, free run over the rest: the judge that a flexible model cannot flatter."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.arrays import Array, Mask
 from disctrack.diagnosis.engine.fit import Fit, fit, triangle
+from disctrack.diagnosis.engine.own import Head, Own
+from disctrack.diagnosis.engine.score import INVISIBLE, cleared, span
 from disctrack.diagnosis.engine.system import Quantity, Subset, System, Values
 
 TRAIN_FRACTION = 0.65  # of the time
@@ -39,25 +41,69 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     """Fit on `rows`, then predict the others from that fit alone.
 
     The predictive distribution of the test data is normal with covariance 1 + J P J^T (P: covariance of the fit), so
-    that a quantity which the first part leaves open is not punished for it.
+    that a quantity which the first part leaves open is not punished for it. Of quantities that a block of rows has of
+    its own and that the first part says nothing of (those of a run that is kept back), what they cannot move is judged.
     """
     train = fit(Subset(system, rows), quantities, start)
     test = ~rows & (system.weights > 0)
-    residual, derivative = system.linearise(train.values, train.names)
-    residual, derivative = residual[test].reshape(-1), derivative[test]
-    derivative = derivative.reshape(residual.size, len(train.names))
+    own = Own(system, train.quantities)
+    kept = [b for b in own.blocks if test[b.rows].any() and not (rows & (system.weights > 0))[b.rows].any()]
+    if kept:  # near their best values the prediction is linear in them
+        alone = np.zeros(len(test), bool)
+        alone[np.concatenate([b.rows for b in kept])] = True
+        theirs = fit(Subset(system, alone), [q for b in kept for q in b.quantities], train.values)
+        train = replace(train, values=theirs.values)
+    residual, derivative = system.linearise(train.values, [*own.slots, *train.shared])
     n_data = int(np.sum(system.weights[test]))
-    if not (np.isfinite(residual).all() and np.isfinite(derivative).all()):
+    finite = np.isfinite(residual[test]).all() and np.isfinite(derivative[test]).all()
+    if not finite or len(train.heads) < len(own.blocks):
         return HeldOut(train, test, np.inf, float(n_data), -np.inf, n_data)
     root = _square_root(train.covariance)
-    B = derivative @ root
-    # R of [B, residual] over [1, 0]: its squares, which a run-away motion would make singular, are never formed
-    k = B.shape[1]
-    R = triangle(np.block([[B, residual[:, None]], [np.eye(k), np.zeros((k, 1))]]))
+    k = root.shape[1]
+    # B: the prediction's derivative by independent numbers of variance one that make up what the fit leaves open
+    both = np.zeros((*residual.shape, k + 1))
+    m, w = int(np.sum(test)), residual.shape[1]
+    by_shared = own.cleared(derivative, train.heads)[test].reshape(m * w, k)
+    both[test, :, :k], both[test, :, k] = (by_shared @ root).reshape(m, w, k), residual[test]
+    parts = [both[own.rest][test[own.rest]].reshape(-1, k + 1)]
+    foretold, log_determinant, spread = [parts[0]], 0.0, 0.0
+    for block, head in zip(own.blocks, train.heads, strict=True):
+        here = block.rows[test[block.rows]]
+        part, J = both[here].reshape(-1, k + 1), derivative[here][..., block.columns].reshape(-1, len(block.columns))
+        if block in kept:  # of what is known beforehand, that is the expectation
+            known = [np.isfinite(q.prior_sigma) for q in block.quantities]
+            away = [train.values[q.name] - q.null for q in block.quantities]
+            part[:, k] += J @ np.where(known, away, 0.0)
+        part, R, B, free = _beside_own(part, J, head)
+        n_data -= free
+        spread += float(np.sum(B * B))
+        log_determinant += float(np.sum(np.log(np.abs(np.diag(R)[: B.shape[1]]))))
+        foretold.append(R[B.shape[1] :, B.shape[1] :])
+        parts.append(part)
+    everything, whitened = np.concatenate(parts), np.concatenate(foretold)
+    R = _over_ones(whitened[:, :k], whitened[:, k:])
     quadratic = R[k, k] ** 2 if R.shape[0] > k else 0.0
-    log_density = -0.5 * (quadratic + 2 * np.sum(np.log(np.abs(np.diag(R)[:k]))))
-    expected = n_data + float(np.sum(B * B))
-    return HeldOut(train, test, float(residual @ residual), expected, float(log_density), n_data)
+    log_density = -0.5 * (quadratic + 2 * (np.sum(np.log(np.abs(np.diag(R)[:k]))) + log_determinant))
+    expected = n_data + spread + float(np.sum(everything[:, :k] ** 2))
+    return HeldOut(train, test, float(np.sum(everything[:, k] ** 2)), expected, float(log_density), n_data)
+
+
+def _beside_own(part: Array, J: Array, head: Head) -> tuple[Array, Array, Array, int]:
+    """Rows (m, k + 1) of a block without what its own quantities may be; R of them beside the own ones; these; number.
+
+    J : (m, p) by the own quantities. What nothing that was fitted determines (all of a run that is kept back) may be
+    what it likes and is cleared; the others are as uncertain as the fit leaves them.
+    """
+    open_, largest = J @ head.open, np.linalg.norm(J, axis=0) @ np.abs(head.open)
+    free = span(open_[:, np.linalg.norm(open_, axis=0) > INVISIBLE * largest])
+    part, B = cleared(part, free), cleared(J @ head.root, free)
+    return part, _over_ones(B, part), B, free.shape[1]
+
+
+def _over_ones(B: Array, others: Array) -> Array:
+    """R of [B, others] over [1, 0]: the squares of B, which a run-away motion would make singular, are never formed."""
+    ones = np.eye(B.shape[1], B.shape[1] + others.shape[1])
+    return triangle(np.concatenate([np.concatenate([B, others], axis=1), ones]))
 
 
 def _square_root(covariance: Array) -> Array:

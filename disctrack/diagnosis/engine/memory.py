@@ -12,6 +12,7 @@ import numpy as np
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
+from disctrack.diagnosis.engine.own import Own
 from disctrack.diagnosis.engine.system import System
 
 SHORTEST = 40  # samples from which a memory is looked for
@@ -21,15 +22,18 @@ SURE = 3.0  # standard deviations of the long-run variance itself, below which i
 def inflation(system: System, fit: Fit) -> Array:
     """(k,) by which the standard deviation of each fitted quantity grows; 1 where no memory is seen.
 
-    Linear quantities with priors keep theirs.
+    Linear quantities with priors keep theirs, and those that blocks of rows have of their own.
     """
     factors = np.ones(len(fit.quantities))
-    moved = [i for i, q in enumerate(fit.quantities) if not is_linear(q)]
-    covariance = fit.covariance[np.ix_(moved, moved)]
+    moved = [i for i, q in enumerate(fit.quantities) if not (is_linear(q) or q.slot)]
+    here = [fit.shared.index(fit.names[i]) for i in moved]
+    covariance = fit.covariance[np.ix_(here, here)]
     rows = np.flatnonzero(system.weights > 0)
     if len(rows) < SHORTEST or not moved or not covariance.any():
         return factors
-    residual, derivative = system.linearise(fit.values, [fit.names[i] for i in moved])
+    own = Own(system, fit.quantities)
+    residual, derivative = system.linearise(fit.values, [*own.slots, *(fit.names[i] for i in moved)])
+    derivative = own.cleared(derivative, fit.heads) if fit.heads else derivative
     common = projection(system, fit.quantities, fit.values)
     cleared = common.cleared(derivative.reshape(residual.size, -1))[: residual.size].reshape(derivative.shape)
     by_number = cleared[rows] @ covariance  # (n, w, k)

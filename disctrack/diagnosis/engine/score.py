@@ -13,6 +13,7 @@ import numpy as np
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, compress, prior_rows, solve_bounded
 from disctrack.diagnosis.engine.nuisances import is_linear, projection
+from disctrack.diagnosis.engine.own import Own
 from disctrack.diagnosis.engine.system import Candidate, Quantity, System
 
 DEPENDENT = 1e-9  # singular value over the largest, below which columns are combinations of the others
@@ -42,12 +43,16 @@ class Linearisation:
         of_candidates = {q.name: q for c in candidates for q in c.quantities}
         new = {n: q for n, q in of_candidates.items() if n not in known or _frees(q, known[n])}
         common = projection(system, fit.quantities, fit.values)
-        self.fitted = tuple(q for q in fit.quantities if not is_linear(q))
+        own = Own(system, fit.quantities)
+        self.fitted = tuple(q for q in fit.quantities if not (is_linear(q) or q.slot))
         values = {name: q.null for name, q in new.items()} | fit.values
         values |= dict(zip(common.names, common.null.tolist(), strict=True))
         names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
-        residual, derivative = system.linearise(values, names)
-        right, matrix = compress(residual, derivative, common)
+        residual, derivative = system.linearise(values, [*own.slots, *names])
+        if own.blocks:
+            right, matrix, _ = own.reduced(residual, derivative, values)
+        else:
+            right, matrix = compress(residual, derivative, common)
         everything = [*self.fitted, *new.values()]
         prior, prior_matrix = prior_rows(everything, values)
         self.right = np.concatenate([right, prior])

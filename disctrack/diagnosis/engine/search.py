@@ -15,7 +15,7 @@ from scipy import stats
 from calibration.arrays import Mask
 from calibration.brief import Outline
 from disctrack.diagnosis.engine.chance import Chance, chance
-from disctrack.diagnosis.engine.fit import Fit, fit, no_fit, prior_rows
+from disctrack.diagnosis.engine.fit import Fit, fit, no_fit, prior_residual
 from disctrack.diagnosis.engine.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.diagnosis.engine.memory import inflation
 from disctrack.diagnosis.engine.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
@@ -271,7 +271,7 @@ class _Search:
         if not self.rough:
             return False
         values = known.values | {q.name: start.get(q.name, q.null) for q in known.quantities}
-        right, _ = prior_rows(known.quantities, values)
+        right = prior_residual(known.quantities, values)
         cost = float(np.sum(self.system.linearise(values, ())[0] ** 2) + right @ right)
         return cost < known.cost - CLASS_GAIN * self.noise
 
@@ -644,5 +644,6 @@ def _without(values: Values, candidate: Candidate, rest: Sequence[Candidate]) ->
 
 def _restricted(fit_: Fit, quantities: tuple[Quantity, ...]) -> Fit:
     """The same fit with fewer quantities counted as free."""
-    index = [fit_.names.index(q.name) for q in quantities]
+    kept = {q.name for q in quantities}
+    index = [i for i, name in enumerate(fit_.shared) if name in kept]
     return replace(fit_, quantities=quantities, covariance=fit_.covariance[np.ix_(index, index)])

@@ -34,6 +34,10 @@ class Quantity:
     linear: bool = False  # the prediction is linear in it with a derivative that is the same everywhere
     belongs_to: tuple[str, ...] = ()  # what must be the same in two recordings for them to share it; (): never shared
     declared: float | None = None  # beforehand, if only roughly: where a fit that was led far off may begin anew
+    # of one block of rows alone, without bounds: the column in which `linearise` gives the derivatives by all such
+    # numbers, each in the rows of its own block
+    slot: str = ""
+    block: int = 0  # number of that block
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,11 @@ def beginnings(system: System) -> Sequence[System]:
     return tuple(getattr(system, "beginnings", ()))
 
 
+def blocks(system: System) -> Sequence[slice]:
+    """Rows that may have quantities of their own (`engine.own`); none where the system does not say so."""
+    return tuple(getattr(system, "blocks", ()))
+
+
 def undo_each_other(system: System, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
     """Do some of these effects undo each other, or what the model has? Not where the system does not say so.
 
@@ -166,6 +175,11 @@ class Wrapped:
     def several_minima(self) -> bool:
         """As the system's: may fits of the same quantities end in different minima?"""
         return several_minima(self._system)
+
+    @property
+    def blocks(self) -> Sequence[slice]:
+        """As the system's: rows that may have quantities of their own."""
+        return blocks(self._system)
 
     def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
         """As the system's."""

@@ -129,7 +129,8 @@ class Run:
     hold : how inputs go on between samples: "smooth" (cubic), "linear", or "hold" (a step at each sample)
     groups : what the run belongs to, by kind of group: {"ball": "golf"}; a `Parameter(per="ball")` is one of each ball
     noise : noise that remembers, of every channel, in place of sigma
-    fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run)
+    fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run). 0: all
+            of it judges, by what no start of its own can explain
     at_rest : True where nothing moved before the first sample: a sensor that lags then shows what it shows there
     """
 
@@ -209,7 +210,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
             f"run {name}: needs 8 samples or more at finite, increasing times; found {n}"
             + (f", and time[{bad}] = {time[bad]:g} after {time[bad - 1]:g}." if bad else ".")
         )
-    if run.fit_until is not None and np.sum(time - time[0] <= run.fit_until) < 8:
+    if run.fit_until and np.sum(time - time[0] <= run.fit_until) < 8:
         raise AnalysisError(
             f"run {name}: fewer than 8 samples until fit_until = {run.fit_until:g} s; a fit needs them."
         )

@@ -11,8 +11,9 @@ from scipy import stats
 from scipy.linalg import qr
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.fit import Fit, compress, fit, solve_bounded
+from disctrack.diagnosis.engine.fit import Fit, fit, solve_bounded
 from disctrack.diagnosis.engine.held_out import held_out
+from disctrack.diagnosis.engine.own import Own
 from disctrack.diagnosis.engine.search import (
     CLASS_GAIN,
     NOT_CONVERGED,
@@ -38,14 +39,13 @@ from disctrack.diagnosis.equations.noise import (
     with_noise,
 )
 from disctrack.diagnosis.equations.start import LOST, Start, guessed, led, misfit, turn
-from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part, fitted_rows
+from disctrack.diagnosis.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
 SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over the first
 BLUNT = 0.1  # of chi-square, by which a sharper jump may move the motion: numbers then move by 0.3 sigma at most
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
-MOST_STATES = 80  # initial states that are fitted along
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
 NO_SENSOR = 5.0  # times the declared noise: nobody knows a sensor so badly
 FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
@@ -241,7 +241,8 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             p = system.numbers(values, s)
             found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
             passed.append([np.broadcast_to(x, s.time.shape) for x in found])
-    names = [q.name for q in system.base]
+    own = Own(system, system.base)
+    names = [q.name for q in system.base if not q.slot]
     amounts = {c.name: c for c in system.with_(aims={}).candidates if any(n.startswith(f"{c.name}.") for n in f.along)}
     best: dict[str, tuple[float, dict[str, float]]] = {}
     # a term that every fit has keeps its limit: without an aim no fit would move it
@@ -254,13 +255,13 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
         there = system.with_(aims=kept | tried)
         asked = [*names, *(n for c in amounts.values() for n in c.names)]
-        residual, derivative = there.linearise(values, asked)
-        right, matrix = compress(residual, derivative)
-        if not np.isfinite(matrix).all():
+        residual, derivative = there.linearise(values, [*own.slots, *asked])
+        if not np.isfinite(derivative).all():
             continue
+        right, matrix, _ = own.reduced(residual, derivative, values)
         for c in amounts.values():
-            own = [asked.index(n) for n in c.names]
-            gain, amounts_there = _first_order(right, matrix[:, : len(names)], matrix[:, own], c.quantities)
+            mine = [asked.index(n) for n in c.names]
+            gain, amounts_there = _first_order(right, matrix[:, : len(names)], matrix[:, mine], c.quantities)
             if gain > best.get(c.name, (0.0, {}))[0]:
                 limits = {n: v for n, v in tried.items() if n.startswith(f"{c.name}.")}
                 best[c.name] = gain, limits | dict(zip(c.names, amounts_there.tolist(), strict=True))
@@ -372,16 +373,18 @@ def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, f
 
 def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tuple[str, ...], str]:
     """Parameters that the data cannot part from others, to be held as declared; and how to say that."""
-    free = [q for q in system.base if not q.name.startswith("state.") and np.isinf(q.prior_sigma)]
-    states = [q.name for q in system.base if q.name.startswith("state.")]
-    residual, derivative = system.linearise(values, [*states, *(q.name for q in free)])
+    own = Own(system, system.base)
+    free = [q for q in system.base if not (q.slot or q.name.startswith("state.")) and np.isinf(q.prior_sigma)]
+    states = [q.name for q in system.base if q.name.startswith("state.") and not q.slot]
+    residual, derivative = system.linearise(values, [*own.slots, *states, *(q.name for q in free)])
     if len(free) < 2 or not np.isfinite(derivative).all():
         return (), ""
-    _, matrix = compress(residual, derivative)
+    _, matrix, _ = own.reduced(residual, derivative, values)
     k = len(states)
     basis = np.linalg.qr(matrix[:, :k] / np.maximum(np.linalg.norm(matrix[:, :k], axis=0), 1e-300))[0]
-    columns = matrix[:, k:] * np.array([max(abs(values.get(q.name, q.null)), q.scale) for q in free])
-    before = np.linalg.norm(columns, axis=0)
+    size = np.array([max(abs(values.get(q.name, q.null)), q.scale) for q in free])
+    before = size * np.linalg.norm(derivative[..., -len(free) :], axis=(0, 1))
+    columns = matrix[:, k:] * size
     cleared = columns - basis @ (basis.T @ columns)
     _, R, order = qr(cleared / np.where(before > 0, before, 1.0), mode="economic", pivoting=True)
     weak = [free[j] for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
@@ -399,12 +402,8 @@ def _in_stretches(
     system: EquationSystem, values: Mapping[str, float], length: float
 ) -> tuple[EquationSystem, dict[str, float], str]:
     """The runs cut where the model loses them, each stretch with a start of its own."""
-    total = sum(float(s.time[-1] - s.time[0]) for s in system.stretches)
-    n = len(system.formulas.states)
-    shortest = total * n / MOST_STATES
-    pieces = cut(system.stretches, max(length, min(shortest, length)))
-    most = max(len(system.stretches), MOST_STATES // n)
-    chosen = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, min(most, len(pieces))).astype(int))]
+    pieces = cut(system.stretches, length)
+    chosen = spread(pieces, len(system.formulas.states), at_least=len(system.stretches))
     system = system.with_(stretches=chosen)
     shared = {k: v for k, v in values.items() if not k.startswith("state.")}
     guesses, _ = guessed(system)
@@ -575,7 +574,7 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diag
 
 def _wald(names: Sequence[str], fitted: Fit) -> float:
     """Square of the distance from nought in standard deviations, of numbers that move together."""
-    here = [fitted.names.index(n) for n in names]
+    here = [fitted.shared.index(n) for n in names]
     return wald(np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(here, here)])
 
 
@@ -586,27 +585,38 @@ def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
     bends as many sums over blocks to nought as it has numbers: data that hold too few blocks are cut into shorter ones,
     which are then taken as wholly alike for as long as an error lasts (the largest that their sum can be).
     """
-    names = fitted.names
-    residual, derivative = system.linearise(fitted.values, names)
+    own = Own(system, fitted.quantities)
+    names = fitted.shared
+    residual, full = system.linearise(fitted.values, [*own.slots, *names])
+    heads = own.reduced(residual, full, fitted.values)[2]
+    derivative = own.cleared(full, heads)
     length = np.linalg.norm(derivative.reshape(-1, len(names)), axis=0)
     scale = np.where(length > 0, length, 1.0)
     J = derivative / scale
     normal = np.einsum("nwi,nwj->ij", J, J)
     duration = sum(float(np.ptp(system.time[rows])) for rows in system.rows)
-    cut = min(block, duration / (ENOUGH * len(names)))
-    scores = []
-    for rows in system.rows:
-        number = ((system.time[rows] - system.time[rows.start]) / cut).astype(int)
-        for b in np.unique(number):
-            here = np.flatnonzero(number == b) + rows.start
-            scores.append(np.einsum("nwi,nw->i", J[here], residual[here]))
-    S = np.array(scores)
-    few = len(S) / max(len(S) - len(names), 1)
-    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    cut = min(block, duration / (ENOUGH * len(fitted.names)))
+    parts = [
+        [np.flatnonzero(number == b) + rows.start for b in np.unique(number)]
+        for rows in system.rows
+        for number in [((system.time[rows] - system.time[rows.start]) / cut).astype(int)]
+    ]
+    S = np.array([np.einsum("nwi,nw->i", J[here], residual[here]) for of_run in parts for here in of_run])
+    few = len(S) / max(len(S) - len(fitted.names), 1)
     alike = min(block, duration) / cut
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     spread = few * alike * inverse @ (S.T @ S) @ inverse / np.outer(scale, scale)
     free = np.diag(fitted.covariance) > 0
-    return replace(fitted, covariance=np.where(np.outer(free, free), spread, 0.0))
+    size, spread_heads = np.sqrt(few * alike), []
+    for of_block, head in zip(own.blocks, heads, strict=True):
+        of_own = [
+            np.einsum("nwi,nw->i", full[here][..., of_block.columns], residual[here])
+            for here in parts[of_block.quantities[0].block]
+        ]
+        # what errors do to both own and shared numbers at once is left out here
+        spread_heads.append(replace(head, root=size * head.root @ (head.root.T @ np.array(of_own).T)))
+    spread = np.where(np.outer(free, free), spread, 0.0)
+    return replace(fitted, covariance=spread, heads=tuple(spread_heads), own=own.known(spread_heads))
 
 
 def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:

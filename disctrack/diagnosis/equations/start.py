@@ -17,7 +17,7 @@ from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Samples
 from disctrack.diagnosis.equations.formulas import Formulas
-from disctrack.diagnosis.equations.system import EquationSystem, first_part
+from disctrack.diagnosis.equations.system import EquationSystem, first_part, spread
 
 GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
 LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
@@ -118,7 +118,7 @@ def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
                     first[i] = begin[i]
         seen.append(first)
         values |= {f"state.{name}[{s.name}]": float(v) for name, v in zip(names, first, strict=True)}
-        count = max(2, _INSTANTS // len(system.stretches))
+        count = max(2, _INSTANTS // len(system.stretches)) if len(system.stretches) < _INSTANTS else 0
         for row in usable[np.linspace(0, len(usable) - 9, count).astype(int)]:
             seen.append(states_from_data(f, s, p, int(row), first))
     sizes = np.quantile(np.abs(seen), 0.9, axis=0)
@@ -210,8 +210,9 @@ def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, 
     """All quantities fitted to all data within a region of trust that grows and shrinks with its success.
 
     Gauss-Newton's halved steps end where a parameter far off (a gain of the wrong sign) has to pass through values with
-    which nothing moves.
+    which nothing moves. Of many runs some tell what all share, and the others follow.
     """
+    everything, system = system, system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
     names = [q.name for q in system.base]
     null = np.array([q.null for q in system.base])
     lower, upper = (np.array([getattr(q, side) for q in system.base]) for side in ("lower", "upper"))
@@ -237,7 +238,10 @@ def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, 
         lambda x: np.nan_to_num(both(x)[0], nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE), start,
         lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=_ATTEMPTS,
     )  # fmt: skip
-    return dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
+    values = dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
+    if len(system.stretches) < len(everything.stretches):
+        values |= fit(everything, [q for q in everything.base if q.slot], values, max_iterations=15).values
+    return values
 
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:

@@ -26,6 +26,8 @@ UNDONE = 0.1  # share of the least term's power that a sum of terms keeps, below
 LARGE = 5.0  # ... where each is so many times larger than all that moves the motion
 TURNED = 2.0  # times larger that terms make a number whose sign is not the declared one, beyond which they bend it ...
 TENTH = 0.1  # ... where its part is so much of all that moves the motion
+MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
+EACH = "*"  # in the place of a stretch: each has a number of its own
 FIRST_SHARE = 0.65  # of every stretch: what is fitted to it is judged on the rest
 
 
@@ -77,6 +79,11 @@ class EquationSystem:
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
 
+    @property
+    def blocks(self) -> Sequence[slice]:
+        """Rows of every stretch."""
+        return self.rows
+
     def with_(self, **changes: object) -> EquationSystem:
         """The same with other stretches, promoted terms, ..."""
         given = {
@@ -87,20 +94,33 @@ class EquationSystem:
 
     def _base(self) -> list[Quantity]:
         found = []
-        for s in self.stretches:
+        several = len(self.stretches) > 1
+        for i, s in enumerate(self.stretches):
             for name, size in zip(self.formulas.equations.states, self.sizes, strict=True):
                 value, sigma = s.known.get(name, (s.start.get(name, 0.0), np.inf))
                 if sigma > 0:
                     unit = self.formulas.equations.units.get(name, "1")
                     q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
                                  meaning="at the first sample")  # fmt: skip
-                    found.append(q)
+                    found.append(replace(q, slot=f"state.{name}[{EACH}]", block=i) if several else q)
         for name, (_, p) in self.formulas.fitted.items():
             term = name.partition(".")[0] if "." in name else ""
             if name in self.held or (p.shape and name not in self.aims) or (term and term not in self.promoted):
                 continue
-            found += self._quantities(name, p)
+            found += self._with_slots(name, self._quantities(name, p)) if several else self._quantities(name, p)
         return found
+
+    def _with_slots(self, name: str, quantities: Sequence[Quantity]) -> list[Quantity]:
+        """With a slot where a number without bounds belongs to one stretch alone."""
+        stretches: dict[str, list[int]] = {}
+        for i, s in enumerate(self.stretches):
+            stretches.setdefault(self._name(name, s), []).append(i)
+        return [
+            replace(q, slot=f"{name}[{EACH}]", block=stretches[q.name][0])
+            if name in self._per and len(stretches[q.name]) == 1 and np.isinf([q.lower, q.upper]).all()
+            else q
+            for q in quantities
+        ]
 
     def _quantities(self, name: str, p: Parameter) -> list[Quantity]:
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
@@ -209,10 +229,10 @@ class EquationSystem:
         stem, bracket, rest = name.partition("[")
         where = rest.rstrip("]")
         if stem.startswith("state."):
-            if where != s.name:
+            if where not in (s.name, EACH):
                 return None
             return -1 - self.formulas.equations.states.index(stem.removeprefix("state."))
-        if bracket and self._name(stem, s) != name:
+        if bracket and where != EACH and self._name(stem, s) != name:
             return None
         return self.formulas.names.index(stem)
 
@@ -357,7 +377,7 @@ def followed(
 def fitted_rows(s: Samples) -> Mask:
     """(n,) True for the samples to which a fit is made that the others judge."""
     if s.fit_until is not None:
-        return np.asarray(s.time <= s.fit_until, bool)
+        return np.asarray(s.time <= (s.fit_until or -np.inf), bool)
     return np.asarray(s.time - s.time[0] <= FIRST_SHARE * (s.time[-1] - s.time[0]), bool)
 
 
@@ -370,6 +390,12 @@ def cut(samples: Sequence[Samples], duration: float) -> list[Samples]:
         edges[-1] = len(s.time)
         found += [s.part(int(a), int(b), i) for i, (a, b) in enumerate(pairwise(edges)) if b - a >= 4]
     return found
+
+
+def spread(samples: Sequence[Samples], n_states: int, at_least: int = 1) -> list[Samples]:
+    """As many stretches as have MOST_STATES initial states together, evenly from first to last; or at least so many."""
+    most = max(at_least, MOST_STATES // n_states)
+    return [samples[i] for i in np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).astype(int))]
 
 
 def first_part(samples: Sequence[Samples], duration: float) -> list[Samples]:

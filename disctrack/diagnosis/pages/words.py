@@ -66,7 +66,7 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
 def bounds(found: Found, fit: Fit) -> list[str]:
     """Numbers of the effect that the data do not tell from nought: how large they may be, and what keeps them open."""
     texts = []
-    spread = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    spread = np.array([fit.sigma(name) for name in fit.names])
     for q in found.candidate.quantities:
         name, value, sigma = shown(q, fit)
         if q.name.startswith("state.") or q.name == SLIP or q.null != 0.0:  # a limit is no size
@@ -74,7 +74,7 @@ def bounds(found: Found, fit: Fit) -> list[str]:
         if not sigma > 0 or abs(value) >= TWO_SIDED * sigma:
             continue
         i = fit.names.index(q.name)
-        shared = np.abs(fit.covariance[i]) / np.where(spread > 0, spread, np.inf) / spread[i]
+        shared = np.abs(fit.covariance_with(q.name)) / np.where(spread > 0, spread, np.inf) / spread[i]
         shared[i] = 0.0
         partner = int(np.argmax(shared))
         why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise"
