@@ -66,3 +66,8 @@ class Assembly:
     def constant(self, name: str) -> Any:
         """One of records.BODY."""
         return self.body[name][0]
+
+    @property
+    def on_a_film(self) -> bool:
+        """Does the contact creep so fast that its velocity is a state of its own? Coulomb's friction goes first."""
+        return bool(self.constant("creep").real > equations.FILM and self.constant("inverse_friction") == 0.0)

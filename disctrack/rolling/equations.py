@@ -25,7 +25,8 @@ A table that moves by u(t) is at rest in its own axes, where gravity is g - u''.
 order in the compliance c the load is that of the rigid table, whose course F_z', F_z'' along the motion is had by
 differences over LOAD_STEP; slip that friction would turn within that time keeps its direction beside n0 in it.
 A contact that creeps, v_A = -c F_t / F_z, is a table that slides by as much under a rolling disc: v_A follows the force
-within c / (3 g), and is had in powers of that time over the motion's, by the same differences.
+within c / (3 g) to c / g, and is had in powers of that time over the motion's, by the same differences. Where that is
+no short time (c above FILM) v_A is a state of its own, as in slip: a disc on a film that is sheared.
 
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
@@ -51,6 +52,7 @@ N_EVENTS = len(EVENTS)
 STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
 LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
 CREEP_PASSES = 3  # each adds a power of c times the motion's rate over 3 g to what is known of creep
+FILM = 2e-3  # [m/s] of creep: (c / g times rates of 100 rad/s)^3 is 1e-5 of v_A, and steps of 0.1 ms are stable
 LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
 
 # table: integers shared by all functions: regime, number of laws, addresses of kinematics and wrench, then the address
@@ -255,6 +257,14 @@ def _inertia_rows(body: Any, phi: Any) -> Any:
 
 
 @_part
+def _speed_of_friction(body: Any, slip: Any) -> Any:
+    """Slip over F_t / F_z: |slip| / mu with Coulomb's friction, c on a film."""
+    if body.inverse_friction == 0.0:
+        return body.creep
+    return body.inverse_friction * np.sqrt(_dot(slip, slip))
+
+
+@_part
 def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
     """Omegadot and acceleration of O (vectors, nodal components); writes the contact force into the record."""
     s, c, m = kin.sin_theta, kin.cos_theta, body.mass
@@ -296,7 +306,7 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
         if regime == SLIPPING:
             slip_z = -(kin.slip_n * kin.normal_n + kin.slip_m * kin.normal_m) / kin.normal_z
             slip = _nodal(kin.slip_n, kin.slip_m, slip_z, s, c)
-            d = _add(k, _scale(-1.0 / (body.inverse_friction * np.sqrt(_dot(slip, slip))), slip))
+            d = _add(k, _scale(-1.0 / _speed_of_friction(body, slip), slip))
             f0_z = f0_z - m * _dot(k_rate, slip)
             B = _add(_cross(D, d), L)
             J0, J1, J2 = _add(J0, _scale(B[0], Dk)), _add(J1, _scale(B[1], Dk)), _add(J2, _scale(B[2], Dk))
@@ -376,7 +386,7 @@ def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any
     v_x, v_y = (y[8], y[9]) if slips else (nothing, nothing)
     here = (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], v_x, v_y, nothing, nothing)
     held = (nothing, nothing, nothing)
-    if slips:
+    if slips and body.inverse_friction != 0.0:
         # slip that creeps follows its force at once, and turns any way within LOAD_STEP: its direction is held then
         _kinematics(table[0], t, here, body, kin)
         slow = 3.0 * LOAD_STEP * kin.gravity / body.inverse_friction
@@ -455,7 +465,7 @@ def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, 
     margin[2] = 1.0 + 0.0 * kin.theta
     if table[0] == ROLLING:
         margin[2] = wrench.N - body.inverse_friction * wrench.T
-    if table[0] == SLIPPING:
+    if table[0] == SLIPPING and body.inverse_friction != 0.0:  # on a film nothing sticks
         margin[2] = np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m) - STICK_SPEED
     if table[0] == FLYING:
         _, _, z = _contact(body, kin)

@@ -117,6 +117,8 @@ def follow(
     end: EndReason | None = None
     i, slip_steps = 0, 0
     while end is None:
+        if regime == ROLLING and assembly.on_a_film:
+            regime, y = SLIPPING, np.concatenate([y, _rates(assembly, ROLLING, t, y)[0][:2]])
         event = _event_at_start(assembly, regime, t, y)
         if event is None:
             system, atol = assembly.system(regime), ATOL[: len(y)]

@@ -302,6 +302,11 @@ def swing(cosine, sine, frequency, start=0.0):
     return course
 
 
+def settling(speed, acceleration):
+    """A table that sinks or rises slowly under cameras at rest."""
+    return lambda t: ((speed + 0.5 * acceleration * t) * t * K, (speed + acceleration * t) * K, acceleration * K)
+
+
 def yielding(disc, start, times, regime="rolling", **integration):
     """The course of a table that has given way to the load of the motion on the rigid one, by a spline."""
     rigid = copy(disc)

@@ -10,7 +10,7 @@ from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, ModelEr
 from disctrack.rolling.effects import catalogue_table, effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
-MOVES_THE_TABLE = ("table_shaken",)  # and exerts nothing in its axes
+MOVES_THE_TABLE = ("table_shaken", "table_settles")  # and exerts nothing in its axes
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None and name not in MOVES_THE_TABLE]
 
 

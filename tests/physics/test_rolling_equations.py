@@ -8,7 +8,7 @@ from scipy.integrate import simpson, solve_ivp
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.rolling import CATALOGUE, Model, State
+from disctrack.rolling import CATALOGUE, Model, State, equations
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.simulate import _rates
 from tests.oracles import free_flight, newton_euler
@@ -266,6 +266,10 @@ EFFECTS = {
             "com_body": (1e-3, -5e-4, 3e-4),
         },
     ),
+    "settles": (
+        {"table_settles": {"v_z": -2e-3, "a_z": 5e-2}, "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4}},
+        {"table": newton_euler.settling(-2e-3, 5e-2), "com_body": (1e-3, -5e-4, 3e-4)},
+    ),
     "body": (
         {
             "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4},
@@ -392,9 +396,12 @@ class _Creeping(newton_euler.Disc):
         return self
 
 
-@pytest.mark.parametrize(("c", "tolerance"), [(1e-3, 1e-4), (0.02, 0.025)])
-def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, tolerance):
-    """The oracle slips with its inertia, stiffly; ours follows the force within a step of its differences."""
+@pytest.mark.parametrize(
+    ("c", "film", "least", "most"), [(1e-3, 2e-3, 0.0, 1e-4), (0.02, 1.0, 0.01, 0.025), (0.02, 2e-3, 0.0, 1e-3)]
+)
+def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, film, least, most, monkeypatch):
+    """The oracle slips with its inertia; ours follows the force by a series, for which c beyond `film` is too fast."""
+    monkeypatch.setattr(equations, "FILM", film)
     effects = (CATALOGUE["km"](k_m=4e-8), CATALOGUE["centre_of_mass"](c_1=1e-3, c_2=-5e-4, c_3=3e-4))
     rigid = Model(MA_2014, effects=effects)
     start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)
@@ -416,7 +423,8 @@ def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, tolerance):
     found, without = (rolling.simulate(m, begin, times=times[settled:]) for m in (model, rigid))
     size = np.abs(without.q - expected[settled:]).max(axis=0)
     assert (size[:3] > 2e-4 * c).all()
-    assert (np.abs(found.q - expected[settled:]).max(axis=0) < tolerance * size).all()
+    error = (np.abs(found.q - expected[settled:]).max(axis=0) / size).max()
+    assert least < error < most
     assert_allclose(found.qdot[0, :3], solution.y[7:10, settled], atol=2e-3 * np.linalg.norm(now.v_contact))
     lost = found.energy[-1] - found.energy[0]
     assert lost < 0

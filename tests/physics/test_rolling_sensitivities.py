@@ -86,6 +86,8 @@ def test_all_columns_at_once_equal_those_one_by_one():
         ({}, {"x", "y", "psi", "phi"}),
         ({"slip.mu": 0.2, "table_yielding.c": 1e-7}, {"x", "y", "psi", "phi"}),
         ({"creep.c": 1e-3}, {"x", "y", "psi", "phi"}),
+        ({"creep.c": 2e-2}, {"x", "y", "psi", "phi"}),
+        ({"table_settles.v_z": 1e-3}, {"x", "y", "psi", "phi"}),
         ({"table_tilt.tilt_x": 1e-3}, {"x", "y", "phi"}),
         ({"table_shaken.u_cos_x": 1e-5}, {"x", "y", "phi"}),
         ({"table_vibration.a_cos_x": 0.1}, {"x", "y", "phi"}),

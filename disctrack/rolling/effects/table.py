@@ -69,3 +69,19 @@ def table_shaken(p: Any, s: Any, w: Any) -> None:
     w.table_ax -= rate * rate * u_x
     w.table_ay -= rate * rate * u_y
     w.table_az -= rate * rate * u_z
+
+
+@effect(
+    "table that sinks or rises slowly under the cameras, or a rim that wears: u_z = v_z t + a_z t^2 / 2",
+    "kinematics: gravity g - u'' in the table's axes; a tripod that settles, a mat that gives, a rim ground off",
+    EffectParameter("v_z", "m/s", 1e-5, "speed of the table upwards at t = 0"),
+    EffectParameter("a_z", "m/s^2", 3e-5, "its acceleration"),
+    belongs_to=(),
+    passive=False,
+    airborne=True,
+)
+def table_settles(p: Any, s: Any, w: Any) -> None:
+    """The height of the table in the axes of the cameras changes with time, and no force with it but by a_z."""
+    w.table_z += (p.v_z + 0.5 * p.a_z * s.time) * s.time
+    w.table_vz += p.v_z + p.a_z * s.time
+    w.table_az += p.a_z
