@@ -154,12 +154,15 @@ def test_a_number_that_nothing_in_its_run_shows_stays_as_it_is(answer):
     assert fitted.sigma("c") > answer.diagnosis.before.sigma("c")
 
 
-def test_parameters_that_cannot_be_parted_are_told_beside_own_numbers(rng):
-    """Mass and stiffness of oscillators: one of them is held."""
+@pytest.mark.parametrize("per", ["", "run"])
+def test_parameters_that_cannot_be_parted_are_told_beside_own_numbers(rng, per):
+    """Mass and stiffness of oscillators, shared or each one's own: one of them is held."""
     runs = [replace(run, known={}) for run in swings(rng, 3)]
-    twice = Equations({"x": "v", "v": "-s/m*x - c*v"}, {"s": 140.0, "m": 1.0, "c": 0.3})
+    both = {"s": Parameter(140.0, per=per), "m": Parameter(1.0, per=per), "c": 0.3}
+    twice = Equations({"x": "v", "v": "-s/m*x - c*v"}, both)
     answer = diagnose(twice, runs, [terms.coulomb("v")])
     assert any("cannot be told from" in note for note in answer.notes)
+    assert answer.system.held in (("m",), ("s",))
     held, _ = redundant(answer.system.with_(held=()), answer.values | {"m": 1.0, "s": 140.0})
     assert held in (("m",), ("s",))
 

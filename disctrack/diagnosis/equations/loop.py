@@ -373,10 +373,13 @@ def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, f
 
 def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tuple[str, ...], str]:
     """Parameters that the data cannot part from others, to be held as declared; and how to say that."""
-    own = Own(system, system.base)
-    free = [q for q in system.base if not (q.slot or q.name.startswith("state.")) and np.isinf(q.prior_sigma)]
-    states = [q.name for q in system.base if q.name.startswith("state.") and not q.slot]
-    residual, derivative = system.linearise(values, [*own.slots, *states, *(q.name for q in free)])
+    # of many runs with numbers of their own a few tell it
+    system = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
+    states = [q for q in system.base if q.name.startswith("state.")]
+    free = [q for q in system.base if not q.name.startswith("state.") and np.isinf(q.prior_sigma)]
+    own = Own(system, states)
+    states = [q for q in states if not q.slot]
+    residual, derivative = system.linearise(values, [*own.slots, *(q.name for q in (*states, *free))])
     if len(free) < 2 or not np.isfinite(derivative).all():
         return (), ""
     _, matrix, _ = own.reduced(residual, derivative, values)
@@ -386,12 +389,17 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tupl
     before = size * np.linalg.norm(derivative[..., -len(free) :], axis=(0, 1))
     columns = matrix[:, k:] * size
     cleared = columns - basis @ (basis.T @ columns)
-    _, R, order = qr(cleared / np.where(before > 0, before, 1.0), mode="economic", pivoting=True)
-    weak = [free[j] for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
+    shares, stems = cleared / np.where(before > 0, before, 1.0), np.array([q.name.partition("[")[0] for q in free])
+    weak: list[str] = []
+    while (left := np.flatnonzero(~np.isin(stems, weak))).size:
+        _, R, order = qr(shares[:, left], mode="economic", pivoting=True)
+        open_ = [str(stems[left[j]]) for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
+        if not open_:
+            break
+        weak.append(max(reversed(open_), key=open_.count))  # runs may leave one or the other of two open
     if not weak:
         return (), ""
-    names = sorted({q.name.partition("[")[0] for q in weak})
-    others = sorted({q.name.partition("[")[0] for q in free} - set(names))
+    names, others = sorted(weak), sorted(set(stems.tolist()) - set(weak))
     return tuple(names), (
         f"{', '.join(names)} cannot be told from {', '.join(others) or 'the initial states'} with these data and "
         f"{'is' if len(names) == 1 else 'are'} held as declared; values of the others hold for that"
