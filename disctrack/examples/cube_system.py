@@ -21,6 +21,7 @@ from disctrack.examples.cube_effects import CANDIDATES, GRAVITY, columns, restin
 CHANNELS = ("x", "y", "z", "turn_1", "turn_2", "turn_3")
 GROUPS = {"horizontal": (0, 1), "vertical": (2,), "turn": (3, 4, 5)}  # channels whose noise is alike
 HELD_OUT = 3  # every third toss
+ABSORBED = 1e-9  # share of an effect, up to which what a flight's own motion leaves of it is rounding
 _START = {"horizontal": SmoothNoise(2e-5, 5e-5, 0.03), "vertical": SmoothNoise(2e-5, 3e-5, 0.03),
           "turn": SmoothNoise(2e-4, 3e-4, 0.03)}  # fmt: skip
 
@@ -32,7 +33,7 @@ class _Rows:
     flight: Flight
     left: Array  # (n, 6) [m], [rad]
     effects: Array  # (n, 6, k)
-    own: Array  # (n, 3, 6) what a flight's own attitude and angular velocity do to its turn
+    own: Array  # (n, 6, 12) by the flight's own place, velocity, attitude and angular velocity
 
 
 class CubeTosses:
@@ -91,7 +92,7 @@ class CubeTosses:
         for r in self._rows:
             n = len(r.left)
             rows = np.arange(n) < max(4, round(seen * n))
-            found.append(_cleared(r.left - r.effects @ amounts, r, rows))
+            found.append(_cleared(r.left - r.effects @ amounts, r.own, rows))
         return found
 
 
@@ -121,25 +122,23 @@ def _resting_rows(cubes: Sequence[Resting], names: Sequence[str]) -> Array:
 def _rows(flight: Flight, names: Sequence[str]) -> _Rows:
     falling = np.zeros_like(flight.position)
     falling[:, 2] = -GRAVITY * flight.time**2 / 2
+    step, dt = np.swapaxes(flight.turning, 1, 2), flight.time[1] - flight.time[0]
+    own = np.zeros((len(step), 6, 12))
+    own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), flight.time[:, None, None] * np.eye(3)
+    own[:, 3:, 6:9], own[1:, 3:, 9:] = np.eye(3), np.cumsum(0.5 * (step[1:] + step[:-1]) * dt, axis=0)
     left = np.concatenate([flight.position - falling, flight.turn], axis=1)
-    left[:, :3] -= np.linalg.lstsq(_line(flight), left[:, :3], rcond=None)[0][0]  # large numbers off before whitening
-    step = np.swapaxes(flight.turning, 1, 2)
-    dt = flight.time[1] - flight.time[0]
-    turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(0.5 * (step[1:] + step[:-1]) * dt, axis=0)])
-    own = np.concatenate([np.broadcast_to(np.eye(3), step.shape), turned], axis=2)
-    return _Rows(flight, left, columns(flight, names), own)
+    everything = np.concatenate([columns(flight, names), left[..., None]], axis=-1)
+    cleared = _cleared(everything, own, np.ones(len(left), bool))
+    # rounding is left of an effect that the flight's own motion makes whole: no trace
+    before, after = (np.linalg.norm(x[..., :-1], axis=(0, 1)) for x in (everything, cleared))
+    return _Rows(flight, cleared[..., -1], np.where(after > ABSORBED * before, everything[..., :-1], 0.0), own)
 
 
-def _line(flight: Flight) -> Array:
-    return np.column_stack([np.ones(len(flight.time)), flight.time])
-
-
-def _cleared(left: Array, rows: _Rows, seen: Mask) -> Array:
-    """Without what the flight's own motion, fitted to the samples `seen`, makes of it."""
-    line, own = _line(rows.flight), rows.own
-    place = line @ np.linalg.lstsq(line[seen], left[seen, :3], rcond=None)[0]
-    amount = np.linalg.lstsq(own[seen].reshape(-1, 6), left[seen, 3:].reshape(-1), rcond=None)[0]
-    return left - np.concatenate([place, own @ amount], axis=1)
+def _cleared(left: Array, own: Array, seen: Mask) -> Array:
+    """Columns (n, 6, ...) without what the flight's own motion, fitted to the samples `seen`, makes of them."""
+    k = int(np.prod(left.shape[2:]))
+    amounts = np.linalg.lstsq(own[seen].reshape(-1, 12), left[seen].reshape(-1, k), rcond=None)[0]
+    return np.asarray(left - (own @ amounts).reshape(left.shape), float)
 
 
 def whitening_blind_to(basis: Array, covariance: Array) -> Array:
@@ -154,14 +153,11 @@ def _whitened(rows: _Rows, noise: Mapping[str, SmoothNoise]) -> Array:
     n, _, k = everything.shape
     found = np.empty((n - 2, 6, k))
     for name, channels in GROUPS.items():
-        K = noise[name].covariance(rows.flight.time)
-        if name == "turn":
-            W = whitening_blind_to(rows.own.reshape(-1, 6), np.asarray(np.kron(K, np.eye(3)), float))
-            found[:, 3:] = (W @ everything[:, 3:].reshape(3 * n, k)).reshape(n - 2, 3, k)
-        else:
-            W = whitening_blind_to(_line(rows.flight), K)
-            for c in channels:
-                found[:, c] = W @ everything[:, c]
+        c = list(channels)
+        own = rows.own[:, c].reshape(-1, 12)
+        K = np.kron(noise[name].covariance(rows.flight.time), np.eye(len(c)))
+        W = whitening_blind_to(own[:, own.any(axis=0)], np.asarray(K, float))
+        found[:, c] = (W @ everything[:, c].reshape(-1, k)).reshape(n - 2, len(c), k)
     return found
 
 
@@ -175,7 +171,7 @@ def _measured_noise(rows: Sequence[_Rows]) -> dict[str, SmoothNoise]:
         # normal equations: 50 columns of length one, of which some are alike by intention
         A = whitened[:, :-1] / scale
         amounts = np.linalg.pinv(A.T @ A, rcond=1e-10, hermitian=True) @ (A.T @ whitened[:, -1]) / scale
-        left = [_cleared(r.left - r.effects @ amounts, r, np.ones(len(r.left), bool)) for r in rows]
+        left = [_cleared(r.left - r.effects @ amounts, r.own, np.ones(len(r.left), bool)) for r in rows]
         for name, channels in GROUPS.items():
             noise[name] = estimate(_by_length(rows, left, channels), noise[name])
     return noise
@@ -183,11 +179,10 @@ def _measured_noise(rows: Sequence[_Rows]) -> dict[str, SmoothNoise]:
 
 def _by_length(rows: Sequence[_Rows], left: Sequence[Array], channels: Sequence[int]) -> list[SampleStretch]:
     """Flights of one length share instants, so that their samples stand side by side."""
-    found: dict[int, list[Array]] = {}
-    lines: dict[int, _Rows] = {}
-    for r, x in zip(rows, left, strict=True):
-        found.setdefault(len(x), []).append(x[:, list(channels)])
-        lines[len(x)] = r
-    return [
-        SampleStretch(lines[n].flight.time, np.concatenate(v, axis=1), _line(lines[n].flight)) for n, v in found.items()
-    ]
+    found = []
+    for n in sorted({len(x) for x in left}):
+        alike = [(r.flight.time, x[:, list(channels)]) for r, x in zip(rows, left, strict=True) if len(x) == n]
+        time = alike[0][0]
+        values = np.concatenate([x for _, x in alike], axis=1)
+        found.append(SampleStretch(time, values, np.column_stack([np.ones(n), time])))
+    return found

@@ -118,6 +118,14 @@ def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of
         assert answer.after.forecast_end[group] < 0.5 * answer.before.forecast_end[group]
 
 
+def test_what_a_flight_s_own_motion_makes_whole_leaves_no_trace(answer):
+    """A delay of the positions is another start, a smoothed parabola another height: rounding once gained 172."""
+    outcome = {t.candidate.name: (t.score, t.reason) for t in answer.diagnosis.tried}
+    for name in ("clock_offset", "smoothing"):
+        assert outcome[name][0] == 0
+        assert "leaves no trace" in outcome[name][1]
+
+
 def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
     system = answer.system
     all_candidates = system.candidates
