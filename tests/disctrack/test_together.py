@@ -1,5 +1,11 @@
 """Many recordings, one answer: shared quantities, own ones eliminated, what does not belong named."""
 
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -191,6 +197,7 @@ def test_the_sigma_of_an_exponent_is_its_scatter_however_small_the_law_s_constan
     assert np.std(constant[:, 0]) == pytest.approx(np.mean(constant[:, 1]), rel=0.15)
 
 
+ROOT = Path(__file__).parents[2]
 FOUR = ("mass", "radius", "thickness", "density of the air")
 
 
@@ -251,6 +258,44 @@ def test_the_number_of_processes_changes_no_bit(rng):
             found.append(diagnose(system, system.sharing.start(), Settings(noise=1.0)).after)
     assert found[0].values == found[1].values
     assert (found[0].covariance == found[1].covariance).all()
+
+
+@pytest.mark.slow
+def test_processes_that_end_at_once_are_an_error_and_no_silence(tmp_path):
+    """As those of a script do that starts them wherever it is read, by themselves too; what they get is large."""
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "import numpy as np\nfrom tests.oracles.decaying_runs import build, runs\n"
+        "from disctrack.diagnosis.together.crew import Crew\n"
+        "items = runs(np.random.default_rng(1), 200)\n"
+        "with Crew(build, items, 2) as crew:\n    crew.call('share', [(['state.a', 'state.b'],)] * 200)\n"
+    )
+    ended = subprocess.run([sys.executable, script], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
+                           capture_output=True, text=True, timeout=120, check=False)  # fmt: skip
+    assert ended.returncode == 1
+    assert "AnalysisError: a process that diagnosed some of the recordings has ended early" in ended.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_path):
+    script = tmp_path / "guarded.py"
+    script.write_text(
+        "import os, time\nfrom disctrack.diagnosis.together.crew import Crew\n"
+        "def build(item):\n    print(os.getpid(), flush=True)\n    time.sleep(100)\n"
+        "if __name__ == '__main__':\n    with Crew(build, [1, 2], 2) as crew:\n        crew.call('share', [(), ()])\n"
+    )
+    running = subprocess.Popen([sys.executable, script], env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)  # fmt: skip
+    assert running.stdout is not None
+    started = [int(running.stdout.readline()) for _ in range(2)]
+    os.killpg(running.pid, signal.SIGINT)  # as a terminal does: all of them get it
+    _, said = running.communicate(timeout=20)
+    assert said.count("Traceback") == 1  # this script's own
+    assert "KeyboardInterrupt" in said
+    for number in started:
+        with pytest.raises(ProcessLookupError):
+            os.kill(number, 0)
 
 
 def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):

@@ -6,9 +6,11 @@ the number of processes. They end when they are closed, and with the process tha
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,6 +20,11 @@ from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.readers.blocks import ONE_THREAD
 
 Build = Callable[[Any], Any]
+ENDED_EARLY = (
+    "a process that diagnosed some of the recordings has ended early, as when memory runs out: try again with fewer "
+    'processes (-j 1). In a script of your own the call has to stand under `if __name__ == "__main__":`, as each '
+    "process reads the script"
+)
 
 
 class Crew:
@@ -40,13 +47,19 @@ class Crew:
         before = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
         try:
-            for k in range(n):
-                ours, theirs = context.Pipe()
-                mine = {i: items[i] for i in range(k, self.n, n)}
-                process = context.Process(target=_work, args=(theirs, build, mine), daemon=True)
-                process.start()
-                theirs.close()
-                self._workers.append((process, ours))
+            with _without_interruptions():
+                for _ in range(n):
+                    ours, theirs = context.Pipe()
+                    process = context.Process(target=_work, args=(theirs, build), daemon=True)
+                    process.start()
+                    theirs.close()
+                    self._workers.append((process, ours))
+            # not with the arguments above: starting a process that ends before it has read them never returns
+            for k, (_, connection) in enumerate(self._workers):
+                connection.send({i: items[i] for i in range(k, self.n, n)})
+        except OSError as error:
+            self.close()
+            raise AnalysisError(ENDED_EARLY) from error
         finally:
             for name, value in before.items():
                 if value is None:
@@ -57,14 +70,14 @@ class Crew:
     def __enter__(self) -> Crew:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, error: object, *_: object) -> None:
+        self.close(at_once=error is not None)
 
-    def close(self) -> None:
-        """End the processes."""
+    def close(self, at_once: bool = False) -> None:
+        """End the processes.   at_once : whatever they do, as after Ctrl-C"""
         for process, connection in self._workers:
             connection.close()
-            process.join(timeout=5)
+            process.join(timeout=0 if at_once else 5)
             if process.is_alive():
                 process.terminate()
         self._workers = []
@@ -90,10 +103,7 @@ class Crew:
             for mine, (_, connection) in zip(asked, self._workers, strict=True):
                 found.update(zip(mine, connection.recv(), strict=True))
         except (EOFError, OSError) as error:
-            raise AnalysisError(
-                "a process that diagnosed some of the recordings has ended early, as when memory runs out: try again "
-                "with fewer processes (-j 1)"
-            ) from error
+            raise AnalysisError(ENDED_EARLY) from error
         return [found[i] for i in numbers]
 
     def ask(self, number: int, method: str, *arguments: Any) -> Any:
@@ -109,6 +119,19 @@ class Crew:
         """As a `Reducer`."""
         found = self.call("reduce", [(values, names) for _, values, names in requests])
         return [None if isinstance(answer, DiscTrackError) else answer for answer in found]
+
+
+@contextlib.contextmanager
+def _without_interruptions() -> Iterator[None]:
+    """Processes that are started within know nothing of Ctrl-C: this one hears it, once it is over, and ends them."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _built(build: Build, item: Any) -> Any:
@@ -131,8 +154,11 @@ def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
         return AnalysisError(f"{type(error).__name__}: {error}")
 
 
-def _work(connection: Connection, build: Build, items: dict[int, Any]) -> None:
-    objects = {i: _built(build, item) for i, item in items.items()}
+def _work(connection: Connection, build: Build) -> None:
+    try:
+        objects = {i: _built(build, item) for i, item in connection.recv().items()}
+    except (EOFError, OSError):
+        return
     while True:
         try:
             method, requests = connection.recv()
