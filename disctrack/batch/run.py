@@ -18,7 +18,7 @@ from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, ma
 from disctrack.batch.processes import run_here
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
 from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
-from disctrack.batch.together import diagnose_all
+from disctrack.batch.together import FOLDER, diagnose_all
 from disctrack.errors import ClusterError, OutputError
 from disctrack.files.whole import check_writable
 from disctrack.readers.blocks import default_threads
@@ -145,8 +145,11 @@ def _summed_up(
     said: list[str] = []
     if options.together and processes and not interrupted:
         measured = rows_of(places, places.found.recordings, results)
-        said, problem = diagnose_all(places.common, measured, processes)
-        problems += [problem] if problem else []
+        try:
+            said, problem = diagnose_all(places.common, measured, processes)
+            problems += [problem] if problem else []
+        except KeyboardInterrupt:  # what was measured is summed up all the same
+            interrupted = True
     files: tuple[Path, ...] = ()
     try:
         rows, files, wrong = write_summary(places, places.found.recordings, results, options)
@@ -154,6 +157,7 @@ def _summed_up(
     except OutputError as error:  # the results themselves may be safe all the same
         problems.append(str(error))
         rows = rows_of(places, places.found.recordings, results)
+    files += (places.common / FOLDER / "diagnosis.html",) if said else ()
     names = {places.found.name(folder) for folder in mine}
     own = tuple(row for row in rows if row["recording"] in names)
     return BatchOutcome(own, files, tuple(problems), interrupted, tuple(said))

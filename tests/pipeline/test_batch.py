@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOW
-from disctrack.batch import BatchOptions, find_recordings, read_summary, run_batch
+from disctrack.batch import BatchOptions, find_recordings, read_summary, run, run_batch
 from disctrack.batch import measure as stage
 from disctrack.batch.plan import Places, make_plan
 from disctrack.batch.records import read_record
@@ -230,6 +230,24 @@ def test_the_summary_is_that_of_all_shards(recording, tmp_path, in_this_process)
     (root / "c" / "results" / "trajectory.h5").unlink()
     assert main([*options, "--summary-only"]) == 1
     assert statuses(summary)["c"] == "not measured"
+
+
+def test_ctrl_c_in_the_diagnosis_of_all_keeps_the_summary_and_its_page_is_named(
+    recording, tmp_path, capsys, monkeypatch, in_this_process
+):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    copy_of(recording, tmp_path / "day" / "a")
+    command = ["batch", str(tmp_path / "day"), "-j", "1", *FAST, "--together"]
+    monkeypatch.setattr(run, "diagnose_all", interrupted)
+    assert main(command) == 130
+    assert statuses(tmp_path / "day" / "batch_results" / "summary.json") == {"a": "measured"}
+    monkeypatch.setattr(run, "diagnose_all", lambda *_: (["what it says"], ""))
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "what it says" in said
+    assert "batch_results/together/diagnosis.html" in said
 
 
 def test_a_summary_tells_of_declarations_that_changed_since(recording, tmp_path, capsys, in_this_process):
