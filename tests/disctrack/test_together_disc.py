@@ -1,6 +1,7 @@
 """Recordings of the disc diagnosed together, and what a further one would bring."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -119,15 +120,18 @@ def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagn
 
 
 @pytest.mark.slow
-def test_a_planned_recording_brings_what_it_brings_when_it_is_made():
+@pytest.mark.parametrize("mass", [1.0, 0.35])
+def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
+    """With another disc, too, whose k_m is its own."""
     first = measured(seed=1, n=120, theta_deg=6.0, omega3=1.0, declared_rate=RATE, rig_seed=RIG)
     result = diagnose_trajectory(first, separate=False)
     system, fit = result.system, result.diagnosis.after
     candidate = next(c for c in system.candidates if c.name == "air_bildsten")
     planner = Planner(system, fit, [candidate])
-    rows, duration = planner.with_(Proposal(12.0, 2.0, 0.3))
+    rows, duration = planner.with_(Proposal(12.0, 2.0, 0.3, mass=mass))
+    disc = replace(first.disc, mass=mass * first.disc.mass)
     made = measured(seed=2, n=round(duration * RATE) + 1, theta_deg=12.0, nutation_deg=0.6, omega3=2.0,
-                    declared_rate=RATE, rig_seed=RIG)  # fmt: skip
+                    declared_rate=RATE, rig_seed=RIG, disc=disc)  # fmt: skip
     both = diagnose_together([Recorded("first", first), Recorded("second", made)])
     (bound,) = [b for b in both.bounds if b.candidate.name == "air_bildsten"]
     assert planner.sigma(planner.now, candidate) == pytest.approx(float(bound.by_number[1][0]), rel=0.05)

@@ -16,8 +16,9 @@ from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.engine.fit import Fit, triangle
 from disctrack.diagnosis.engine.score import Linearisation, cleared, score, span
 from disctrack.diagnosis.engine.search import Diagnosis
-from disctrack.diagnosis.engine.system import Candidate
+from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.diagnosis.together.reduction import Reduction
+from disctrack.diagnosis.together.sharing import LAWS
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.frames import rotation_from_euler
@@ -202,23 +203,38 @@ class Planner:
         return np.concatenate([rows, self._priors])
 
     def _said(self, system: DiscSystem, values: dict[str, float], proposal: Proposal) -> Array:
-        """(m, k) what a recording says of the shared quantities, its own at their best."""
-        known = [q for q in system.base if not q.belongs_to]
-        own = known if system is not self.system else self.own
-        scales = {q.name: q.scale for q in (*system.base, *self.tested)}
-        here = [q for q in system.base if q.belongs_to and q.name not in {t.name for t in self.tested}]
-        local = here if system is not self.system else self._local
-        names = [q.name for q in (*local, *self.tested)]
-        reduced = Reduction(system, own, values, scales).reduce(values, names)
+        """(m, k) what a recording says of the shared quantities, its own at their best.
+
+        Another disc has its own k_m, its own inertia and its own dots, as in a diagnosis of both together; laws that
+        were found or are asked for have one constant.
+        """
+        here = system is self.system
+        another = proposal.mass != 1.0 or proposal.radius != 1.0
+        in_base = {q.name for q in system.base}
+        foreseen = {name for c in system.candidates for name in c.names}
+        found = [q for q in self._local if q.name in foreseen]
+        known = {q.name: q for q in (*system.base, *found, *self.tested)}
+
+        def shared(q: Quantity) -> bool:
+            if not another:
+                return bool(q.belongs_to)
+            one_for_all = q.name not in in_base and any(kind in LAWS for kind in q.belongs_to)
+            return bool(q.belongs_to) and ("disc" not in q.belongs_to or one_for_all)
+
+        own = self.own if here else [q for q in known.values() if not shared(q)]
+        local = [*self._local, *self.tested] if here else [q for q in known.values() if shared(q)]
+        names = [q.name for q in local]
+        start = {q.name: q.null for q in own} | values
+        scales = {q.name: q.scale for q in (*known.values(), *local)}
+        reduced = Reduction(system, own, start, scales).reduce(start, names)
         if reduced is None:
             raise AnalysisError("the motion cannot be followed")
         mixing = np.zeros((len(names), len(self.column)))
-        another = proposal.mass != 1.0 or proposal.radius != 1.0
-        for row, q in enumerate((*local, *self.tested)):
-            if q.name.startswith("rig."):
-                mixing[row, : system.rig_directions.shape[1]] = system.rig_directions[int(q.name[4:])]
-            elif not (another and q.belongs_to == ("disc",)) and q.name in self.column:
-                mixing[row, self.column[q.name]] = 1.0
+        for row, name in enumerate(names):
+            if name.startswith("rig."):
+                mixing[row, : system.rig_directions.shape[1]] = system.rig_directions[int(name[4:])]
+            elif name in self.column:
+                mixing[row, self.column[name]] = 1.0
         return np.asarray(triangle(reduced.matrix @ mixing) / np.sqrt(self._noise), float)
 
     def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
