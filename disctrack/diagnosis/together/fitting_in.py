@@ -22,6 +22,8 @@ SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be
 TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
 SEEN = 1e-6  # part of an effect's derivative that is left beside what is shared, from which on it is seen
 ALIKE = 10.0  # of chi-square, by which another effect tells less and may yet be the one
+NOISE = 2.0  # median of some falls of chi-square over that of noise, up to which it is noise
+LEFT_ASIDE = 2.5  # median of the squares of normal numbers over that of their inner two thirds
 NAMED = 3  # effects that one recording may differ by
 DETERMINED = 3.0  # sigmas that a prior's sigma makes in a recording, from which the recording itself tells of it
 
@@ -141,10 +143,7 @@ def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
     if not blocks.candidates:
         return found
     falls = blocks.differences(kept)
-    scatter = []
-    for k in range(len(blocks.candidates)):
-        usual = [fall[k][0] / stats.chi2.median(fall[k][1]) for fall in falls.values() if fall[k][1] > 0]
-        scatter.append(max(1.0, float(np.median(usual))) if usual else 1.0)
+    scatter = _scatter(blocks, falls)
     for i, fall in falls.items():
         told = [
             (float(stats.chi2.sf(difference / scatter[k], degrees)), difference / scatter[k], degrees, k)
@@ -161,6 +160,26 @@ def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
             first, *others = (blocks.candidates[one[3]] for one in alike[:NAMED])
             words = f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
             found[i] = replace(found[i], statistic=statistic, degrees=degrees, p_value=p, differs_by=words)
+    return found
+
+
+def _scatter(blocks: Blocks, falls: dict[int, list[tuple[float, int]]]) -> list[float]:
+    """Of each candidate: by how much its sizes scatter over the recordings, as a factor on chi-square; 1 for noise.
+
+    One recording that stands apart draws the sizes of the others away from all of them: those that stand out most are
+    left aside, a third of them, and what they would have added to the scatter is put back on.
+    """
+
+    def stands_out(fall: list[tuple[float, int]]) -> float:
+        return min((float(stats.chi2.logsf(x, degrees)) for x, degrees in fall if degrees > 0), default=0.0)
+
+    calm = sorted(falls, key=lambda i: -stands_out(falls[i]))[: len(falls) - len(falls) // 3]
+    found = []
+    among = blocks.differences(sorted(calm)) if len(calm) > 2 else {}
+    for k in range(len(blocks.candidates)):
+        usual = [fall[k][0] / stats.chi2.median(fall[k][1]) for fall in among.values() if fall[k][1] > 0]
+        ratio = float(np.median(usual)) if usual else 1.0
+        found.append(LEFT_ASIDE * ratio if ratio > NOISE else 1.0)
     return found
 
 
