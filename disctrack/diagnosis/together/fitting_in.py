@@ -8,6 +8,7 @@ may have any size, and nobody differs by it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -24,6 +25,8 @@ SEEN = 1e-6  # part of an effect's derivative that is left beside what is shared
 ALIKE = 10.0  # of chi-square, by which another effect tells less and may yet be the one
 NOISE = 2.0  # median of some falls of chi-square over that of noise, up to which it is noise
 LEFT_ASIDE = 2.5  # median of the squares of normal numbers over that of their inner two thirds
+ALIKE_SHARE = 0.05  # of all that it tells, which is to first order
+STANDS_OUT = 0.05  # probability below which it tells something
 NAMED = 3  # effects that one recording may differ by
 DETERMINED = 3.0  # sigmas that a prior's sigma makes in a recording, from which the recording itself tells of it
 
@@ -146,21 +149,44 @@ def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
     scatter = _scatter(blocks, falls)
     for i, fall in falls.items():
         told = [
-            (float(stats.chi2.sf(difference / scatter[k], degrees)), difference / scatter[k], degrees, k)
+            _Told(2.0 * len(falls[i]) * float(stats.chi2.sf(difference / scatter[k], degrees)), difference, degrees, k)
             for k, (difference, degrees) in enumerate(fall)
             if degrees > 0
         ]
         if not told:
             continue
-        p, statistic, degrees, _ = min(told, key=lambda one: (one[0], -one[1]))
-        p = min(2.0 * len(blocks.candidates) * p, 1.0)
-        if (p, -statistic) < (found[i].p_value, -found[i].statistic):
-            # those that tell as much, the one with the fewest numbers first
-            alike = sorted((one for one in told if statistic - one[1] < ALIKE), key=lambda one: (one[2], -one[1]))
-            first, *others = (blocks.candidates[one[3]] for one in alike[:NAMED])
-            words = f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
-            found[i] = replace(found[i], statistic=statistic, degrees=degrees, p_value=p, differs_by=words)
+        most, own = min(told, key=lambda one: (one.p_value, -one.difference)), found[i]
+        words = _differs_by(blocks, told, own.statistic)
+        if (most.p_value, -most.difference) < (own.p_value, -own.statistic):
+            of_candidate = most.difference / scatter[most.candidate]
+            own = replace(own, statistic=of_candidate, degrees=most.degrees, p_value=min(most.p_value, 1.0))
+        found[i] = replace(own, differs_by=words)
     return found
+
+
+class _Told(NamedTuple):
+    """What the size of one candidate in one recording tells against the others."""
+
+    p_value: float  # for the number of candidates
+    difference: float  # of chi-square
+    degrees: int
+    candidate: int
+
+
+def _differs_by(blocks: Blocks, told: Sequence[_Told], shared: float) -> str:
+    """The effects that tell most, those with the fewest numbers first; none where what is shared tells more.
+
+    By the chi-square alone: what scatters among the others may be what first order leaves of this recording.
+    shared : fall of chi-square with shared numbers of its own
+    """
+    standing = [one for one in told if one.p_value < STANDS_OUT]
+    most = max((one.difference for one in standing), default=0.0)
+    if most < shared or not standing:
+        return ""
+    alike = [one for one in standing if most - one.difference < max(ALIKE, ALIKE_SHARE * most)]
+    alike.sort(key=lambda one: (one.degrees, -one.difference))
+    first, *others = (blocks.candidates[one.candidate] for one in alike[:NAMED])
+    return f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
 
 
 def _scatter(blocks: Blocks, falls: dict[int, list[tuple[float, int]]]) -> list[float]:

@@ -129,7 +129,7 @@ def diagnose_together(
             if not out:
                 break
             for k, effect in out.items():
-                reasons[kept[k]] = "does not fit the others" + (f"; it differs by: {effect}" if effect else "")
+                reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
             members = [m for k, m in enumerate(members) if k not in out]
             kept = [i for k, i in enumerate(kept) if k not in out]
         progress("each recording against the others")
