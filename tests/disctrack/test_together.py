@@ -279,16 +279,17 @@ def test_processes_that_end_at_once_are_an_error_and_no_silence(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_path):
-    script = tmp_path / "guarded.py"
+    script = tmp_path / "guarded.py"  # each process reads it for 3 s, as long imports take
     script.write_text(
         "import os, time\nfrom disctrack.diagnosis.together.crew import Crew\n"
-        "def build(item):\n    print(os.getpid(), flush=True)\n    time.sleep(100)\n"
+        "def build(item):\n    time.sleep(100)\n"
+        "os.write(1, b'%d\\n' % os.getpid())\ntime.sleep(0.0 if __name__ == '__main__' else 3.0)\n"
         "if __name__ == '__main__':\n    with Crew(build, [1, 2], 2) as crew:\n        crew.call('share', [(), ()])\n"
     )
     running = subprocess.Popen([sys.executable, script], env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)  # fmt: skip
     assert running.stdout is not None
-    started = [int(running.stdout.readline()) for _ in range(2)]
+    _, *started = [int(running.stdout.readline()) for _ in range(3)]
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does: all of them get it
     _, said = running.communicate(timeout=20)
     assert said.count("Traceback") == 1  # this script's own

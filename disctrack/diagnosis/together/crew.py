@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -127,6 +128,7 @@ def _without_interruptions() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    resource_tracker.ensure_running()  # which, where it is started with the first process, lets them through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -155,6 +157,7 @@ def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
 
 
 def _work(connection: Connection, build: Build) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         objects = {i: _built(build, item) for i, item in connection.recv().items()}
     except (EOFError, OSError):
