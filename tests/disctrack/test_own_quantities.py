@@ -213,3 +213,18 @@ def test_of_many_runs_some_tell_a_gain_of_the_wrong_sign_and_the_others_follow(r
     assert max(widths) == 80 + 3
     assert_allclose([values[n] for n in "kcg"], [9.0, 0.5, -4.0], rtol=0.01)
     assert misfit(system, values) < 0.02
+
+
+@pytest.mark.parametrize("fault", ["", "shaken", "noisy"])
+def test_a_run_that_does_not_fit_the_others_is_named(rng, fault):
+    """What shakes one run of twelve, or a sensor three times as noisy there; else none is named."""
+    runs = swings(rng, 12, 80)
+    x = runs[7].data["x"]
+    if fault == "shaken":
+        x = x + 0.02 * np.sin(15.0 * runs[7].time ** 2)
+    if fault == "noisy":
+        x = x + 3 * SIGMA * rng.standard_normal(len(x))
+    runs[7] = replace(runs[7], data={"x": x})
+    named = [note for note in diagnose(SWINGS, runs, OFFERED).notes if "other runs" in note]
+    assert len(named) == bool(fault)
+    assert all("in swing 7 (" in note and note.count("times") == 1 for note in named)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit
@@ -26,6 +27,11 @@ from disctrack.files.whole import write_whole
 
 OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
 HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
+FEWEST_RUNS, ODD, MOST_ODD = (
+    4,
+    2.0,
+    0.3,
+)  # runs are compared; rms over the others' median; share, above which none is odd
 FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
 
 
@@ -112,11 +118,30 @@ class Answer:
             "or the noise changes with time"
         ]
 
+    def _odd_runs(self) -> list[str]:
+        """Runs that leave far more than the others do: one of them alone may be what no term describes."""
+        stretches = self.system.stretches
+        whole = not any(s.stretch for s in stretches)
+        if len(stretches) < FEWEST_RUNS or not whole or self.diagnosis.held_out_before is None:
+            return []
+        judged = self.asked.judged
+        residual, _ = judged.linearise(self.diagnosis.after.values, [])
+        count = np.array([max(float(np.sum(judged.weights[rows])), 1.0) for rows in self.system.rows])
+        left = np.array([float(np.sum(residual[rows] ** 2)) for rows in self.system.rows]) / count
+        level = float(np.median(left))
+        by_noise = stats.chi2.isf(self.diagnosis.settings.false_alarm / len(left), count) / count
+        odd = np.flatnonzero(left > level * np.maximum(ODD**2, by_noise))
+        worst = [f"{stretches[i].name} ({np.sqrt(left[i] / level):.3g} times)" for i in odd[np.argsort(-left[odd])]]
+        if not worst or len(worst) > MOST_ODD * len(stretches):
+            return []
+        some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
+        return [f"what is left is far more than in the other runs in {some}: look at what was different there"]
+
     def _far_off(self) -> list[str]:
         """Single samples that what is left of all others does not reach: they make noise and sigmas too large."""
+        notes = self._odd_runs()
         if self.verdict == "unexplained":
-            return []
-        notes = []
+            return notes
         predicted = self.predicted(self.diagnosis.after)
         for c, channel in enumerate(self.system.formulas.channels):
             left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
