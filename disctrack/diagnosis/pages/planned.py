@@ -11,9 +11,9 @@ from disctrack.pages.html import bullets, details, paragraph, table
 
 SAID = (
     "Computed from the fitted model: each recording is simulated with the same cameras and noise, and put beside "
-    "what there is; laws, cameras and dots are shared, the initial state is its own. With another disc the laws' "
-    "coefficients are taken to stay, with another pressure air drag to go with the density as its law says. More dots "
-    "and a third view count as numbers of the same kind."
+    "what there is; laws, cameras and dots are shared, the initial state is its own. Another disc has a k_m of its "
+    "own, laws in question keep their coefficient; air drag goes with the density as its law says. More dots and a "
+    "third view count as numbers of the same kind."
 )
 
 
