@@ -108,7 +108,7 @@ def diagnose_trajectory(
         not_noise = left is not None and not left.white
         as_found = (system, remembering, learned.law, diagnosis.noise, not_noise)
         formed = with_form(*as_found, _of_motion(kept))
-        diagnosis, doubted = _beside_any_form(diagnosis, kept, formed.of_another)
+        diagnosis, doubted = _beside_any_form(diagnosis, kept, formed.of_another, learned.law.looked)
         if _of_motion(diagnosis.found):  # what holds beside any law does not stand in with this one
             formed = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
         learned = replace(learned, fit=formed.fit, course=formed.course)
@@ -370,12 +370,15 @@ def _as_noise_with_memory(system: System, fitted: Fit, names: Sequence[str], noi
     return float(max(1.0, fitted.reduced_chi_square / noise) * max(factors[name] for name in names) ** 2)
 
 
-def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -> tuple[Diagnosis, tuple[str, ...]]:
+def _beside_any_form(
+    diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit, looked: float
+) -> tuple[Diagnosis, tuple[str, ...]]:
     """Without effects beside a law that stand out no longer once the law's form may be another; and a note of each.
 
     They stay in the fit: with the law they describe the data.
     kept : effects beside the law.   fitted : with sigmas as they are if the law's form is another's: a library seldom
-    holds the law that no catalogue names
+    holds the law that no catalogue names.   looked : chi-square that a law pays for having been looked for; so does an
+    effect whose place or frequency was
     """
     doubted, notes = list[Found](), list[str]()
     for found in kept:
@@ -385,7 +388,7 @@ def _beside_any_form(diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit) -
         index = [fitted.names.index(q.name) for q in sizes]
         amounts = np.array([fitted.values[q.name] - q.null for q in sizes])
         gain = wald(amounts, fitted.covariance[np.ix_(index, index)])
-        if gain > found.threshold:
+        if gain > found.threshold + looked * candidate.sought:
             continue
         doubted.append(found)
         notes.append(

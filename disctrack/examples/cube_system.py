@@ -66,7 +66,7 @@ class CubeTosses:
         self.toss = np.concatenate([*toss, np.array([c.number for c in self.cubes], int)])
         self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """No candidate has a threshold."""
         return ()
 

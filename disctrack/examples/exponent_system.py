@@ -161,7 +161,7 @@ class ExponentSystem:
         """Values from which the base fit begins."""
         return {q.name: q.null for q in self.base} | {at("km.k_m", s.setup.surface): s.setup.k_m for s in self.series}
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """Slip: friction coefficients that rolling would just exceed on every surface."""
         return [(1 / mu,) * len(candidate.quantities) for mu in (0.05, 0.02)]
 

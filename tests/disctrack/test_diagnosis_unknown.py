@@ -215,9 +215,12 @@ def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
     assert result.learned is None or np.isfinite(result.learned.course.sigma).all()
 
 
-@pytest.mark.parametrize(("name", "beside"), [("loose_ball", "rolling_classical"), ("pad", "table_shaken")])
+@pytest.mark.parametrize(
+    ("name", "beside"),
+    [("loose_ball", "rolling_classical"), ("pad", "table_shaken"), ("eddy_half", "table_shaken")],
+)
 def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
-    """A ball in oil, and a table that gives way: the library has neither, and sums that come near are no finding."""
+    """A ball in oil, a table that gives way, a brake over half of it: sums that come near to these are no finding."""
     made = unknown(name, 1)
     result = diagnose_trajectory(made.trajectory, separate=False)
     assert not result.diagnosis.found

@@ -23,11 +23,15 @@ ANGLES = 48  # round the rim: 7.5 deg apart, half the width of a flat
 PEAKS = 6  # of the spectrum
 PADDED = 8  # times the length of the recording, for peaks between its frequencies
 REFITS = 2  # begin at so many of them
+NEAR = 10.0  # [sigma of a number], rms between two motions: micrometres of the centimetres by which they move
 SLOW = 3.0  # periods in the recording that a vibration has at least
 
 
-def sought(system: DiscSystem, candidate: Candidate, values: Values) -> list[tuple[float, ...]]:
-    """Values of the candidate's shape to begin with, the best first; empty where none has to be looked for."""
+def sought(system: DiscSystem, candidate: Candidate, values: Values, least: float = 0.0) -> list[tuple[float, ...]]:
+    """Values of the candidate's shape to begin with, the best first; empty where none has to be looked for.
+
+    least : gain to first order, below which none is worth a refit
+    """
     if not candidate.sought:
         return []
     first, *rest = candidate.shape
@@ -36,16 +40,26 @@ def sought(system: DiscSystem, candidate: Candidate, values: Values) -> list[tup
     priors = np.diag([1.0 / q.prior_sigma for q in system.base])
     basis = span(np.concatenate([derivative.reshape(-1, len(priors)), priors]))
     r, no_prior = residual.ravel(), np.zeros((len(priors), len(candidate.names)))
+    by_amounts = system.columns_known.get((candidate.name, r.size))
+    if by_amounts is None or len(by_amounts[1]) != len(places) or not _near(r, by_amounts[0]):
+        null = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values)
+        by_amounts = r, [system.linearise({**null, first.name: float(x)}, candidate.names)[1] for x in places]
+        if first.unit == "rad":  # the same places whatever is left
+            system.columns_known[candidate.name, r.size] = by_amounts
     gains = []
-    for place in places:
-        own = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values) | {first.name: float(place)}
-        columns = system.linearise(own, candidate.names)[1].reshape(len(r), -1)
+    for derivatives in by_amounts[1]:
+        columns = derivatives.reshape(len(r), -1)
         left = cleared(np.concatenate([columns, no_prior]), basis)[: len(r)]
         amounts, *_ = np.linalg.lstsq(left, r, rcond=1e-10)
         inside = all(q.lower <= q.null + a <= q.upper for q, a in zip(candidate.quantities, amounts, strict=True))
         gains.append(float(r @ r - np.sum((r - left @ amounts) ** 2)) if inside else 0.0)
     best = np.argsort(gains)[::-1][:REFITS]
-    return [(float(places[i]), *(q.null for q in rest)) for i in best if gains[i] > 0]
+    return [(float(places[i]), *(q.null for q in rest)) for i in best if gains[i] > least]
+
+
+def _near(residual: Array, other: Array) -> bool:
+    """Of motions so near to each other that a small effect does the same to both?"""
+    return float(np.mean((residual - other) ** 2)) < NEAR**2
 
 
 def _frequencies(system: DiscSystem, values: Values) -> Array:

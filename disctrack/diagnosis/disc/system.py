@@ -123,6 +123,7 @@ class DiscSystem:
         """
         self.systematic = systematic or Systematic()
         self.patience = Patience()
+        self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
         self.stretch = stretch or free_stretch(trajectory)
         self.starts_in_slip = starts_in_slip
@@ -324,13 +325,13 @@ class DiscSystem:
             effects["slip.mu"] = 1.0 / values[SLIP]
         return self.model.with_values(effects)
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time.
 
         For others: values of the shape, where that has to be looked for.
         """
         if not candidate.threshold:
-            return sought(self, candidate, values)
+            return sought(self, candidate, values, least)
         motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
         needed = float(np.max(motion.friction_needed))
         return [(1.0 / (share * needed),) for share in SLIP_STARTS]

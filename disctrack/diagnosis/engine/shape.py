@@ -27,6 +27,7 @@ STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour sa
 NARROW = 1e-6  # of a shape's size: as close as two values need to be
 MAX_STARTED = 12  # iterations at each shape of the grid, and ...
 WORTH_A_SHAPE = 0.5  # ... share of what exceeds the noise that the best of them may leave, for its shape to be sought
+FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
 DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
 
 
@@ -216,8 +217,11 @@ def _with_free_shape(
     base, before = diagnosis.before, diagnosis.held_out_before
     if kept:
         base = _without_others(system, diagnosis, kept)
-        before = _held_out(system, diagnosis, base)
-    starts = [dict(zip(_names(candidate.shape), s, strict=True)) for s in system.starts(candidate, base.values)]
+    least = FIRST_ORDER * max(base.cost - diagnosis.after.cost, 0.0) if kept else 0.0  # of what it would stand in for
+    places = system.starts(candidate, base.values, least)
+    if kept and not places:
+        return None
+    starts = [dict(zip(_names(candidate.shape), s, strict=True)) for s in places]
     fits = []
     for shape in starts or _grid(candidate):
         with suppress(TrialGivenUp):
@@ -230,6 +234,8 @@ def _with_free_shape(
     # beside others little may exceed the noise: there it is to describe more than what it stands in for
     if not (first.cost < diagnosis.after.cost if kept else excess[1] < WORTH_A_SHAPE * excess[0]):
         return None
+    if kept:
+        before = _held_out(system, diagnosis, base)
     expected = {q.name: _first_order(system, first, q) for q in candidate.shape}
     free = tuple(q for q in candidate.shape if np.isfinite(expected[q.name]))
     fitted = first

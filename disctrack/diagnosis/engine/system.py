@@ -87,10 +87,11 @@ class System(Protocol):
     def weights(self) -> Array:
         """(n,) how many numbers of each row are data."""
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """Values from which refits of a candidate with a threshold begin, given a fit without it.
 
         Of any other: of its shape, where the system knows where to look; none, where the shape's range is tried.
+        least : gain to first order, below which a shape that has to be looked for is worth no refit
         """
 
 
@@ -167,9 +168,9 @@ class Wrapped:
         """As the system's."""
         return self._system.weights
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """As the system's."""
-        return self._system.starts(candidate, values)
+        return self._system.starts(candidate, values, least)
 
     @property
     def several_minima(self) -> bool:

@@ -155,7 +155,7 @@ class EquationSystem:
         """Where the numbers lie that were tried along the motion: without their term's amount they move nothing."""
         return {n: v for n, v in self.aims.items() if n in self.formulas.along}
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """No term has a threshold."""
         return ()
 

@@ -33,7 +33,7 @@ class JointSystem:
         self.base: tuple[Quantity, ...] = tuple(sharing.base.values())
         self.candidates: tuple[Candidate, ...] = sharing.candidates
 
-    def starts(self, candidate: Candidate, values: Values) -> Sequence[tuple[float, ...]]:
+    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """No candidate has a threshold."""
         return ()
 
