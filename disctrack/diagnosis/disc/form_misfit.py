@@ -6,9 +6,9 @@ discrepancy beside the parameters). Where the form is nearly right, it is a norm
 a probe. Where it is another's, it is a sum: along each axis such a process, and some that change slowly beside the
 precession and its harmonics, as what depends on place and direction does; each of a size of its own, so that what the
 recording does not show may be as large as the law. All sizes are in proportion to the law's, and their probabilities
-follow from the residual. That the form is another's is certain where the residual is not noise, or where it takes
-several to describe the data, and else as probable as laws of other kinds are that describe the data too. What a law's
-numbers could take up themselves is no misfit (Plumlee 2017).
+follow from the residual. An edge or a blow shorter than a probe may be anywhere in it. That the form is another's is
+certain where the residual is not noise, or where it takes several to describe the data, and else as probable as laws of
+other kinds are that describe the data too. What a law's numbers could take up themselves is no misfit (Plumlee 2017).
 """
 
 from collections.abc import Collection, Sequence
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
 from calibration.arrays import Array
@@ -34,6 +35,7 @@ SLOW = 1.0 / 3.0  # of the recording: correlation of a part that changes slowly
 SELDOM = 0.05  # probability that the form is another's, where no other describes the data
 SWEEPS = 4  # over the parts, the size of each judged beside the others
 STEP = 1e-4  # of a number, for the derivative of the course
+WITHIN = 8  # instants of a probe, at which laws are looked at
 UNSEEN = 1e-10  # share of a column's length below which the data do not show it
 
 
@@ -123,6 +125,7 @@ def with_form(
         mixed += probability * (another - fitted.covariance)
         misfit += probability * size**2
     variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_rivals(system, fitted, law, course, blocks.time)
+    variance += wrong * _within_probes(system, fitted, blocks, course)
     found = LawCourse(blocks.time, course, np.sqrt(variance), float(np.sqrt(misfit)))
     return WithForm(replace(fitted, covariance=mixed), replace(fitted, covariance=another), found)
 
@@ -166,6 +169,18 @@ def _among_rivals(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Arra
         moment = moment_about_contact(system.knowing(rival.effect), rival.values, motion)[1:]
         total, spread = total + odds, spread + odds * (moment - course) ** 2
     return np.asarray(spread / total, float)
+
+
+def _within_probes(system: DiscSystem, fitted: Fit, blocks: _Blocks, course: Array) -> Array:
+    """Mean square (k, 3), over the time of each probe, by which the laws differ from a smooth course through them all.
+
+    What is shorter than a probe (an edge, a blow) moves the disc by its sum alone: another form has it elsewhere there.
+    """
+    parts = (np.arange(WITHIN) + 0.5) / WITHIN - 0.5
+    fine = blocks.time[:, None] + blocks.spacing * parts
+    motion = _motion(system, fitted.values, fine.ravel())
+    moment = moment_about_contact(system, fitted.values, motion)[1:].reshape(*fine.shape, 3)
+    return np.asarray(np.mean((moment - CubicSpline(blocks.time, course)(fine)) ** 2, axis=1), float)
 
 
 def _motion(system: DiscSystem, values: Values, time: Array) -> Motion:
