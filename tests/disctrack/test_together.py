@@ -105,6 +105,20 @@ def test_a_run_with_a_fault_that_no_shared_number_takes_is_named_with_the_fault(
     assert two[3] == "hum [hum]"
 
 
+def test_an_effect_without_a_derivative_hinders_no_judgement(rng):
+    system, _ = joint(runs(rng, 12, run_7={"rate": 0.87}))
+    found = fit(system, system.base, system.sharing.start())
+    whole = system.linearise
+
+    def broken(values, names):
+        residual, derivative = whole(values, names)
+        derivative[..., [name.startswith("hum") for name in names]] = np.nan
+        return residual, derivative
+
+    system.linearise = broken
+    assert list(apart(system, found, 0.005, candidates=system.candidates)) == [7]
+
+
 def test_difference_in_an_effect_is_a_chi_square_and_names_nobody_by_chance(rng):
     falls, false = [], 0
     for _ in range(40):

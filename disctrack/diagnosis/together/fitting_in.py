@@ -21,6 +21,7 @@ from disctrack.diagnosis.together.joint import JointSystem
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
 SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit
 TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
+TWINS = 3  # of those that are looked at: a twin fits about as badly as the worst
 SEEN = 1e-6  # part of an effect's derivative that is left beside what is shared, from which on it is seen
 ALIKE = 10.0  # of chi-square, by which another effect tells less and may yet be the one
 NOISE = 2.0  # median of some falls of chi-square over that of noise, up to which it is noise
@@ -50,6 +51,9 @@ class Blocks:
         self.candidates = [c for c in candidates if not set(c.names) & set(fit.names)]
         new = {q.name: q.null for c in self.candidates for q in c.quantities}
         residual, every = system.linearise(new | fit.values, [*fit.names, *new])
+        if not np.isfinite(every).all():  # some effect has no derivative there
+            self.candidates, new = [], {}
+            residual, every = system.linearise(fit.values, fit.names)
         derivative, self._by_candidate = every[..., : len(fit.names)], every[..., len(fit.names) :]
         length = np.sqrt(np.sum(self._by_candidate**2, axis=(0, 1)))
         self._by_candidate = self._by_candidate / np.where(length > 0, length, 1.0)
@@ -233,6 +237,7 @@ def apart(
             break
         first = first or statistic
         alike = [i for i in kept if i != worst and judged[i].statistic > TWIN * statistic]
+        alike = sorted(alike, key=lambda i: -judged[i].statistic)[:TWINS]
         twins = [i for i in alike if _either_fits(blocks, (i, worst), kept, level / n, SPOILT * first)]
         for i in (worst, *twins[:1])[: most - len(named)]:
             kept.remove(i)
