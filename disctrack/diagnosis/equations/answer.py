@@ -17,6 +17,7 @@ from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.system import Candidate, System
 from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box, no_memory
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.diagnosis.equations.law import Learned
 from disctrack.diagnosis.equations.loop import Answered, ask
 from disctrack.diagnosis.equations.system import EquationSystem, fitted_rows
 from disctrack.diagnosis.pages.general import document, table
@@ -84,17 +85,57 @@ class Answer:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the data and on what they do not tell."""
-        return (*self.asked.notes, *self._what_helps_most(), *self._not_white(), *self._far_off())
+        return (*self.asked.notes, *self._what_helps_most(), *self._of_a_law(), *self._not_white(), *self._far_off())
+
+    @property
+    def law(self) -> Learned | None:
+        """A law of one variable that no term names, with its course; None where none describes the data."""
+        return self.asked.law
+
+    def _of_a_law(self) -> list[str]:
+        """What describes the data as well as the law that is named; or the law, where it is not."""
+        law = self.law
+        if law is None:
+            return []
+        notes = []
+        known = " and ".join(c.name for c in law.replaces)
+        odds = f"1 to exp({0.5 * abs(law.length - law.their_length):.3g})"
+        text = law.text(self.equations.units)
+        named = law.candidate.name in {
+            c.name for c in (*(f.candidate for f in self.diagnosis.found), *self.diagnosis.partial)
+        }
+        if not law.is_shorter:
+            notes.append(f"one law describes the data in place of {known}, with odds of {odds} against it: {text}")
+        elif not named:
+            notes.append(f"nearer to the data than {known} comes one law, though not to the noise: {text}")
+        elif np.isfinite(law.their_length):
+            notes.append(f"of known terms {known} come nearest, with odds of {odds} against the law")
+        if law.held and named:
+            notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")
+        if law.along.variable == "t":
+            notes.append(
+                "a force that depends on time alone describes any motion: a sensor whose zero wanders may do as much, "
+                "and another run will not repeat it unless time is what drives it"
+            )
+        if law.alike:
+            others = " or ".join(a.title for a in law.alike)
+            notes.append(f"these data cannot tell the law from {others}")
+        return notes
 
     def _what_helps_most(self) -> list[str]:
         """Where no term is named: those that gain most, and what they leave."""
         d = self.diagnosis
         if self.found or not d.partial or d.nearest is None:
             return []
-        names = " and ".join(f"{c.title} [{c.name}] ({self._numbers_of(c)})" for c in d.partial)
+        names = " and ".join(self._nearest_of(c) for c in d.partial)
         left = self._errors(d.nearest, None)
         sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
         return [f"{names} would help most and still leave {sizes}".replace(" 1 of", " of")]
+
+    def _nearest_of(self, c: Candidate) -> str:
+        if self.law is not None and c.name == self.law.candidate.name:
+            return self.law.text(self.equations.units)
+        return f"{c.title} [{c.name}] ({self._numbers_of(c)})"
 
     def _numbers_of(self, candidate: Candidate) -> str:
         """Its numbers in the nearest description, shapes that were held among them."""
@@ -241,7 +282,12 @@ class Answer:
         )
         if d.verdict == "nothing missing":
             return f"Nothing is missing: the equations leave {level}."
-        effects = "; and ".join(effect_text(f, d) for f in d.found)
+        effects = "; and ".join(
+            self.law.text(self.equations.units)
+            if self.law is not None and f.candidate.name == self.law.candidate.name
+            else effect_text(f, d)
+            for f in d.found
+        )
         if d.verdict == "found":
             return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
         if effects:
@@ -270,6 +316,7 @@ class Answer:
             "equations": {k: str(v) for k, v in self.equations.rates.items()},
             "runs": [{"name": s.name, "samples": len(s.time)} for s in self.system.stretches],
             "whiteness_p_value": self.whiteness,
+            "law": None if self.law is None else self.law.document(),
         }
         return dict(plain(found))
 

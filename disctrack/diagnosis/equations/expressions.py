@@ -13,8 +13,8 @@ from disctrack.errors import AnalysisError
 Formula: TypeAlias = str | float | sympy.Expr
 
 FUNCTIONS = (
-    "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign",
-    "Abs", "Min", "Max", "Piecewise", "Heaviside", "pi",
+    "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "exp", "log", "sqrt",
+    "sign", "Abs", "Min", "Max", "Piecewise", "Heaviside", "pi",
 )  # fmt: skip
 _KNOWN = {name: getattr(sympy, name) for name in FUNCTIONS} | {"abs": sympy.Abs}
 

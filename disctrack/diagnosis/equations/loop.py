@@ -29,7 +29,9 @@ from disctrack.diagnosis.engine.significance import wald
 from disctrack.diagnosis.engine.system import Quantity, System
 from disctrack.diagnosis.equations import terms as library
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.diagnosis.equations.expressions import Formula
 from disctrack.diagnosis.equations.formulas import formulas
+from disctrack.diagnosis.equations.law import Learned, learn, with_law
 from disctrack.diagnosis.equations.noise import (
     Remembering,
     autoregression,
@@ -56,6 +58,7 @@ NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the neare
 PATIENCE = 60.0  # [s] of a search without a word
 ENOUGH_A_TURN = 40  # samples of a turn: more of them tell little more than the noise of each
 MOST_LED = 2  # terms with which a fit is led anew over growing windows
+ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that no term describes
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
@@ -69,6 +72,7 @@ class Answered:
     samples: tuple[Samples, ...]  # whole runs
     notes: tuple[str, ...]
     memory: Array | None  # (w, order) autoregression of the noise, where it remembers
+    law: Learned | None = None  # of one variable, where it describes the data: in place of known terms, or beside them
 
 
 def ask(
@@ -173,10 +177,25 @@ def _asked(
         if again is not None:
             diagnosis, judged = again, again.judged or judged
             notes.append(remark)
-    if diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
+    law = _law(system, diagnosis, channels, judged)
+    if law is not None and law.system is not None and law.is_named(diagnosis):
+        judged = law.system if judged is system else getattr(judged, "over", lambda s: s)(law.system)
+        system, diagnosis = law.system, with_law(diagnosis, law)
+        if law.at_noise:
+            notes = [n for n in notes if not n.startswith(ERROR_THAT_LASTS)]
+    elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
         diagnosis, shapes = refine_shapes(judged, diagnosis)
         notes += list(shapes)
-    return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory)
+    return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory, law)
+
+
+def _law(
+    system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System
+) -> Learned | None:
+    """A law of one variable where known terms leave something, or where it takes several of them to describe it."""
+    if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
+        return None
+    return learn(system, diagnosis, channels, None if judged is system else judged)
 
 
 def _as_far_as_followed(
@@ -519,7 +538,7 @@ def _with_memory(
         block = max(2 * shortest_turn, 5 * lasting)
         reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
         spread = replace(_certain(system, diagnosis, block), reason=reason)
-        text = f"sigmas are those of what is left ({block:.2g} s taken as one error), not of the noise alone"
+        text = f"{ERROR_THAT_LASTS} ({block:.2g} s taken as one error), not of the noise alone"
         return spread, None, text
     if base is None or not base.converged:
         return None, None, ""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import signal
 
+from disctrack.diagnosis.equations.law import NAME, Learned
 from disctrack.pages.figures import Drawn, draw, gallery, panels
 from disctrack.pages.html import Markup, as_typed, bullets, page, paragraph, section, table
 from disctrack.pages.palette import BLUE, MUTED, RED
@@ -23,6 +24,8 @@ def written_page(answer: Answer, folder: Path) -> tuple[str, list[Path]]:
     """The whole page, and the figures that were written beside it. Raises OutputError."""
     d = answer.diagnosis
     drawings = [_drawn(answer, c, name) for c, name in enumerate(answer.system.formulas.channels)]
+    if answer.law is not None:
+        drawings.insert(0, _law(answer, answer.law))
     files, pictures = draw(folder, drawings, ("png",))
     equations = [as_typed(f"d{k}/dt = {v}") for k, v in answer.equations.rates.items()]
     parts = [
@@ -60,7 +63,7 @@ def _fitted(answer: Answer) -> Markup:
     d = answer.diagnosis
     rows = []
     for q in d.after.quantities:
-        if not q.name.startswith("state."):
+        if not q.name.startswith(("state.", f"{NAME}.")):  # a law is shown by its course
             old = f"{d.before.values[q.name]:.6g} +- {d.before.sigma(q.name):.2g}" if q.name in d.before.names else ""
             new = f"{d.after.values[q.name]:.6g} +- {d.after.sigma(q.name):.2g}"
             rows.append([as_typed(q.name), old, new, "" if q.unit == "1" else q.unit])
@@ -77,6 +80,23 @@ def _tried(answer: Answer) -> Markup:
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
+
+
+def _law(answer: Answer, law: Learned) -> Drawn:
+    """The law that was learned with its band, and what known terms make at the same places."""
+    units = answer.equations.units
+    picture, (axes,) = panels(9, 3.5)
+    axes.fill_between(law.variable, law.force - 2 * law.sigma, law.force + 2 * law.sigma, color=BLUE, alpha=0.25, lw=0)
+    axes.plot(law.variable, law.force, color=BLUE, lw=1.2, label="learned, 95 %")
+    if law.theirs is not None:
+        known = " + ".join(c.name for c in law.replaces)
+        axes.plot(law.variable, law.theirs, "--", color=RED, lw=1.0, label=f"known terms: {known}")
+    of = "time" if law.along.variable == "t" else law.along.variable
+    unit = units.get(law.along.variable, "s" if law.along.variable == "t" else "")
+    axes.set(xlabel=f"{of} ({unit})" if unit else of, ylabel=f"added to d{law.along.equation}/dt")
+    axes.legend(frameon=False, fontsize=8)
+    held = f", beyond {' and '.join(law.held)} as declared" if law.held else ""
+    return Drawn("law", "law", f"{law.along.title}, learned from what is left{held}.", picture)
 
 
 def _drawn(answer: Answer, channel: int, name: str) -> Drawn:

@@ -4,7 +4,7 @@ Over many turns of an oscillation chi-square has many minima; over half a turn i
 is led to longer and longer windows stays in it, for as long as the model can follow at all.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import fit, prior_rows
-from disctrack.diagnosis.engine.system import Quantity
+from disctrack.diagnosis.engine.system import Quantity, System
 from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import Samples
 from disctrack.diagnosis.equations.formulas import Formulas
@@ -207,24 +207,34 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
 
 
 def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, float]:
-    """All quantities fitted to all data within a region of trust that grows and shrinks with its success.
+    """All quantities fitted to all data (`trusted`). Of many runs some tell what all share, and the others follow."""
+    some = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
+    values = trusted(some, some.base, declared)
+    if len(some.stretches) < len(system.stretches):
+        values |= fit(system, [q for q in system.base if q.slot], values, max_iterations=15).values
+    return values
+
+
+def trusted(
+    system: System, quantities: Sequence[Quantity], declared: Mapping[str, float], attempts: int = _ATTEMPTS
+) -> dict[str, float]:
+    """Quantities fitted within a region of trust that grows and shrinks with its success.
 
     Gauss-Newton's halved steps end where a parameter far off (a gain of the wrong sign) has to pass through values with
-    which nothing moves. Of many runs some tell what all share, and the others follow.
+    which nothing moves.
     """
-    everything, system = system, system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
-    names = [q.name for q in system.base]
-    null = np.array([q.null for q in system.base])
-    lower, upper = (np.array([getattr(q, side) for q in system.base]) for side in ("lower", "upper"))
-    size = np.maximum(np.abs(null), [q.scale for q in system.base])
-    start = np.clip([declared.get(name, q.null) for name, q in zip(names, system.base, strict=True)], lower, upper)
+    names = [q.name for q in quantities]
+    null = np.array([q.null for q in quantities])
+    lower, upper = (np.array([getattr(q, side) for q in quantities]) for side in ("lower", "upper"))
+    size = np.maximum(np.abs(null), [q.scale for q in quantities])
+    start = np.clip([declared.get(name, q.null) for name, q in zip(names, quantities, strict=True)], lower, upper)
     latest: dict[bytes, tuple[Array, Array]] = {}
 
     def both(x: Array) -> tuple[Array, Array]:
         if x.tobytes() not in latest:
             values = dict(declared) | dict(zip(names, x.tolist(), strict=True))
             residual, derivative = system.linearise(values, names)
-            right, matrix = prior_rows(system.base, values)
+            right, matrix = prior_rows(quantities, values)
             latest.clear()
             latest[x.tobytes()] = (
                 np.concatenate([residual.ravel(), right]),
@@ -236,12 +246,9 @@ def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, 
         return dict(declared)
     found = least_squares(
         lambda x: np.nan_to_num(both(x)[0], nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE), start,
-        lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=_ATTEMPTS,
+        lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=attempts,
     )  # fmt: skip
-    values = dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
-    if len(system.stretches) < len(everything.stretches):
-        values |= fit(everything, [q for q in everything.base if q.slot], values, max_iterations=15).values
-    return values
+    return dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
 
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:

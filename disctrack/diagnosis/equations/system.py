@@ -287,7 +287,8 @@ class EquationSystem:
                 slope = np.einsum("mwn,mn->mw", H_y, self._rates(s, p, times[g], states)[0])
                 for j, which in enumerate(own):
                     if 0 <= which < by_number.shape[1]:
-                        derivative[:, channels, j] += slope[:, channels] * by_number[channels, which].T
+                        with np.errstate(invalid="ignore"):  # a motion that ran away has no slope
+                            derivative[:, channels, j] += slope[:, channels] * by_number[channels, which].T
         return Prediction(out[0, :, :n], seen, derivative)
 
     def _instants(self, s: Samples, p: Array) -> tuple[Array, list[int], Array]:

@@ -61,7 +61,7 @@ def table(d: Diagnosis) -> list[str]:
     lines = [f"{'chi-square per degree':<30}{chi[0]:12.4g}{chi[1]:12.4g}{1:12}"]
     lines += ["", f"{'fitted':<30}{'value':>14}{'sigma':>12}"]
     for name in d.after.names:
-        if not name.startswith("state."):
+        if not name.startswith(("state.", "learned.")):  # a law is told by its course
             lines.append(f"{name:<30}{d.after.values[name]:14.6g}{d.after.sigma(name):12.2g}")
     lines += ["", f"{'tried':<30}{'gain':>12}  outcome"]
     for t in d.tried:
