@@ -389,7 +389,7 @@ class _Competition:
         part = sorted(_part_of_law(there.formulas, law, there.held))
         moved, by_number = _declared_part(there, law, part, fitted.values, x)
         force, columns = force + moved, np.column_stack([columns, by_number])
-        at = [fitted.shared.index(n) for n in (*(q.name for q in best.quantities), *part)]
+        at = [fitted.names.index(n) for n in (*(q.name for q in best.quantities), *part)]
         moved_by, covariance = self._roughly(view, fitted, best.quantities)
         variance = np.einsum("ij,jk,ik->i", columns, covariance[np.ix_(at, at)], columns)
         variance = np.maximum(variance, 0.0) + (columns @ moved_by[at]) ** 2
