@@ -22,6 +22,7 @@ from disctrack.diagnosis.equations import _ode_kernel as kernel
 from disctrack.diagnosis.equations.declared import checked
 from disctrack.diagnosis.equations.formulas import formulas
 from disctrack.diagnosis.equations.noise import fast_part, step_of
+from disctrack.diagnosis.equations.page import _sentence
 from disctrack.diagnosis.equations.system import EquationSystem
 from disctrack.errors import AnalysisError
 
@@ -422,6 +423,12 @@ def test_the_answer_is_written_as_json_and_as_a_page(with_friction, tmp_path):
     assert found["after"]["channels"]["x"]["rms"] < found["before"]["channels"]["x"]["rms"]
     assert "dry friction" in paths[1].read_text()
     assert "dry friction" in str(with_friction)
+
+
+def test_the_page_leaves_names_as_they_were_declared():
+    assert _sentence("c acts as a part of the law", {"c"}) == "c acts as a part of the law."
+    assert _sentence("u*abs(p) on p would help most") == "u*abs(p) on p would help most."
+    assert _sentence("sigmas allow for that", {"c"}) == "Sigmas allow for that."
 
 
 def snippets():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,7 +33,7 @@ def written_page(answer: Answer, folder: Path) -> tuple[str, list[Path]]:
         paragraph(answer.sentence, "lead"),
         paragraph(f"Verdict: {d.verdict}. {_sentence(d.reason)}"),
         bullets(equations),
-        *(paragraph(_sentence(n)) for n in answer.notes),
+        *(paragraph(_sentence(n, _named(answer))) for n in answer.notes),
         section("Before and after", [_before_after(answer)]),
         section("Fitted numbers", [_fitted(answer)]),
         section("In pictures", [gallery(drawings, pictures)]),
@@ -41,8 +42,15 @@ def written_page(answer: Answer, folder: Path) -> tuple[str, list[Path]]:
     return page(f"{answer.equations.name}: what is missing?", parts), files
 
 
-def _sentence(said: str) -> str:
-    return f"{said[:1].upper()}{said[1:]}."
+def _named(answer: Answer) -> set[str]:
+    """What the user's equations call by names, of which c is not C."""
+    e = answer.equations
+    return {*e.rates, *e.parameters, *e.constants, *e.inputs, *answer.system.formulas.channels}
+
+
+def _sentence(said: str, names: Collection[str] = ()) -> str:
+    first = said.partition(" ")[0]
+    return f"{said}." if first in names or not first.isalpha() else f"{said[:1].upper()}{said[1:]}."
 
 
 def _before_after(answer: Answer) -> Markup:
