@@ -164,11 +164,11 @@ def test_an_effect_beside_a_law_is_claimed_only_if_no_form_of_the_law_may_do_as_
     fitted = Fit(quantities, values, nearly, 1.0, 0.0, 100, True, 3)
     found = Found(candidate, 300.0, 10.0, 21.6, ())
     diagnosis = Diagnosis("unexplained", "", (found,), fitted, fitted, None, None, 1.0, ())
-    kept, notes = stage._beside_any_form(diagnosis, [found], fitted)
+    kept, notes = stage._beside_any_form(diagnosis, [found], fitted, 0.0)
     assert kept.found == (found,)
     assert notes == ()
     wider = replace(fitted, covariance=4.0 * nearly)
-    kept, (note,) = stage._beside_any_form(diagnosis, [found], wider)
+    kept, (note,) = stage._beside_any_form(diagnosis, [found], wider, 0.0)
     assert kept.found == ()
     assert "[spring]" in note
     assert "not claimed" in note
@@ -177,7 +177,7 @@ def test_an_effect_beside_a_law_is_claimed_only_if_no_form_of_the_law_may_do_as_
     shaped = np.zeros((3, 3))
     shaped[:2, :2], shaped[2, 2] = wider.covariance, 1e-6
     bent = replace(wider, quantities=(*quantities, exponent), values=values | {"spring.p": 2.0}, covariance=shaped)
-    assert stage._beside_any_form(replace(diagnosis, found=(known,)), [known], bent)[0].found == ()
+    assert stage._beside_any_form(replace(diagnosis, found=(known,)), [known], bent, 0.0)[0].found == ()
 
 
 def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():

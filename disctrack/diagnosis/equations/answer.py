@@ -17,7 +17,7 @@ from disctrack.diagnosis.engine.search import Diagnosis, Settings
 from disctrack.diagnosis.engine.system import Candidate, System
 from disctrack.diagnosis.engine.whiteness import LAGS, ljung_box, no_memory
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
-from disctrack.diagnosis.equations.law import Learned
+from disctrack.diagnosis.equations.law import LearnedForce
 from disctrack.diagnosis.equations.loop import Answered, ask
 from disctrack.diagnosis.equations.system import EquationSystem, fitted_rows
 from disctrack.diagnosis.pages.general import document, table
@@ -88,7 +88,7 @@ class Answer:
         return (*self.asked.notes, *self._what_helps_most(), *self._of_a_law(), *self._not_white(), *self._far_off())
 
     @property
-    def law(self) -> Learned | None:
+    def law(self) -> LearnedForce | None:
         """A law of one variable that no term names, with its course; None where none describes the data."""
         return self.asked.law
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import sympy
+from scipy import linalg
 
 from calibration.arrays import Array
 from disctrack.diagnosis.engine.fit import Fit, compress, covariance_within, fit, prior_rows, solve_bounded
@@ -71,7 +72,7 @@ class Along:
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedForce:
     """A law with its course."""
 
     along: Along
@@ -130,7 +131,7 @@ class Learned:
 
 def learn(
     system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
-) -> Learned | None:
+) -> LearnedForce | None:
     """The law of one variable with which the data are most probable, beside known terms where it takes them.
 
     channels : formulas of what is observed, without terms
@@ -210,7 +211,7 @@ class _Competition:
         own = {c.name: c for c in self.system.candidates}
         return [own[name] for name in dict.fromkeys(named) if name in own][:MOST_BESIDE]
 
-    def is_worth_telling(self, law: Learned) -> bool:
+    def is_worth_telling(self, law: LearnedForce) -> bool:
         """Does it describe the data, or nearly all of what is missing, and samples that it has not seen as well?
 
         As known terms are asked: where it is not noise that is left, they must leave more.
@@ -287,14 +288,15 @@ class _Competition:
         k = len(others)
         right = right + matrix[:, k:] @ np.array([values[q.name] for q in own])
         length = np.linalg.norm(matrix[:, :k], axis=0)
-        basis = np.linalg.svd(matrix[:, :k] / np.where(length > 0, length, 1.0), full_matrices=False)
-        basis_ = basis[0][:, basis[1] > 1e-9 * max(float(basis[1].max(initial=0.0)), 1e-300)]
-        right, columns = (x - basis_ @ (basis_.T @ x) for x in (right, matrix[:, k:]))
+        basis, R, _ = linalg.qr(matrix[:, :k] / np.where(length > 0, length, 1.0), mode="economic", pivoting=True)
+        basis = basis[:, np.abs(np.diag(R)) > 1e-9]
+        right, columns = (x - basis @ (basis.T @ x) for x in (right, matrix[:, k:]))
         size = _size(system, law, values)
         priors, lengths = [], []
         for smooth, fall in product(SMOOTH, FALLS):
             falls = _falls(own, smooth, fall)
-            U, singular, _ = np.linalg.svd(columns * falls, full_matrices=False)
+            # the faster driver gives up where columns are alike
+            U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
             power = (U.T @ right) ** 2 / self.noise
             gain = (SIZES[:, None] * size * singular) ** 2 / self.noise
             found = np.sum(np.log1p(gain) - power * gain / (1 + gain), axis=1)
@@ -373,7 +375,7 @@ class _Competition:
         lower, upper = np.array([q.lower for q in quantities]), np.array([q.upper for q in quantities])
         return solve_bounded(right, matrix, lower - x, upper - x), covariance_within(matrix, right, x, lower, upper)
 
-    def told(self, best: _Trial, whole: EquationSystem) -> Learned:
+    def told(self, best: _Trial, whole: EquationSystem) -> LearnedForce:
         """The law fitted to all data, with its course, beside the known terms that describe them too."""
         law, d = best.along, self.diagnosis
         there, fitted = _set(whole, law, best.fit.values)[0], best.fit
@@ -401,8 +403,8 @@ class _Competition:
         theirs = None
         if of_sums is not None and sums and not there.formulas.equations.mass:
             theirs = _sum_of(there, law, of_sums.values, x, part)
-        return Learned(law, candidate, best.beside, fitted, held, tuple(part), x, force, sigma, best.length, best.alike,
-                       sums, their_length, theirs, self.at_noise(fitted), there)  # fmt: skip
+        return LearnedForce(law, candidate, best.beside, fitted, held, tuple(part), x, force, sigma, best.length,
+                            best.alike, sums, their_length, theirs, self.at_noise(fitted), there)  # fmt: skip
 
 
 def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
@@ -684,7 +686,7 @@ def _joining(values: Values, system: EquationSystem) -> dict[str, float]:
     return found
 
 
-def with_law(diagnosis: Diagnosis, law: Learned) -> Diagnosis:
+def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
     """The answer with the law in place of known terms, and with those that act beside it.
 
     Where more than noise is left, it is the nearest description.

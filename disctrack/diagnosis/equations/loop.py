@@ -31,7 +31,7 @@ from disctrack.diagnosis.equations import terms as library
 from disctrack.diagnosis.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.diagnosis.equations.expressions import Formula
 from disctrack.diagnosis.equations.formulas import formulas
-from disctrack.diagnosis.equations.law import Learned, learn, with_law
+from disctrack.diagnosis.equations.law import LearnedForce, learn, with_law
 from disctrack.diagnosis.equations.noise import (
     Remembering,
     autoregression,
@@ -72,7 +72,7 @@ class Answered:
     samples: tuple[Samples, ...]  # whole runs
     notes: tuple[str, ...]
     memory: Array | None  # (w, order) autoregression of the noise, where it remembers
-    law: Learned | None = None  # of one variable, where it describes the data: in place of known terms, or beside them
+    law: LearnedForce | None = None  # where one describes the data: in place of known terms, or beside them
 
 
 def ask(
@@ -191,7 +191,7 @@ def _asked(
 
 def _law(
     system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System
-) -> Learned | None:
+) -> LearnedForce | None:
     """A law of one variable where known terms leave something, or where it takes several of them to describe it."""
     if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
         return None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import signal
 
-from disctrack.diagnosis.equations.law import NAME, Learned
+from disctrack.diagnosis.equations.law import NAME, LearnedForce
 from disctrack.pages.figures import Drawn, draw, gallery, panels
 from disctrack.pages.html import Markup, as_typed, bullets, page, paragraph, section, table
 from disctrack.pages.palette import BLUE, MUTED, RED
@@ -90,7 +90,7 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
-def _law(answer: Answer, law: Learned) -> Drawn:
+def _law(answer: Answer, law: LearnedForce) -> Drawn:
     """The law that was learned with its band, and what known terms make at the same places."""
     units = answer.equations.units
     picture, (axes,) = panels(9, 3.5)
