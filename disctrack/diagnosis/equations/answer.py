@@ -28,11 +28,8 @@ from disctrack.files.whole import write_whole
 
 OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
 HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
-FEWEST_RUNS, ODD, MOST_ODD = (
-    4,
-    2.0,
-    0.3,
-)  # runs are compared; rms over the others' median; share, above which none is odd
+FEWEST_RUNS = 4  # that are compared with each other
+ODD, MOST_ODD = 2.0, 0.3  # rms over the median of all runs; share of them, above which none is odd
 FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
 
 
@@ -101,9 +98,7 @@ class Answer:
         known = " and ".join(c.name for c in law.replaces)
         odds = f"1 to exp({0.5 * abs(law.length - law.their_length):.3g})"
         text = law.text(self.equations.units)
-        named = law.candidate.name in {
-            c.name for c in (*(f.candidate for f in self.diagnosis.found), *self.diagnosis.partial)
-        }
+        named = law.candidate.name in {*self.found, *(c.name for c in self.diagnosis.partial)}
         if not law.is_shorter:
             notes.append(f"one law describes the data in place of {known}, with odds of {odds} against it: {text}")
         elif not named:
@@ -133,9 +128,13 @@ class Answer:
         return [f"{names} would help most and still leave {sizes}".replace(" 1 of", " of")]
 
     def _nearest_of(self, c: Candidate) -> str:
-        if self.law is not None and c.name == self.law.candidate.name:
-            return self.law.text(self.equations.units)
-        return f"{c.title} [{c.name}] ({self._numbers_of(c)})"
+        return self._law_text(c) or f"{c.title} [{c.name}] ({self._numbers_of(c)})"
+
+    def _law_text(self, c: Candidate) -> str:
+        """The course of the law that was learned, if the candidate is that; else nothing."""
+        if self.law is None or c.name != self.law.candidate.name:
+            return ""
+        return self.law.text(self.equations.units)
 
     def _numbers_of(self, candidate: Candidate) -> str:
         """Its numbers in the nearest description, shapes that were held among them."""
@@ -282,12 +281,7 @@ class Answer:
         )
         if d.verdict == "nothing missing":
             return f"Nothing is missing: the equations leave {level}."
-        effects = "; and ".join(
-            self.law.text(self.equations.units)
-            if self.law is not None and f.candidate.name == self.law.candidate.name
-            else effect_text(f, d)
-            for f in d.found
-        )
+        effects = "; and ".join(self._law_text(f.candidate) or effect_text(f, d) for f in d.found)
         if d.verdict == "found":
             return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
         if effects:
