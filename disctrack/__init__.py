@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING, Any
 # In the order of the measurement: module -> the names it gives; "name=other" where the module calls it otherwise.
 _HOME = {
     "disctrack.recording.declaration": ("read_recording", "Recording"),
-    "disctrack.readers": ("open_frames", "FrameReader"),
-    "disctrack.readers.blocks": ("iter_pair_blocks",),
+    "disctrack.recording.readers": ("open_frames", "FrameReader"),
+    "disctrack.recording.readers.blocks": ("iter_pair_blocks",),
     "disctrack.calibrate.views": ("find_views", "calibrate_views"),
     "disctrack.calibrate.stage": ("calibrate_recording",),
     "calibration.rig_file": ("read_rig", "write_rig"),
@@ -53,8 +53,8 @@ _HOME = {
     "disctrack.diagnosis.stage": ("run_diagnose", "diagnose=diagnose_trajectory"),
     "disctrack.batch": ("run_batch",),
     "disctrack.rolling": ("Model", "State", "steady_precession", "simulate"),
-    "disctrack.scene.simulation": ("run_simulate",),
-    "disctrack.render": ("run_render",),
+    "disctrack.synthetic.simulation": ("run_simulate",),
+    "disctrack.synthetic": ("run_render",),
     "disctrack.errors": ("DiscTrackError",),
     "disctrack.files.software": ("__version__",),
 }
@@ -80,17 +80,17 @@ if TYPE_CHECKING:
     from disctrack.disc import Disc as Disc
     from disctrack.errors import DiscTrackError as DiscTrackError
     from disctrack.files.software import __version__ as __version__
-    from disctrack.readers import FrameReader as FrameReader
-    from disctrack.readers import open_frames as open_frames
-    from disctrack.readers.blocks import iter_pair_blocks as iter_pair_blocks
     from disctrack.recording.declaration import Recording as Recording
     from disctrack.recording.declaration import read_recording as read_recording
-    from disctrack.render import run_render as run_render
+    from disctrack.recording.readers import FrameReader as FrameReader
+    from disctrack.recording.readers import open_frames as open_frames
+    from disctrack.recording.readers.blocks import iter_pair_blocks as iter_pair_blocks
     from disctrack.rolling import Model as Model
     from disctrack.rolling import State as State
     from disctrack.rolling import simulate as simulate
     from disctrack.rolling import steady_precession as steady_precession
-    from disctrack.scene.simulation import run_simulate as run_simulate
+    from disctrack.synthetic import run_render as run_render
+    from disctrack.synthetic.simulation import run_simulate as run_simulate
     from disctrack.track.arrays import measure_pairs as measure_pairs
     from disctrack.track.live import LivePose as LivePose
     from disctrack.track.live import Tracker as Tracker

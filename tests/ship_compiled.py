@@ -23,12 +23,12 @@ from numba.core.ccallback import CFunc
 from numba.core.compiler_lock import global_compiler_lock
 
 from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, normal_equations
-from disctrack.diagnosis.equations import _ode_kernel, _stiff_kernel
-from disctrack.readers import _lzw, _png
-from disctrack.render import board_raster, disc_raster
+from disctrack.discrepancy.equations import _ode_kernel, _stiff_kernel
+from disctrack.recording.readers import _lzw, _png
 from disctrack.rolling import equations, integrate
 from disctrack.rolling._compiled import law_types, may_call, system_types
 from disctrack.rolling.effects.base import HELPERS, catalogue
+from disctrack.synthetic import board_raster, disc_raster
 from disctrack.track import _kernels, _pose_kernel, dots, following, pose
 
 ODE = (_ode_kernel.integrate, _ode_kernel.observe_all, _ode_kernel.rates_all)

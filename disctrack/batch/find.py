@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.readers.base import CINE_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, VIDEO_SUFFIXES
-from disctrack.readers.files import natural_key
 from disctrack.recording.declaration import FILE_NAME
+from disctrack.recording.readers.base import CINE_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, VIDEO_SUFFIXES
+from disctrack.recording.readers.files import natural_key
 
 RESULTS = "results"  # beside a recording's images
 FOLDER = "batch_results"  # of a batch, for what belongs to no single recording

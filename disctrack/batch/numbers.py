@@ -9,7 +9,7 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.batch.columns import UNITS
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.disc.model_file import declared_model
-from disctrack.diagnosis.engine.fit import fit
+from disctrack.discrepancy.fit import fit
 from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory

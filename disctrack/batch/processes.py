@@ -18,7 +18,7 @@ from disctrack.batch.jobs import JobQueue, Share
 from disctrack.batch.plan import Job
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import Result
-from disctrack.readers.blocks import ONE_THREAD
+from disctrack.recording.readers.blocks import ONE_THREAD
 
 _STOPPING, _ASK_AGAIN = 9.0, 2.0  # [s] that a worker has to clear up, and after which it is asked once more
 

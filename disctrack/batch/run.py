@@ -21,8 +21,8 @@ from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
 from disctrack.batch.together import FOLDER, diagnose_all
 from disctrack.errors import ClusterError, OutputError
 from disctrack.files.whole import check_writable
-from disctrack.readers.blocks import default_threads
 from disctrack.recording.declaration import FILE_NAME
+from disctrack.recording.readers.blocks import default_threads
 
 INTERRUPTED = "interrupted before it was done"
 

@@ -111,7 +111,7 @@ def write_summary(
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
     """The rows with the share of false findings among all that are as improbable: the more that look, the more find."""
-    from disctrack.diagnosis.engine.significance import false_discovery  # SciPy's statistics: only where wanted
+    from disctrack.discrepancy.significance import false_discovery  # SciPy's statistics: only where wanted
 
     tested = [row for row in rows if row["diagnosis_p_value"] is not None]
     shares = false_discovery([row["diagnosis_p_value"] for row in tested])

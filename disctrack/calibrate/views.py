@@ -15,13 +15,13 @@ from calibration.stuck_pixels import repaired_views
 from disctrack.calibrate.targets import find_target, other_board
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.frames import CAMERAS
-from disctrack.readers import open_frames
-from disctrack.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
-from disctrack.readers.decoding import decode
-from disctrack.readers.files import file_number, match_files
-from disctrack.readers.flat_field import FlatField, FlatFields, flat_fields
-from disctrack.readers.part import ImagePart, ImageParts, image_parts
 from disctrack.recording.declaration import CalibrationViews, Recording
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
+from disctrack.recording.readers.decoding import decode
+from disctrack.recording.readers.files import file_number, match_files
+from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
+from disctrack.recording.readers.part import ImagePart, ImageParts, image_parts
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
 

@@ -10,7 +10,7 @@ from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
 from disctrack.progress import stage, steps
-from disctrack.readers.blocks import default_threads
+from disctrack.recording.readers.blocks import default_threads
 from disctrack.track import summary
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 

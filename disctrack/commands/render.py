@@ -8,9 +8,9 @@ from tqdm import tqdm
 
 from disctrack.commands import DONE
 from disctrack.errors import SceneError
-from disctrack.render import run_render
-from disctrack.scene.description import Scene, load_scene, scene_toml
-from disctrack.scene.motion import effects_in_words
+from disctrack.synthetic import run_render
+from disctrack.synthetic.description import Scene, load_scene, scene_toml
+from disctrack.synthetic.motion import effects_in_words
 
 
 def run(arguments: argparse.Namespace) -> int:

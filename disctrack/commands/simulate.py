@@ -5,7 +5,7 @@ import argparse
 from disctrack.commands import DONE
 from disctrack.errors import SceneError
 from disctrack.rolling.effects import catalogue_table
-from disctrack.scene.simulation import run_simulate
+from disctrack.synthetic.simulation import run_simulate
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -8,11 +8,11 @@ from calibration import corner_fit, normal_equations
 from calibration.compiled import when_compiling
 from disctrack.commands import DONE
 from disctrack.progress import compiling
-from disctrack.readers import _lzw as lzw
-from disctrack.readers import _png as png
-from disctrack.render import board_raster, disc_raster
+from disctrack.recording.readers import _lzw as lzw
+from disctrack.recording.readers import _png as png
 from disctrack.rolling import _assembly as assembly
 from disctrack.rolling import integrate
+from disctrack.synthetic import board_raster, disc_raster
 from disctrack.track import _kernels as kernels
 from disctrack.track import dots
 from disctrack.track.tracking import prepare

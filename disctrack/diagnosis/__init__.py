@@ -7,9 +7,9 @@ for their noise there is `engine.noise_with_memory`, for their diagnosis.json `p
 
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.engine.system import Candidate, Quantity, System
 from disctrack.diagnosis.stage import DiagnoseOutcome, diagnose_trajectory, run_diagnose
+from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
+from disctrack.discrepancy.system import Candidate, Quantity, System
 
 __all__ = [
     "Candidate",

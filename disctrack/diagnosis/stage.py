@@ -28,16 +28,16 @@ from disctrack.diagnosis.disc.plan import open_questions, plan, separations
 from disctrack.diagnosis.disc.regimes import regimes
 from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.held_out import held_out, training_rows
-from disctrack.diagnosis.engine.memory import inflation, with_memory
-from disctrack.diagnosis.engine.score import Linearisation, score_all
-from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings
-from disctrack.diagnosis.engine.shape import refine_shapes
-from disctrack.diagnosis.engine.significance import price_of_a_number, wald
-from disctrack.diagnosis.engine.system import System, Wrapped
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import law_text, sentence
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.held_out import held_out, training_rows
+from disctrack.discrepancy.memory import inflation, with_memory
+from disctrack.discrepancy.score import Linearisation, score_all
+from disctrack.discrepancy.search import Diagnosis, Found, Settings
+from disctrack.discrepancy.shape import refine_shapes
+from disctrack.discrepancy.significance import price_of_a_number, wald
+from disctrack.discrepancy.system import System, Wrapped
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file

@@ -20,14 +20,14 @@ from matplotlib.figure import Figure
 
 from calibration.arrays import Array
 from disctrack.diagnosis import Settings
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.held_out import held_out
-from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, estimate
-from disctrack.diagnosis.engine.search import CLASS_GAIN
-from disctrack.diagnosis.engine.significance import price_of_a_number
-from disctrack.diagnosis.engine.system import Subset
-from disctrack.diagnosis.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
-from disctrack.diagnosis.equations.system import EquationSystem
+from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
+from disctrack.discrepancy.equations.system import EquationSystem
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.held_out import held_out
+from disctrack.discrepancy.noise_with_memory import SampleStretch, estimate
+from disctrack.discrepancy.search import CLASS_GAIN
+from disctrack.discrepancy.significance import price_of_a_number
+from disctrack.discrepancy.system import Subset
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
 from disctrack.pages.figures import panels

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.system import Candidate, Quantity
+from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting
 
 GRAVITY = 9.81  # [m/s^2] as declared

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.arrays import Array, Mask
-from disctrack.diagnosis.engine.noise_with_memory import SampleStretch, SmoothNoise, estimate
-from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.discrepancy.noise_with_memory import SampleStretch, SmoothNoise, estimate
+from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies
 from disctrack.examples.cube_effects import CANDIDATES, GRAVITY, columns, resting_columns

@@ -17,9 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.engine.system import Values
 from disctrack.diagnosis.pages.general import document, table
 from disctrack.diagnosis.pages.words import effect_text
+from disctrack.discrepancy.system import Values
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Toss, read_tosses
 from disctrack.examples.cube_effects import GRAVITY

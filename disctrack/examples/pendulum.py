@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.arrays import Array, Mask
-from disctrack.diagnosis.equations import Answer, Equations, Run, Term, diagnose, terms
+from disctrack.discrepancy.equations import Answer, Equations, Run, Term, diagnose, terms
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
 from disctrack.pages.figures import panels

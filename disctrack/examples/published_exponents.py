@@ -20,11 +20,11 @@ from scipy import stats
 from calibration.arrays import Array, Mask
 from disctrack.analyse.published import PREDICTED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.held_out import held_out, training_rows
-from disctrack.diagnosis.engine.system import Values
 from disctrack.diagnosis.pages.general import document, table
 from disctrack.diagnosis.pages.words import quantity_text
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.held_out import held_out, training_rows
+from disctrack.discrepancy.system import Values
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_model import LastStage, Setup
 from disctrack.examples.exponent_system import BRAKING, ExponentSystem, at, published_series

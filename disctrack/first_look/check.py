@@ -21,8 +21,8 @@ from disctrack.calibrate.targets import evenly
 from disctrack.calibrate.views import calibrate_views, declared_views
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.frames import CAMERAS, rotation_from_quaternion
-from disctrack.readers.blocks import PairBlock, iter_pair_blocks
 from disctrack.recording.declaration import Recording, read_recording
+from disctrack.recording.readers.blocks import PairBlock, iter_pair_blocks
 from disctrack.track.dots import locate_on_disc
 from disctrack.track.doubts import LIE_OFF, LOWEST_POINT, MISFIT
 from disctrack.track.own_scatter import without_shared_faults

@@ -20,12 +20,12 @@ from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml, toml_value
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
-from disctrack.readers import open_frames
-from disctrack.readers.base import FrameReader, split_member
-from disctrack.readers.camera_header import header_of
-from disctrack.readers.decoding import decode
-from disctrack.readers.files import match_files
 from disctrack.recording.declaration import FILE_NAME, OPTIONAL
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import FrameReader, split_member
+from disctrack.recording.readers.camera_header import header_of
+from disctrack.recording.readers.decoding import decode
+from disctrack.recording.readers.files import match_files
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.chessboard import grey_values
 from disctrack.first_look.check import Check
 from disctrack.frames import CAMERAS
-from disctrack.readers.decoding import decode
+from disctrack.recording.readers.decoding import decode
 from disctrack.track.figures import INK
 from disctrack.track.overlay import draw_pair
 

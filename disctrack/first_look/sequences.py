@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.readers import open_frames
-from disctrack.readers.base import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, FrameReader
-from disctrack.readers.files import natural_key
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, FrameReader
+from disctrack.recording.readers.files import natural_key
 
 DEEPEST = 4  # folders below the recording that are looked into
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
@@ -137,7 +137,7 @@ def _stacks(file: Path) -> list[str]:
     """Paths of the data sets in an HDF5 file that can be frames: (n, height, width) of 8 or 16 bit."""
     import h5py
 
-    from disctrack.readers.hdf5 import stacks_of
+    from disctrack.recording.readers.hdf5 import stacks_of
 
     try:
         with h5py.File(file, "r") as opened:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
-from disctrack.readers.blocks import PairBlock
+from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.stage import Measurement, Progress, findings_of
 from disctrack.track.tracking import TrackingSettings, prepare, stretch_edges, track
 

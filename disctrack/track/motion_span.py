@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from calibration.arrays import Array32
 from calibration.grey_levels import level_step
 from disctrack.errors import RecordingError
-from disctrack.readers.base import FrameReader
-from disctrack.readers.blocks import default_threads
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.blocks import default_threads
 
 Pair = tuple[NDArray, NDArray]
 

@@ -16,15 +16,15 @@ from calibration.camera import StereoRig
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
-from disctrack.readers import open_frames
-from disctrack.readers.base import FrameReader
-from disctrack.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
-from disctrack.readers.camera_header import check_headers, header_of, other_exposure
-from disctrack.readers.file_numbers import check_same_numbers
-from disctrack.readers.flat_field import flat_fielded, flat_fields
-from disctrack.readers.part import frames_in_parts, image_parts
-from disctrack.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.recording.declaration import Recording
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
+from disctrack.recording.readers.camera_header import check_headers, header_of, other_exposure
+from disctrack.recording.readers.file_numbers import check_same_numbers
+from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
+from disctrack.recording.readers.part import frames_in_parts, image_parts
+from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.track.motion_span import MotionSpan, find_motion
 from disctrack.track.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory

@@ -20,7 +20,7 @@ from calibration.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
-from disctrack.readers.blocks import PairBlock
+from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track import following, pose
 from disctrack.track.arrangement import arrangement_found
 from disctrack.track.assembly import Taken, Tracking, TrackingSettings, assemble

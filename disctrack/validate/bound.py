@@ -14,8 +14,8 @@ from calibration.arrays import Array, Array32, Mask
 from calibration.camera import Camera, StereoRig, normalised_maps
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_euler, rotation_from_vector
-from disctrack.render import expected_disc
-from disctrack.scene.description import Scene, SensorSettings
+from disctrack.synthetic import expected_disc
+from disctrack.synthetic.description import Scene, SensorSettings
 from disctrack.track.dots import face_edge
 
 Maps = tuple[tuple[Array, Array], tuple[Array, Array]]

@@ -13,8 +13,8 @@ from calibration.arrays import Array
 from calibration.camera import N_RIG, WORLD_TURN, StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
-from disctrack.render import render_disc, rig_after_faults
-from disctrack.scene.description import CameraFault, Faults, Scene
+from disctrack.synthetic import render_disc, rig_after_faults
+from disctrack.synthetic.description import CameraFault, Faults, Scene
 from disctrack.track.tracking import Tracking
 from disctrack.validate.comparison import PoseErrors, compare
 from disctrack.validate.stress import CLAIM_POSITION, CLAIM_ROTATION, LOST_ALLOWED, stress_poses

@@ -8,8 +8,8 @@ import numpy as np
 from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.frames import euler_jacobian
-from disctrack.render.sensor import digitise
-from disctrack.scene.description import Scene
+from disctrack.synthetic.description import Scene
+from disctrack.synthetic.sensor import digitise
 from disctrack.trajectory import MarkerStatus
 from disctrack.validate.bound import camera_maps, inverse_information, pose_bound
 from disctrack.validate.comparison import QUANTITIES, PoseErrors, compare

@@ -11,9 +11,9 @@ from calibration.arrays import Array
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.recording.declaration import read_recording
-from disctrack.render import write_recording
-from disctrack.scene.description import GlareSettings, ImperfectionSettings, Scene
-from disctrack.scene.motion import motion_of
+from disctrack.synthetic import write_recording
+from disctrack.synthetic.description import GlareSettings, ImperfectionSettings, Scene
+from disctrack.synthetic.motion import motion_of
 from disctrack.validate.comparison import compare
 from disctrack.validate.trial import locate, read_images, rolling_scene
 

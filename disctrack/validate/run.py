@@ -10,7 +10,7 @@ import numpy as np
 
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import make_folder, write_whole
-from disctrack.scene.description import BoardSettings, CameraSettings, RigSettings, Scene
+from disctrack.synthetic.description import BoardSettings, CameraSettings, RigSettings, Scene
 from disctrack.validate.controls import Control, planted_faults
 from disctrack.validate.efficiency import measure_efficiency
 from disctrack.validate.stress import DISTURBANCES, apply_stress, stress_poses

@@ -15,8 +15,8 @@ from calibration.arrays import Array, Mask
 from calibration.camera import StereoRig
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import TrackingError
-from disctrack.render import render_disc
-from disctrack.scene.description import GlareSettings, Occluder, Scene
+from disctrack.synthetic import render_disc
+from disctrack.synthetic.description import GlareSettings, Occluder, Scene
 from disctrack.validate.comparison import compare
 from disctrack.validate.poses import cameras_in_sight
 from disctrack.validate.trial import every, locate

@@ -19,12 +19,12 @@ from calibration.camera import StereoRig
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
-from disctrack.readers import open_frames
-from disctrack.readers.blocks import PairBlock, Unreadable, iter_pair_blocks
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.render import Truth, rig_of, write_recording
-from disctrack.scene.description import MotionSettings, RollingMotion, Scene
-from disctrack.scene.motion import SceneMotion, motion_of
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.blocks import PairBlock, Unreadable, iter_pair_blocks
+from disctrack.synthetic import Truth, rig_of, write_recording
+from disctrack.synthetic.description import MotionSettings, RollingMotion, Scene
+from disctrack.synthetic.motion import SceneMotion, motion_of
 from disctrack.track.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import Trajectory, part
 from disctrack.validate.comparison import PoseErrors, compare

@@ -47,10 +47,10 @@ from calibration.rig_file import read_rig
 from disctrack.batch.processes import ONE_THREAD
 from disctrack.files.software import software_version
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
-from disctrack.readers import open_frames
-from disctrack.readers.file_numbers import NumberedFiles
-from disctrack.readers.images import ImageSequence
 from disctrack.recording.declaration import Recording, read_recording
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.file_numbers import NumberedFiles
+from disctrack.recording.readers.images import ImageSequence
 from disctrack.track.arrays import measure_pairs
 from disctrack.track.stage import ImagePairs, measure, open_pairs
 from disctrack.trajectory import Trajectory
@@ -343,7 +343,7 @@ class Played:
 
 
 class MappedFrames:
-    """Frames of one camera in a file that is mapped into memory; see disctrack.readers.FrameReader."""
+    """Frames of one camera in a file that is mapped into memory; see disctrack.recording.readers.FrameReader."""
 
     timestamps, notes, random_access = None, (), True
 

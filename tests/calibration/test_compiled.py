@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibration import compiled
-from disctrack.readers import _png
+from disctrack.recording.readers import _png
 from tests.ship_compiled import HOW_MANY
 
 LEVELS = [  # that a processor of x86-64 has, by what numba takes from the environment
@@ -157,7 +157,7 @@ import numpy as np
 from calibration import compiled
 compiled.AHEAD = Path("nowhere")
 told = []
-from disctrack.readers import _lzw
+from disctrack.recording.readers import _lzw
 with compiled.when_compiling(lambda: told.append(1)):
     rows = np.array([[3, 4, 5]], np.uint8)
     _lzw.undo_differences(rows)

@@ -20,8 +20,8 @@ from calibration.tolerances import (
     on_the_table,
     with_tolerances,
 )
-from disctrack.render import rig_of
-from disctrack.scene.description import Scene
+from disctrack.synthetic import rig_of
+from disctrack.synthetic.description import Scene
 
 BOARD = Board((9, 6), 8e-3)
 THICK = 3e-3

@@ -8,8 +8,8 @@ import pytest
 from calibration.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.render import render_disc, rig_of
-from disctrack.scene.description import Scene
+from disctrack.synthetic import render_disc, rig_of
+from disctrack.synthetic.description import Scene
 
 
 @dataclass(frozen=True)

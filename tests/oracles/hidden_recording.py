@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from disctrack.render.recording import write_recording
-from disctrack.scene.description import (
+from disctrack.synthetic.description import (
     BoardSettings,
     CameraSettings,
     Faults,
@@ -19,7 +18,8 @@ from disctrack.scene.description import (
     RigSettings,
     Scene,
 )
-from disctrack.scene.motion import SceneMotion
+from disctrack.synthetic.motion import SceneMotion
+from disctrack.synthetic.recording import write_recording
 from tests.oracles import newton_euler
 
 K_M = 0.381e-7

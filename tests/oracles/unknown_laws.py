@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from disctrack.scene.description import Scene
+from disctrack.synthetic.description import Scene
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
 from tests.oracles.newton_euler import ZERO, K

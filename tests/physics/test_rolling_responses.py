@@ -6,7 +6,7 @@ import pytest
 from disctrack.rolling import Model, sensitivities, steady_precession
 from disctrack.rolling.effects import effect_class
 from disctrack.rolling.responses import COMPONENTS, responses
-from disctrack.scene.description import Scene
+from disctrack.synthetic.description import Scene
 
 DISC = Scene().declared_disc
 THETA_END = np.radians(0.05)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from disctrack.cli import main
 from disctrack.recording.declaration import read_recording
-from disctrack.render import read_truth
-from disctrack.scene.description import Scene, load_scene
+from disctrack.synthetic import read_truth
+from disctrack.synthetic.description import Scene, load_scene
 
 SCENE = """
 name = "tiny"

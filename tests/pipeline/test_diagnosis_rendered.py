@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from disctrack.cli import main
-from disctrack.render.recording import write_recording
-from disctrack.scene.description import CameraSettings, Faults, MotionSettings, RollingMotion, Scene
+from disctrack.synthetic.description import CameraSettings, Faults, MotionSettings, RollingMotion, Scene
+from disctrack.synthetic.recording import write_recording
 from tests.oracles.hidden_recording import small_scene
 
 CALIBRATION = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere

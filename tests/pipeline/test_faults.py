@@ -13,9 +13,9 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.errors import DiscTrackError, OutputError
-from disctrack.render import read_truth
-from disctrack.render import recording as render_recording
-from disctrack.scene.description import Scene
+from disctrack.synthetic import read_truth
+from disctrack.synthetic import recording as render_recording
+from disctrack.synthetic.description import Scene
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_findings, read_trajectory
 

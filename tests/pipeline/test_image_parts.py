@@ -12,8 +12,8 @@ from disctrack.calibrate.views import declared_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
 from disctrack.first_look.sequences import Sequence, pair_cameras
-from disctrack.readers.blocks import iter_pair_blocks
 from disctrack.recording.declaration import read_recording
+from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.track.stage import open_pairs
 
 FRAMES, VIEWS, SIZE = 24, 18, 272

@@ -14,8 +14,8 @@ from calibration.rig_file import read_rig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
-from disctrack.readers.blocks import PairBlock
 from disctrack.recording.declaration import read_recording
+from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.moved_camera import moved_camera
 from disctrack.track.own_scatter import MIN_FRAMES
 from disctrack.track.stage import open_pairs
@@ -346,8 +346,8 @@ def test_of_a_hundred_random_faults_none_passes_in_silence(laboratory, tmp_path)
 def ideal():
     """Rendered here, with the poses that were rendered as the truth, through the true rig."""
     from disctrack import rolling as model
-    from disctrack.render import render_disc, rig_of
-    from disctrack.scene.description import Scene
+    from disctrack.synthetic import render_disc, rig_of
+    from disctrack.synthetic.description import Scene
 
     scene = Scene()
     rig, disc = rig_of(scene), scene.declared_disc

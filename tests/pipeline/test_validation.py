@@ -8,7 +8,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.frames import rotation_from_euler
-from disctrack.render import render_disc, rig_of
+from disctrack.synthetic import render_disc, rig_of
 from disctrack.validate import QUICK, complaints, scene_of, summarise, validate, verdict, write_validation
 from disctrack.validate.bound import camera_maps, dot_pixels, pose_bound
 from disctrack.validate.comparison import compare, joined, noise_consistency

@@ -9,9 +9,9 @@ from disctrack.diagnosis.disc.learned_law import LearnedLaw
 from disctrack.diagnosis.disc.plan import Plan, Separation
 from disctrack.diagnosis.disc.regimes import Regimes
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.held_out import HeldOut
-from disctrack.diagnosis.engine.search import Diagnosis
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.search import Diagnosis
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from scipy.integrate import trapezoid
 
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.held_out import HeldOut
-from disctrack.diagnosis.engine.system import Values
-from disctrack.diagnosis.engine.whiteness import Whiteness, whiteness
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.system import Values
+from disctrack.discrepancy.whiteness import Whiteness, whiteness
 from disctrack.frames import euler_jacobian, nodal_axes_world
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_power, kinematics

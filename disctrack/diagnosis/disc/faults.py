@@ -16,10 +16,10 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.camera import Camera, StereoRig, project_with_jacobians
-from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.disc import Disc
+from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.frames import CAMERAS, rotation_from_vector
-from disctrack.scene.description import Faults, Scene
+from disctrack.synthetic.description import Faults, Scene
 
 TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
 RIM_POINTS = 24  # of a dot's outline, for the centre of its image

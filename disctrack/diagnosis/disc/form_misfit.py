@@ -23,8 +23,8 @@ from calibration.arrays import Array
 from disctrack.diagnosis.disc.learned_law import WIDTH, LearnedLaw, _Blocks, probe
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, triangle
-from disctrack.diagnosis.engine.system import Values
+from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_wrench, kinematics
 from disctrack.rolling.model import body_constants

@@ -14,8 +14,8 @@ from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HALF_WINDOW, HORIZONS, Ahead, energy_balance, free_run, simulated
 from disctrack.diagnosis.disc.learned_law import MissingMoment, missing_moment, probe
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.held_out import held_out
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.held_out import held_out
 from disctrack.errors import AnalysisError
 from disctrack.trajectory import part
 

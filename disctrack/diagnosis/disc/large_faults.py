@@ -16,9 +16,9 @@ from disctrack.diagnosis.disc.faults import MeasurementSetup, faults_of, setup_o
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, with_noise_of_frames
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.search import Diagnosis, Found, Tried
-from disctrack.diagnosis.engine.system import Candidate, Values
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.search import Diagnosis, Found, Tried
+from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, rotation_from_vector, unwrap_euler
 from disctrack.rolling import Model

@@ -22,11 +22,11 @@ from disctrack.diagnosis.disc.law_library import Family, families
 from disctrack.diagnosis.disc.left_over import left_over
 from disctrack.diagnosis.disc.motion import STATE_SCALES, state_of
 from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, fit, prior_rows, triangle
-from disctrack.diagnosis.engine.nuisances import is_linear, projection
-from disctrack.diagnosis.engine.shape import profiled
-from disctrack.diagnosis.engine.significance import as_sigmas, price_of_a_number
-from disctrack.diagnosis.engine.system import Candidate, Quantity, System, Values
+from disctrack.discrepancy.fit import Fit, fit, prior_rows, triangle
+from disctrack.discrepancy.nuisances import is_linear, projection
+from disctrack.discrepancy.shape import profiled
+from disctrack.discrepancy.significance import as_sigmas, price_of_a_number
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.rolling import Model, simulate
 from disctrack.rolling.effects import Effect, EffectParameter, effect_from_formulas
 from disctrack.rolling.evaluate import effect_wrench, kinematics

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.whiteness import ljung_box, no_memory, whiteness
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 
 LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
 MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks

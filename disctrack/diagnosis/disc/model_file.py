@@ -10,10 +10,10 @@ from calibration.camera import StereoRig, placed_at, rotation_from_vector
 from disctrack.diagnosis.disc.faults import scene_faults, setup_of, values_in_scene
 from disctrack.diagnosis.disc.scene_rig import scene_with_rig
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.system import Values
+from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
-from disctrack.scene.description import Scene, load_scene, scene_toml
+from disctrack.synthetic.description import Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
 
 PAPER = "paper"

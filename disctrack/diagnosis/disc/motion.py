@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, State
 
 # Parameters of one effect that act so differently that each part is a question of its own.

@@ -13,13 +13,13 @@ from calibration.arrays import Array
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, triangle
-from disctrack.diagnosis.engine.score import Linearisation, cleared, score, span
-from disctrack.diagnosis.engine.search import Diagnosis
-from disctrack.diagnosis.engine.system import Candidate, Quantity
 from disctrack.diagnosis.together.reduction import Reduction
 from disctrack.diagnosis.together.sharing import LAWS
 from disctrack.disc import Disc
+from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.score import Linearisation, cleared, score, span
+from disctrack.discrepancy.search import Diagnosis
+from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import State, simulate, steady_precession

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.system import Subset, System
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.system import Subset, System
 
 LEAST = 0.2  # of the frames, and ...
 LEAST_FRAMES = 60  # ... that a model must describe before it can be said to hold

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.camera import StereoRig
-from disctrack.scene.description import RigSettings, Scene
+from disctrack.synthetic.description import RigSettings, Scene
 
 
 def scene_with_rig(scene: Scene, rig: StereoRig) -> Scene:

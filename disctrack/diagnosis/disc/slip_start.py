@@ -19,11 +19,11 @@ from disctrack.diagnosis.disc.start import first_slip
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import MOST_SLIP_STEPS, DiscSystem, Patience
 from disctrack.diagnosis.disc.systematic import find_systematic, with_noise_of_frames
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.held_out import HeldOut, held_out, training_rows
-from disctrack.diagnosis.engine.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
-from disctrack.diagnosis.engine.shape import refine_shapes
-from disctrack.diagnosis.engine.system import Candidate, GivenUp
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
+from disctrack.discrepancy.shape import refine_shapes
+from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
 from disctrack.rolling import CATALOGUE, Model, Regime
 from disctrack.trajectory import Trajectory, part

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.score import cleared, span
-from disctrack.diagnosis.engine.system import Candidate, Values
+from disctrack.discrepancy.score import cleared, span
+from disctrack.discrepancy.system import Candidate, Values
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.system import DiscSystem

@@ -9,9 +9,9 @@ import numpy as np
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
 from disctrack.diagnosis.disc.stretch import FIRST_WINDOW
-from disctrack.diagnosis.engine.fit import fit
-from disctrack.diagnosis.engine.system import Values
 from disctrack.disc import Disc
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.system import Values
 from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_rotation
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ from disctrack.diagnosis.disc.sought import sought
 from disctrack.diagnosis.disc.start import STRETCHES, start_values
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
-from disctrack.diagnosis.engine.fit import triangle
-from disctrack.diagnosis.engine.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
+from disctrack.discrepancy.fit import triangle
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect

@@ -22,7 +22,7 @@ from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc.system import DiscSystem, StaticView
-    from disctrack.diagnosis.engine.system import Values
+    from disctrack.discrepancy.system import Values
 
 
 MIN_DIFFERENCES = 20  # third differences from which a noise is read

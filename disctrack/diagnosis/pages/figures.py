@@ -15,7 +15,7 @@ from disctrack.diagnosis.disc.errors import frequencies, simulated
 from disctrack.diagnosis.disc.form_misfit import LawCourse
 from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
 from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
-from disctrack.diagnosis.engine.held_out import HeldOut
+from disctrack.discrepancy.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
 from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels, plain_powers
 from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.held_out import HeldOut
-from disctrack.diagnosis.engine.search import Diagnosis
 from disctrack.diagnosis.pages.output import effect_json, tried_json
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.search import Diagnosis
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from disctrack.diagnosis.disc.errors import Ahead, Errors
 from disctrack.diagnosis.disc.plan import Separation
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.search import Found, Tried
-from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.words import UNFOLLOWED, shown, together
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.search import Found, Tried
+from disctrack.discrepancy.significance import as_sigmas
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import COORDINATES, POSE_COMPONENTS

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from disctrack.diagnosis.disc.plan import ENOUGH, Plan, Question
-from disctrack.diagnosis.engine.significance import TWO_SIDED
 from disctrack.diagnosis.pages.words import quantity_text
+from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.pages.html import bullets, details, paragraph, table
 
 SAID = (

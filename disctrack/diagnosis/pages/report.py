@@ -9,11 +9,11 @@ from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
 from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
 from disctrack.diagnosis.disc.model_file import NONE, PAPER
-from disctrack.diagnosis.engine.search import Found, Tried
-from disctrack.diagnosis.engine.significance import as_sigmas
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.figures import all_figures
 from disctrack.diagnosis.pages.words import UNFOLLOWED, effect_text, law_text, quantity_text
+from disctrack.discrepancy.search import Found, Tried
+from disctrack.discrepancy.significance import as_sigmas
 from disctrack.files.whole import write_whole
 from disctrack.pages.figures import draw, gallery
 from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, text

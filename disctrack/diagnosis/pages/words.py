@@ -9,11 +9,11 @@ from disctrack.diagnosis.disc.learned_law import LearnedLaw
 from disctrack.diagnosis.disc.left_over import LEVEL, LeftOver
 from disctrack.diagnosis.disc.motion import SLIP
 from disctrack.diagnosis.disc.systematic import Systematic
-from disctrack.diagnosis.engine.correlated import Correlated, correlated
-from disctrack.diagnosis.engine.fit import Fit
-from disctrack.diagnosis.engine.search import Diagnosis, Found
-from disctrack.diagnosis.engine.significance import TWO_SIDED
-from disctrack.diagnosis.engine.system import Quantity
+from disctrack.discrepancy.correlated import Correlated, correlated
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.search import Diagnosis, Found
+from disctrack.discrepancy.significance import TWO_SIDED
+from disctrack.discrepancy.system import Quantity
 
 SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
 UNFOLLOWED = "without it the model follows no part of the recording"  # so that there is no chi-square to compare

@@ -18,7 +18,7 @@ from typing import Any
 from disctrack.diagnosis.together.joint import Request
 from disctrack.diagnosis.together.reduction import Reduced
 from disctrack.errors import AnalysisError, DiscTrackError
-from disctrack.readers.blocks import ONE_THREAD
+from disctrack.recording.readers.blocks import ONE_THREAD
 
 Build = Callable[[Any], Any]
 ENDED_EARLY = (

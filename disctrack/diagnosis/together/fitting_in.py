@@ -14,9 +14,9 @@ import numpy as np
 from scipy import stats
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.fit import Fit, prior_rows, triangle
-from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.joint import JointSystem
+from disctrack.discrepancy.fit import Fit, prior_rows, triangle
+from disctrack.discrepancy.system import Candidate
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
 SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit

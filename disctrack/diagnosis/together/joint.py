@@ -6,9 +6,9 @@ from typing import Protocol
 import numpy as np
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
 from disctrack.diagnosis.together.reduction import Reduced
 from disctrack.diagnosis.together.sharing import Sharing
+from disctrack.discrepancy.system import Candidate, Quantity, Values
 
 Request = tuple[int, dict[str, float], tuple[str, ...]]  # recording, its shared values, names
 

@@ -14,17 +14,17 @@ from scipy import stats
 from calibration.arrays import Array
 from disctrack.diagnosis.disc.model_file import PAPER
 from disctrack.diagnosis.disc.plan import Plan, Question
-from disctrack.diagnosis.engine.fit import Fit, triangle
-from disctrack.diagnosis.engine.score import Linearisation, cleared, score_all, span
-from disctrack.diagnosis.engine.search import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.engine.significance import TWO_SIDED
-from disctrack.diagnosis.engine.system import Candidate
 from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses
 from disctrack.diagnosis.together.crew import Crew
 from disctrack.diagnosis.together.fitting_in import Blocks, FitsIn, apart
 from disctrack.diagnosis.together.joint import JointSystem
 from disctrack.diagnosis.together.recordings import Alone, Item, Recorded, Say, build, in_common, labels_of
 from disctrack.diagnosis.together.sharing import EACH, Member, Sharing
+from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.score import Linearisation, cleared, score_all, span
+from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
+from disctrack.discrepancy.significance import TWO_SIDED
+from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
 
 TEST_EVERY = 3  # of the recordings, every so many is foretold from the others

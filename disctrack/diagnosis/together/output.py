@@ -7,9 +7,6 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from disctrack.diagnosis.engine.search import Diagnosis, Found
-from disctrack.diagnosis.engine.significance import as_sigmas
-from disctrack.diagnosis.engine.system import Quantity
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.output import declared_json, effect_json, tried_json
 from disctrack.diagnosis.pages.report import tried_table
@@ -17,6 +14,9 @@ from disctrack.diagnosis.pages.words import effect_text, quantity_text
 from disctrack.diagnosis.together.covariates import Hypothesis, alike
 from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.diagnosis.together.sharing import EACH
+from disctrack.discrepancy.search import Diagnosis, Found
+from disctrack.discrepancy.significance import as_sigmas
+from disctrack.discrepancy.system import Quantity
 from disctrack.files.json_text import plain
 from disctrack.pages.figures import Drawn, panels
 from disctrack.pages.html import bullets, details, page, paragraph, section, table, typeset, warning

@@ -21,13 +21,13 @@ from disctrack.diagnosis.disc.systematic import (
     noise_over_stated,
     smooth_field,
 )
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.memory import inflation
-from disctrack.diagnosis.engine.row_noise import THIRD
-from disctrack.diagnosis.engine.system import Quantity, Values
 from disctrack.diagnosis.together.reduction import Reduced, Reduction
 from disctrack.diagnosis.together.sharing import Member
 from disctrack.disc import Disc
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.memory import inflation
+from disctrack.discrepancy.row_noise import THIRD
+from disctrack.discrepancy.system import Quantity, Values
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.trajectory import MarkerStatus, Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory

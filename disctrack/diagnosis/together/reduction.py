@@ -13,9 +13,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from calibration.arrays import Array
-from disctrack.diagnosis.engine.fit import prior_rows, triangle
-from disctrack.diagnosis.engine.nuisances import Projection, is_linear, projection
-from disctrack.diagnosis.engine.system import Quantity, System, Values
+from disctrack.discrepancy.fit import prior_rows, triangle
+from disctrack.discrepancy.nuisances import Projection, is_linear, projection
+from disctrack.discrepancy.system import Quantity, System, Values
 
 NEAR = 0.3  # of chi-square, that a further step of the own quantities may promise: what it changes is then a thousandth
 STEPS = 12

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from disctrack.diagnosis.engine.nuisances import is_linear
-from disctrack.diagnosis.engine.system import Candidate, Quantity, Values
+from disctrack.discrepancy.nuisances import is_linear
+from disctrack.discrepancy.system import Candidate, Quantity, Values
 
 EACH = "each its own"  # of the candidates whose amounts differ from group to group
 LAWS = ("surface", "air")  # whose laws may well have the same constant with another disc, or on another surface

@@ -21,15 +21,15 @@ from disctrack.diagnosis.disc.left_over import left_over
 from disctrack.diagnosis.disc.model_file import declared_model
 from disctrack.diagnosis.disc.system import DiscSystem
 from disctrack.diagnosis.disc.systematic import DOT_SIGMA
-from disctrack.diagnosis.engine.chance import chance
-from disctrack.diagnosis.engine.fit import fit
-from disctrack.diagnosis.engine.score import Linearisation, score_all
-from disctrack.diagnosis.engine.search import Settings, noise_variance
 from disctrack.diagnosis.stage import diagnose_trajectory
 from disctrack.diagnosis.trials.hidden_effects import Planted
 from disctrack.diagnosis.trials.imperfect import Laboratory
 from disctrack.diagnosis.trials.rates import draw, trajectory_of
 from disctrack.diagnosis.trials.recordings import Unseen
+from disctrack.discrepancy.chance import chance
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.score import Linearisation, score_all
+from disctrack.discrepancy.search import Settings, noise_variance
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory

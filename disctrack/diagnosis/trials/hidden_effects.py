@@ -13,7 +13,7 @@ from numpy.random import Generator
 from disctrack.diagnosis.trials.recordings import STATION, Unseen
 from disctrack.errors import DiscTrackError
 from disctrack.rolling import CATALOGUE
-from disctrack.scene.description import CameraFault, Faults, Triple
+from disctrack.synthetic.description import CameraFault, Faults, Triple
 
 N_DOTS = 6
 

@@ -18,10 +18,10 @@ from scipy.optimize import brentq
 from calibration.arrays import Array
 from disctrack.diagnosis import DiscSystem, Settings
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model
-from disctrack.diagnosis.engine.fit import fit
-from disctrack.diagnosis.engine.score import Linearisation
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted
 from disctrack.diagnosis.trials.rates import FRAME_RATE, draw, trajectory_of
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.score import Linearisation
 
 FARTHEST = 1e4  # times the effect's size, beyond which nothing is looked for
 

@@ -19,16 +19,16 @@ from numpy.random import Generator
 from scipy import stats
 
 from disctrack.diagnosis import DiscDiagnosis, diagnose_trajectory
-from disctrack.diagnosis.engine.fit import Fit, fit
-from disctrack.diagnosis.engine.significance import wald
-from disctrack.diagnosis.engine.system import Values
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted, hidden_effect
 from disctrack.diagnosis.trials.recordings import Unseen, measured
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.significance import wald
+from disctrack.discrepancy.system import Values
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 from disctrack.rolling import Model, simulate, steady_precession
-from disctrack.scene.description import Faults, Scene
+from disctrack.synthetic.description import Faults, Scene
 from disctrack.trajectory import Trajectory
 
 FRAME_RATE = 1000.0  # [Hz] of the reference recordings

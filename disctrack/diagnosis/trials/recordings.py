@@ -24,8 +24,8 @@ from disctrack.frames import (
     unwrap_euler,
 )
 from disctrack.rolling import Effect, Model, simulate, steady_precession
-from disctrack.scene.cameras import board_poses, rig_after_faults, rig_of
-from disctrack.scene.description import Faults, Scene
+from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
+from disctrack.synthetic.description import Faults, Scene
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
 

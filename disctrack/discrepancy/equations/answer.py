@@ -1,0 +1,339 @@
+"""The answer of a diagnosis of equations: in words, in numbers, as JSON and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from calibration.arrays import Array
+from disctrack.diagnosis.pages.general import document, table
+from disctrack.diagnosis.pages.words import effect_text
+from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.discrepancy.equations.law import LearnedForce
+from disctrack.discrepancy.equations.loop import Answered, ask
+from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.search import Diagnosis, Settings
+from disctrack.discrepancy.system import Candidate, System
+from disctrack.discrepancy.whiteness import LAGS, ljung_box, no_memory
+from disctrack.errors import OutputError
+from disctrack.files.json_text import json_file, plain
+from disctrack.files.whole import write_whole
+
+OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
+HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
+FEWEST_RUNS = 4  # that are compared with each other
+ODD, MOST_ODD = 2.0, 0.3  # rms over the median of all runs; share of them, above which none is odd
+FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
+
+
+@dataclass(frozen=True)
+class ChannelErrors:
+    """What a model leaves of one channel, in its own unit."""
+
+    rms: float  # over all that was fitted
+    held_out: float  # free run over the last part of every stretch, from a fit to the first
+    noise: float  # as found in what the model leaves
+
+
+def diagnose(
+    equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
+    settings: Settings | None = None, stretch: float | None = None,
+) -> Answer:  # fmt: skip
+    """Fit the equations to the runs and look for what they lack.
+
+    runs : they share all parameters, but for those declared `per` run or group; initial states are each one's own
+    terms : what may be missing; the usual terms (`terms.usual`), if none are given
+    settings : how hard to look, and how sure to be
+    stretch : [s] after which a run begins anew with a state of its own; if not given, as far as the model follows it
+    Raises AnalysisError, which says what was found and what to do.
+    """
+    return Answer(equations, ask(equations, [runs] if isinstance(runs, Run) else runs, terms, settings, stretch))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is missing, how much of it, and how sure that is."""
+
+    equations: Equations
+    asked: Answered
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """The engine's answer."""
+        return self.asked.diagnosis
+
+    @property
+    def system(self) -> EquationSystem:
+        """Data and model in the stretches that were judged."""
+        return self.asked.system
+
+    @property
+    def verdict(self) -> str:
+        """`nothing missing`, `found` or `unexplained`."""
+        return self.diagnosis.verdict
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks on the data and on what they do not tell."""
+        return (*self.asked.notes, *self._what_helps_most(), *self._of_a_law(), *self._not_white(), *self._far_off())
+
+    @property
+    def law(self) -> LearnedForce | None:
+        """A law of one variable that no term names, with its course; None where none describes the data."""
+        return self.asked.law
+
+    def _of_a_law(self) -> list[str]:
+        """What describes the data as well as the law that is named; or the law, where it is not."""
+        law = self.law
+        if law is None:
+            return []
+        notes = []
+        known = " and ".join(c.name for c in law.replaces)
+        odds = f"1 to exp({0.5 * abs(law.length - law.their_length):.3g})"
+        text = law.text(self.equations.units)
+        named = law.candidate.name in {*self.found, *(c.name for c in self.diagnosis.partial)}
+        if not law.is_shorter:
+            notes.append(f"one law describes the data in place of {known}, with odds of {odds} against it: {text}")
+        elif not named:
+            notes.append(f"nearer to the data than {known} comes one law, though not to the noise: {text}")
+        elif np.isfinite(law.their_length):
+            notes.append(f"of known terms {known} come nearest, with odds of {odds} against the law")
+        if law.held and named:
+            notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")
+        if law.along.variable == "t":
+            notes.append(
+                "a force that depends on time alone describes any motion: a sensor whose zero wanders may do as much, "
+                "and another run will not repeat it unless time is what drives it"
+            )
+        if law.alike:
+            others = " or ".join(a.title for a in law.alike)
+            notes.append(f"these data cannot tell the law from {others}")
+        return notes
+
+    def _what_helps_most(self) -> list[str]:
+        """Where no term is named: those that gain most, and what they leave."""
+        d = self.diagnosis
+        if self.found or not d.partial or d.nearest is None:
+            return []
+        names = " and ".join(self._nearest_of(c) for c in d.partial)
+        left = self._errors(d.nearest, None)
+        sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
+        return [f"{names} would help most and still leave {sizes}".replace(" 1 of", " of")]
+
+    def _nearest_of(self, c: Candidate) -> str:
+        return self._law_text(c) or f"{c.title} [{c.name}] ({self._numbers_of(c)})"
+
+    def _law_text(self, c: Candidate) -> str:
+        """The course of the law that was learned, if the candidate is that; else nothing."""
+        if self.law is None or c.name != self.law.candidate.name:
+            return ""
+        return self.law.text(self.equations.units)
+
+    def _numbers_of(self, candidate: Candidate) -> str:
+        """Its numbers in the nearest description, shapes that were held among them."""
+        found = {q.name: q.null for q in (*candidate.quantities, *candidate.shape)} | self.nearest
+        own = [q.name for q in (*candidate.quantities, *candidate.shape)]
+        return ", ".join(f"{n.partition('.')[2]} = {found[n]:.4g}" for n in own)
+
+    @property
+    def nearest(self) -> dict[str, float]:
+        """All fitted numbers with the terms that help most, where they leave too much to be named; else empty."""
+        d = self.diagnosis
+        return {} if self.found or d.nearest is None else {n: d.nearest.values[n] for n in d.nearest.names}
+
+    def _not_white(self) -> list[str]:
+        """Where what is left is called noise by its size: is it so by its memory?"""
+        if self.verdict == "unexplained" or not self.whiteness < self.diagnosis.settings.false_alarm:
+            return []
+        chance = f"noise has so much with a probability of {self.whiteness:.1g}"
+        return [
+            f"what is left is as large as the noise but has a memory ({chance}): something smaller is missing besides, "
+            "or the noise changes with time"
+        ]
+
+    def _odd_runs(self) -> list[str]:
+        """Runs that leave far more than the others do: one of them alone may be what no term describes."""
+        stretches = self.system.stretches
+        whole = not any(s.stretch for s in stretches)
+        if len(stretches) < FEWEST_RUNS or not whole or self.diagnosis.held_out_before is None:
+            return []
+        judged = self.asked.judged
+        residual, _ = judged.linearise(self.diagnosis.after.values, [])
+        count = np.array([max(float(np.sum(judged.weights[rows])), 1.0) for rows in self.system.rows])
+        left = np.array([float(np.sum(residual[rows] ** 2)) for rows in self.system.rows]) / count
+        level = float(np.median(left))
+        by_noise = stats.chi2.isf(self.diagnosis.settings.false_alarm / len(left), count) / count
+        odd = np.flatnonzero(left > level * np.maximum(ODD**2, by_noise))
+        worst = [f"{stretches[i].name} ({np.sqrt(left[i] / level):.3g} times)" for i in odd[np.argsort(-left[odd])]]
+        if not worst or len(worst) > MOST_ODD * len(stretches):
+            return []
+        some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
+        return [f"what is left is far more than in the other runs in {some}: look at what was different there"]
+
+    def _far_off(self) -> list[str]:
+        """Single samples that what is left of all others does not reach: they make noise and sigmas too large."""
+        notes = self._odd_runs()
+        if self.verdict == "unexplained":
+            return notes
+        predicted = self.predicted(self.diagnosis.after)
+        for c, channel in enumerate(self.system.formulas.channels):
+            left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
+            limit = OUTLIER * float(np.nanmedian(np.concatenate(left))) / HALF_WITHIN
+            off = [(s.run, float(t)) for (s, _), r in zip(predicted, left, strict=True) for t in s.time[r > limit]]
+            if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
+                some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")
+                lie = "1 lies" if len(off) == 1 else f"{len(off)} lie"
+                notes.append(
+                    f"{lie} farther off in {channel} than {OUTLIER:.0f} times the scatter of the others ({some}): "
+                    "where the sensor erred, write NaN, and noise and sigmas fall"
+                )
+        return notes
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """Names of the terms that are missing."""
+        return tuple(f.candidate.name for f in self.diagnosis.found)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All fitted numbers of the enlarged model."""
+        return {name: self.diagnosis.after.values[name] for name in self.diagnosis.after.names}
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Their standard deviations; nought for one that stands at a bound."""
+        return {name: self.diagnosis.after.sigma(name) for name in self.diagnosis.after.names}
+
+    @cached_property
+    def before(self) -> dict[str, ChannelErrors]:
+        """Errors by channel of the equations as declared."""
+        return self._errors(self.diagnosis.before, self.diagnosis.held_out_before)
+
+    @cached_property
+    def after(self) -> dict[str, ChannelErrors]:
+        """Errors by channel with what was found."""
+        return self._errors(self.diagnosis.after, self.diagnosis.held_out_after)
+
+    def predicted(self, fit: Fit) -> list[tuple[Samples, Array]]:
+        """Every stretch with what its sensors should show (n, w); NaN where the motion cannot be followed."""
+        stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
+        return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
+
+    def forecast(self, run: Run, *, before: bool = False, nearest: bool = False) -> dict[str, Array]:
+        """What the sensors should show (n,) at the instants of a run, by channel: a free run of the model.
+
+        A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
+        begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
+        before : by the equations as declared (and fitted)
+        nearest : with the terms that help most, where none is named
+        """
+        (samples,) = checked(self.equations, [run])
+        if not run.name:
+            first = self.system.stretches[0]
+            samples = replace(samples, run=first.run, groups=first.groups)
+        fit = self.diagnosis.before if before else self.diagnosis.after
+        if nearest and self.nearest and self.diagnosis.nearest is not None:
+            fit = self.diagnosis.nearest
+        (found,) = self.system.with_(stretches=[samples]).predictions(fit.values)
+        shape = (len(samples.time), len(self.system.formulas.channels))
+        seen = np.full(shape, np.nan) if found is None else found.seen
+        return dict(zip(self.system.formulas.channels, seen.T, strict=True))
+
+    def _errors(self, fit: Fit, held: Any) -> dict[str, ChannelErrors]:
+        names = self.system.formulas.channels
+        left = np.concatenate([s.data - seen for s, seen in self.predicted(fit)])
+        rms = np.sqrt(np.nanmean(left**2, axis=0))
+        ahead = np.full(len(names), np.nan)
+        if held is not None:
+            free = []
+            for s, seen in self.predicted(held.train):
+                free.append((s.data - seen)[~fitted_rows(s)])
+            ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
+        noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
+        if self.asked.memory is None:  # the fast part of the data holds some of the motion, that of the residual less
+            noise = noise * np.sqrt(self.diagnosis.noise)
+        both = zip(names, rms, ahead, noise, strict=True)
+        return {name: ChannelErrors(float(r), float(a), float(n)) for name, r, a, n in both}
+
+    @cached_property
+    def whiteness(self) -> float:
+        """Probability that white noise remembers as much as what is left (Ljung and Box, every channel and stretch)."""
+        return _whiteness(self.asked.judged, self.system, self.diagnosis.after)
+
+    @property
+    def sentence(self) -> str:
+        """The answer in plain words."""
+        d = self.diagnosis
+        if d.held_out_before is None:
+            loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
+            open_ = f" {', '.join(loose)} cannot be told: declare a value or bounds." if loose else ""
+            return f"No answer: {d.reason}.{open_} Values from which to begin nearer to the truth may help."
+        level = ", ".join(
+            f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")
+            for c, e in self.after.items()
+        )
+        if d.verdict == "nothing missing":
+            return f"Nothing is missing: the equations leave {level}."
+        effects = "; and ".join(self._law_text(f.candidate) or effect_text(f, d) for f in d.found)
+        if d.verdict == "found":
+            return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
+        if effects:
+            return f"Something is missing that no term describes; nearest comes {effects}, which leaves {level}."
+        return f"Something is missing that no term describes: the equations leave {level}."
+
+    def _unit(self, name: str) -> str:
+        return self.equations.units.get(name, "1")
+
+    def __str__(self) -> str:
+        """The answer, before and after, and remarks."""
+        lines = [self.sentence, *(f"Note: {note}." for note in self.notes), ""]
+        lines.append(f"{'':<30}{'before':>12}{'after':>12}{'noise':>12}")
+        for c in self.system.formulas.channels:
+            b, a = self.before[c], self.after[c]
+            lines.append(f"{f'rms of {c} [{self._unit(c)}]':<30}{b.rms:12.4g}{a.rms:12.4g}{a.noise:12.4g}")
+            lines.append(f"{'  free run, held out':<30}{b.held_out:12.4g}{a.held_out:12.4g}")
+        return "\n".join([*lines, *table(self.diagnosis)])
+
+    def document(self) -> dict[str, Any]:
+        """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
+        sides = [{"channels": {c: vars(e) for c, e in errors.items()}} for errors in (self.before, self.after)]
+        found = document(self.diagnosis, self.equations.name, self.sentence, *sides)
+        found |= {
+            "notes": list(self.notes),
+            "equations": {k: str(v) for k, v in self.equations.rates.items()},
+            "runs": [{"name": s.name, "samples": len(s.time)} for s in self.system.stretches],
+            "whiteness_p_value": self.whiteness,
+            "law": None if self.law is None else self.law.document(),
+        }
+        return dict(plain(found))
+
+    def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
+        """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
+        from disctrack.discrepancy.equations.page import written_page
+
+        paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
+        for path in paths:
+            if path.exists() and not overwrite:
+                raise OutputError(f"{path}: exists. Choose another folder, or say overwrite=True.")
+        write_whole(paths[0], json_file(self.document()))
+        write_whole(paths[1], written_page(self, Path(folder))[0].encode())
+        return paths
+
+
+def _whiteness(judged: System, system: EquationSystem, fit: Fit) -> float:
+    residual, _ = judged.linearise(fit.values, [])
+    p_values = []
+    for rows, s in zip(system.rows, system.stretches, strict=True):
+        for c in range(residual.shape[1]):
+            x = residual[rows, c][np.isfinite(s.data[:, c])]
+            lags = min(LAGS, len(x) // 4)
+            if lags >= FEWEST_LAGS:
+                p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
+    return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")

@@ -1,0 +1,302 @@
+"""What a user declares: equations of motion, terms that they may lack, and runs of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibration.arrays import Array
+from disctrack.discrepancy.equations.expressions import Formula, checked_name, unknown_name
+from disctrack.discrepancy.noise_with_memory import SmoothNoise
+from disctrack.errors import AnalysisError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of the model that a fit may move; SI or any units that belong together."""
+
+    value: float  # where the fit starts; of a term: its value while the effect is absent
+    unit: str = "1"
+    sigma: float = np.inf  # standard deviation to which it is known beforehand; infinite: not at all
+    lower: float = -np.inf
+    upper: float = np.inf
+    per: str = ""  # "run": each run has one of its own; a key of the runs' `groups`: each group has
+    typical: float | None = None  # of a term: size that would surprise nobody; None: a tenth of the motion's own forces
+    shape: bool = False  # of a term's law (an exponent, a scale): held at `value` until the term is found
+    along: str = ""  # of a shape: a formula whose values along the motion are tried for it (a limit, a speed)
+    meaning: str = ""
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.value) or not self.lower <= self.value <= self.upper or not self.sigma > 0:
+            raise AnalysisError(
+                f"a parameter needs a finite value within its bounds and a positive sigma; found value {self.value}, "
+                f"bounds {self.lower} to {self.upper}, sigma {self.sigma}."
+            )
+
+
+@dataclass(frozen=True)
+class Term:
+    """Something that the equations, or the picture that sensors give of them, may lack.
+
+    Its formulas are added to what is declared; its parameters' own values (0, if not said) are those of its absence.
+    A parameter k may be written own_k in its formulas; a plain k there then is that of the equations.
+    """
+
+    name: str
+    rates: Mapping[str, Formula] = field(default_factory=dict)  # by state: added to its equation
+    observed: Mapping[str, Formula] = field(default_factory=dict)  # by channel: added to what the sensor shows
+    clock: Formula = 0.0  # added to the time that is written beside a sample, a formula in t
+    lag: Mapping[str, Formula] = field(default_factory=dict)  # by channel: how late the sensor is [s]
+    # by a name that stands in the rates: an input, and how much earlier it is taken [s]
+    delayed: Mapping[str, tuple[str, Formula]] = field(default_factory=dict)
+    parameters: Mapping[str, float | Parameter] = field(default_factory=dict)
+    title: str = ""
+    source: str = ""
+
+    @property
+    def is_measurement(self) -> bool:
+        """True where the motion itself is left as it is."""
+        return not self.rates
+
+
+@dataclass(frozen=True)
+class Equations:
+    """First-order differential equations, what is observed of them, and the numbers in them.
+
+    rates : by state, its derivative in time; with `mass`, the right-hand side of M(y) dy/dt = rates
+    parameters : value, or Parameter; all are fitted
+    constants : numbers that no fit moves; a run may have its own
+    inputs : signals that are measured along and drive the motion; `u_rate` is the derivative of `u`
+    observed : by channel of the data, what its sensor shows; states of the same name, if not said
+    mass : entries of M by pairs of states (the matrix is symmetric, 1 on the diagonal and else 0 where not said)
+    """
+
+    rates: Mapping[str, Formula]
+    parameters: Mapping[str, float | Parameter] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    inputs: Sequence[str] = ()
+    observed: Mapping[str, Formula] | None = None
+    mass: Mapping[tuple[str, str], Formula] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  # of states and channels
+    name: str = "the declared equations"
+
+    def __post_init__(self) -> None:
+        groups = {
+            "state": self.rates, "parameter": self.parameters, "constant": self.constants, "input": self.inputs,
+        }  # fmt: skip
+        seen: dict[str, str] = {}
+        for what, names in groups.items():
+            for name in names:
+                checked_name(name, what)
+                if name in seen:
+                    raise AnalysisError(f"{name!r} is declared twice, as {seen[name]} and as {what}.")
+                seen[name] = what
+        if not self.rates:
+            raise AnalysisError("equations need at least one state: rates={'x': '-k*x'}.")
+        for pair in self.mass:
+            for name in pair:
+                if name not in self.rates:
+                    raise AnalysisError(f"mass {pair}: {unknown_name(name, self.rates)}")
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states, in the order of their equations."""
+        return tuple(self.rates)
+
+    def channels(self, run: Run) -> Mapping[str, Formula]:
+        """What is observed, by channel."""
+        if self.observed is not None:
+            return self.observed
+        return {name: name for name in run.data if name in self.rates}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Samples of one motion.
+
+    time : (n,) [s], increasing, not necessarily even
+    data : (n,) by channel; NaN where a sample is missing
+    sigma : standard deviation of the noise by channel, a number or (n,); a channel that is not named, or None: found
+            from the data's fast part
+    inputs : (n,) by input, without gaps
+    constants : those that differ from the declared ones in this run
+    start : states at the first sample from which the fit begins, where the guess from the data is not wanted
+    known : states at the first sample that are known: value, or (value, sigma)
+    hold : how inputs go on between samples: "smooth" (cubic), "linear", or "hold" (a step at each sample)
+    groups : what the run belongs to, by kind of group: {"ball": "golf"}; a `Parameter(per="ball")` is one of each ball
+    noise : noise that remembers, of every channel, in place of sigma
+    fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run). 0: all
+            of it judges, by what no start of its own can explain
+    at_rest : True where nothing moved before the first sample: a sensor that lags then shows what it shows there
+    """
+
+    time: ArrayLike
+    data: Mapping[str, ArrayLike]
+    sigma: Mapping[str, ArrayLike] | float | None = None
+    inputs: Mapping[str, ArrayLike] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    start: Mapping[str, float] = field(default_factory=dict)
+    known: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    name: str = ""
+    hold: str = "smooth"
+    groups: Mapping[str, str] = field(default_factory=dict)
+    noise: SmoothNoise | None = None
+    fit_until: float | None = None
+    at_rest: bool = False
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A run that has been checked, or a stretch of one: plain arrays."""
+
+    run: str
+    stretch: int  # 0, 1, ... of its run
+    time: Array  # (n,) [s] since the run's first sample
+    data: Array  # (n, w) NaN where missing
+    sigma: Array  # (n, w)
+    knots: Array  # (m,) [s] of the inputs
+    pieces: Array  # (c, 5, m - 1) cubics, highest power first, and what is added to their slope
+    constants: Mapping[str, float]
+    start: Mapping[str, float]
+    known: Mapping[str, tuple[float, float]]
+    groups: Mapping[str, str]  # by kind, "run" among them
+    noise: SmoothNoise | None = None
+    fit_until: float | None = None
+    at_rest: bool = False  # before the first sample
+
+    @property
+    def name(self) -> str:
+        """Run, and which stretch of it, where it is not whole."""
+        return self.run if self.stretch == 0 else f"{self.run}#{self.stretch + 1}"
+
+    def part(self, first: int, last: int, number: int) -> Samples:
+        """Samples first <= i < last as a stretch with a start of its own."""
+        rows = slice(first, last)
+        own = number == 0
+        return replace(
+            self, stretch=number, time=self.time[rows], data=self.data[rows], sigma=self.sigma[rows],
+            start=self.start if own else {}, known=self.known if own else {}, at_rest=self.at_rest and own,
+        )  # fmt: skip
+
+
+def checked(equations: Equations, runs: Sequence[Run]) -> list[Samples]:
+    """Runs as plain arrays. Raises AnalysisError with the run, what was found and what was expected."""
+    if isinstance(runs, Run):
+        runs = [runs]
+    if not runs:
+        raise AnalysisError("no run was given: Run(time, {'x': values}).")
+    names = [run.name or f"run{i + 1}" for i, run in enumerate(runs)]
+    if len(set(names)) < len(names):
+        raise AnalysisError(f"runs need names of their own; found {', '.join(names)}.")
+    channels = [tuple(equations.channels(run)) for run in runs]
+    if not channels[0]:
+        raise AnalysisError(
+            f"no channel of run {names[0]} ({', '.join(runs[0].data) or 'none'}) is a state "
+            f"({', '.join(equations.states)}): say what is observed with observed={{'channel': 'formula'}}."
+        )
+    return [_checked_run(equations, run, name, channels[0]) for run, name in zip(runs, names, strict=True)]
+
+
+def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[str]) -> Samples:
+    time = _numbers(run.time, f"run {name}, time")
+    n = len(time)
+    if n < 8 or not np.isfinite(time).all() or not np.all(np.diff(time) > 0):
+        bad = int(np.argmin(np.diff(time))) + 1 if n > 1 and np.isfinite(time).all() else 0
+        raise AnalysisError(
+            f"run {name}: needs 8 samples or more at finite, increasing times; found {n}"
+            + (f", and time[{bad}] = {time[bad]:g} after {time[bad - 1]:g}." if bad else ".")
+        )
+    if run.fit_until and np.sum(time - time[0] <= run.fit_until) < 8:
+        raise AnalysisError(
+            f"run {name}: fewer than 8 samples until fit_until = {run.fit_until:g} s; a fit needs them."
+        )
+    missing = [c for c in channels if c not in run.data]
+    if len(missing) == len(channels):
+        raise AnalysisError(f"run {name}: no data for {', '.join(channels)}; there is {', '.join(run.data)}.")
+    data = np.full((n, len(channels)), np.nan)
+    for i, c in enumerate(channels):
+        if c in run.data:
+            data[:, i] = _column(run.data[c], n, f"run {name}, {c}")
+    if np.isinf(data).any():
+        raise AnalysisError(f"run {name}: infinite values in the data; write NaN where a sample is missing.")
+    if np.isfinite(data).any(axis=1).sum() < 8:
+        raise AnalysisError(f"run {name}: fewer than 8 samples have data.")
+    given: Any = {} if run.sigma is None else run.sigma
+    if run.noise is not None:
+        given = float(np.hypot(run.noise.white, run.noise.smooth))
+    if not isinstance(given, Mapping):
+        given = dict.fromkeys(channels, given)
+    for key in given:
+        if key not in channels:
+            raise AnalysisError(f"run {name}, sigma: {unknown_name(key, channels)}")
+    sigma = np.full((n, len(channels)), np.nan)  # NaN: to be found
+    for i, c in enumerate(channels):
+        if c in given:
+            sigma[:, i] = np.broadcast_to(np.asarray(given[c], float), (n,))
+            if not np.all(sigma[:, i] > 0):
+                raise AnalysisError(f"run {name}, sigma of {c}: must be positive.")
+    for what, names, known in (
+        ("start", run.start, equations.states), ("known", run.known, equations.states),
+        ("constants", run.constants, equations.constants), ("inputs", run.inputs, equations.inputs),
+    ):  # fmt: skip
+        for key in names:
+            if key not in known:
+                raise AnalysisError(f"run {name}, {what}: {unknown_name(key, known)}")
+    known_states = {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
+    knots, pieces = _inputs(equations, run, name, time - time[0])
+    return Samples(
+        name, 0, time - time[0], data, sigma, knots, pieces, dict(run.constants), dict(run.start), known_states,
+        {**run.groups, "run": name}, run.noise, run.fit_until, run.at_rest,
+    )  # fmt: skip
+
+
+def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Array, Array]:
+    from scipy.interpolate import CubicSpline
+
+    if not equations.inputs:
+        return np.zeros(0), np.zeros((0, 5, 0))
+    columns = []
+    for u in equations.inputs:
+        if u not in run.inputs:
+            raise AnalysisError(f"run {name}: the input {u!r} is missing. Give it with inputs={{{u!r}: values}}.")
+        columns.append(_column(run.inputs[u], len(time), f"run {name}, input {u}"))
+    values = np.array(columns)
+    if not np.isfinite(values).all():
+        raise AnalysisError(f"run {name}: an input must be known at every sample; fill the gaps first.")
+    pieces = np.zeros((len(values), 5, len(time) - 1))
+    if run.hold == "smooth":
+        pieces[:, :4] = CubicSpline(time, values, axis=1).c.transpose(2, 0, 1)
+        return time, pieces
+    if run.hold not in ("linear", "hold"):
+        raise AnalysisError(f"run {name}: hold = {run.hold!r}; expected 'smooth', 'linear' or 'hold'.")
+    pieces[:, 3] = values[:, :-1]
+    if run.hold == "linear":
+        pieces[:, 2] = np.diff(values, axis=1) / np.diff(time)
+        return time, pieces
+    changes = np.flatnonzero(np.any(np.diff(pieces[:, 3], axis=1) != 0, axis=0)) + 1
+    # the rate of a step is spread over the sample that it begins: what it moves has felt all of it by then
+    pieces[:, 4, changes] = (np.diff(pieces[:, 3], axis=1) / np.diff(time)[1:])[:, changes - 1]
+    kept = np.unique(np.concatenate([[0], changes, changes + 1]))
+    kept = kept[kept < len(time) - 1]
+    return np.concatenate([time[kept], time[-1:]]), np.ascontiguousarray(pieces[:, :, kept])
+
+
+def _numbers(values: ArrayLike, what: str) -> Array:
+    try:
+        found = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise AnalysisError(f"{what}: not numbers ({error}).") from error
+    if found.ndim != 1:
+        raise AnalysisError(f"{what}: expected one number per sample, found an array of shape {found.shape}.")
+    return found
+
+
+def _column(values: ArrayLike, n: int, what: str) -> Array:
+    found = _numbers(values, what)
+    if len(found) != n:
+        raise AnalysisError(f"{what}: {len(found)} values for {n} instants.")
+    return found

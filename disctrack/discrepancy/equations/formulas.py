@@ -1,0 +1,243 @@
+"""Declared equations and terms, differentiated and compiled: motion, sensors and clock as functions of numbers."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import sympy
+from numba.core.types import CompileResultWAP
+
+from calibration.arrays import Array
+from calibration.compiled import njit
+from disctrack.discrepancy.equations import _ode_kernel as kernel
+from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
+from disctrack.discrepancy.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
+from disctrack.discrepancy.equations.late_inputs import with_late
+from disctrack.errors import AnalysisError
+
+OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
+
+
+@dataclass(frozen=True)
+class Formulas:
+    """Symbols of everything, with all terms added; compiled when first asked for.
+
+    Numbers come in one array p: parameters of the model, of the terms, constants, widths of jumps.
+    """
+
+    equations: Equations
+    terms: tuple[Term, ...]
+    channels: tuple[str, ...]
+    states: tuple[sympy.Symbol, ...]
+    fitted: dict[str, tuple[sympy.Symbol, Parameter]]  # by name of the quantity
+    constants: dict[str, sympy.Symbol]
+    inputs: tuple[sympy.Symbol, ...]
+    input_rates: tuple[sympy.Symbol, ...]
+    rates: tuple[sympy.Expr, ...]
+    observed: tuple[sympy.Expr, ...]
+    late: tuple[sympy.Expr, ...]  # by channel: true instant minus the time beside the sample, in t and numbers
+    widths: dict[sympy.Expr, sympy.Symbol]
+    along: dict[str, sympy.Expr]  # by name of a shape: values along the motion that are tried for it
+    late_inputs: tuple[tuple[int, sympy.Expr], ...]  # the last of the inputs: which of the first each is, how late [s]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all numbers in p."""
+        return (*self.fitted, *self.constants, *(s.name for s in self.widths.values()))
+
+    @cached_property
+    def numbers(self) -> list[sympy.Symbol]:
+        """Symbols of p."""
+        return [*(s for s, _ in self.fitted.values()), *self.constants.values(), *self.widths.values()]
+
+    @cached_property
+    def rhs(self) -> Any:
+        """Compiled rates with derivatives (`_ode_kernel.RHS`)."""
+        return self._compiled("rates_", self.rates, ("f_", "J_", "P_"))
+
+    @cached_property
+    def observe(self) -> Any:
+        """Compiled sensors with derivatives (`_ode_kernel.OBSERVE`)."""
+        return self._compiled("sensors_", self.observed, ("h_", "H_y", "H_p"))
+
+    def _compiled(self, name: str, formulas: Sequence[sympy.Expr], out: tuple[str, str, str]) -> Any:
+        value, by_state, by_number = out
+        targets = [(f"{value}[{i}]", e) for i, e in enumerate(formulas)]
+        targets += [
+            (f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)
+        ]
+        fitted = [s for s, _ in self.fitted.values()]
+        for i, e in enumerate(formulas):
+            targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
+        arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
+        source = source_of(name, [sympy.Symbol("t"), *arrays], targets, out)
+        return _compiled_source(source, name)
+
+    def _by_number(self, formula: sympy.Expr, number: sympy.Symbol) -> sympy.Expr:
+        """Derivative of a formula: a number may also say how late an input is."""
+        found = formula.diff(number)
+        first = len(self.inputs) - len(self.late_inputs)
+        for u, rate, (_, late) in zip(self.inputs[first:], self.input_rates[first:], self.late_inputs, strict=True):
+            found -= formula.diff(u) * rate * late.diff(number)
+        return found
+
+    def driven(self, knots: Array, pieces: Array, p: Array) -> tuple[Array, Array]:
+        """Inputs of a run (`declared.Samples`) with those that act late, for numbers p."""
+        if not self.late_inputs:
+            return knots, pieces
+        return with_late(knots, pieces, [which for which, _ in self.late_inputs], np.array(self._how_late(p), float))
+
+    @cached_property
+    def _how_late(self) -> Any:
+        return sympy.lambdify((self.numbers,), [late for _, late in self.late_inputs], "numpy")
+
+    @cached_property
+    def is_late(self) -> bool:
+        """True where any term moves the instants of the samples."""
+        return any(e != 0 for e in self.late)
+
+    @cached_property
+    def lateness(self) -> Any:
+        """(t (m,), p) -> true minus written instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
+        t, fitted = sympy.Symbol("t", real=True), [s for s, _ in self.fitted.values()]
+        flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
+        function = sympy.lambdify((t, self.numbers), flat, "numpy")
+
+        def evaluate(time: Array, p: Array) -> tuple[Array, Array]:
+            values = np.array([np.broadcast_to(v, time.shape) for v in function(time, p)], float)
+            w = len(self.late)
+            return values[:w], values[w:].reshape(w, len(fitted), len(time))
+
+        return evaluate
+
+    @cached_property
+    def jump_arguments(self) -> Any:
+        """(t, y, p, u) -> the arguments of all jumps, each (m,)."""
+        return self._along_motion(list(self.widths))
+
+    @cached_property
+    def scanned(self) -> Any:
+        """(t, y, p, u) -> what each shape of `along` is tried along, each (m,)."""
+        return self._along_motion(list(self.along.values()))
+
+    def _along_motion(self, expressions: Sequence[sympy.Expr]) -> Any:
+        t = sympy.Symbol("t", real=True)
+        return sympy.lambdify((t, self.states, self.numbers, self.inputs), expressions, "numpy")
+
+    def defaults(self) -> dict[str, float]:
+        """Declared values of all numbers; the widths of jumps are 1 until they are known."""
+        found = {name: p.value for name, (_, p) in self.fitted.items()} | dict(self.equations.constants)
+        return found | {s.name: 1.0 for s in self.widths.values()}
+
+
+def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str, Formula]) -> Formulas:
+    """Read and check every formula. Raises AnalysisError."""
+
+    def symbol(name: str) -> sympy.Symbol:
+        return sympy.Symbol(name, real=True)
+
+    states = {name: symbol(name) for name in equations.rates}
+    inputs = {name: symbol(name) for name in equations.inputs}
+    input_rates = {f"{name}_rate": symbol(f"{name}_rate") for name in equations.inputs}
+    constants = {name: symbol(name) for name in equations.constants}
+    own = {name: symbol(name) for name in equations.parameters}
+    fitted = {name: (own[name], _parameter(p)) for name, p in equations.parameters.items()}
+    everything = {"t": symbol("t"), **states, **inputs, **input_rates, **constants, **own}
+    rates = [parsed(f, everything, f"equation of {name}") for name, f in equations.rates.items()]
+    without_motion = {k: v for k, v in everything.items() if k not in states and k not in inputs}
+    observed = {c: parsed(f, everything, f"observed {c}") for c, f in channels.items()}
+    # a term of a sensor may name the channel itself: what it shows as declared. A state of that name comes first
+    shown = {symbol(c): f for c, f in observed.items() if c not in everything}
+    channel_names = {s.name: s for s in shown}
+    late = dict.fromkeys(channels, sympy.Integer(0))
+    position = {name: i for i, name in enumerate(states)}
+    seen: set[str] = set()
+    along: dict[str, sympy.Expr] = {}
+    late_inputs: list[tuple[int, sympy.Expr]] = []
+    driving, driving_rates = list(inputs.values()), list(input_rates.values())
+    for term in terms:
+        if term.name in seen or "[" in term.name or "." in term.name:
+            raise AnalysisError(f"term {term.name!r}: needs a name of its own, without '.' and '['.")
+        seen.add(term.name)
+        mine = {name: symbol(f"term{len(seen)}_{name}") for name in term.parameters}
+        for name, p in term.parameters.items():
+            checked_name(name, f"parameter of term {term.name}")
+            fitted[f"{term.name}.{name}"] = (mine[name], _parameter(p))
+        here = f"term {term.name}"
+        own_names = {f"{OWN}{name}": s for name, s in mine.items()}
+        written = [*term.rates.values(), *term.observed.values(), *term.lag.values(), term.clock]
+        # where a term says which numbers are its own, other names are the equations'
+        mine = own_names if any(OWN in str(f) for f in written) else mine | own_names
+        words = {**everything, **mine}
+        for name, p in term.parameters.items():
+            if isinstance(p, Parameter) and p.along:
+                along[f"{term.name}.{name}"] = parsed(p.along, everything, f"{here}, {name} along")
+        before: dict[str, sympy.Symbol] = {}
+        for name, (u, f) in term.delayed.items():
+            checked_name(name, f"late input of term {term.name}")
+            _known(u, inputs, f"{here}, delayed {name}")
+            delay = parsed(f, {**constants, **own, **mine}, f"{here}, delay of {u}")
+            late_inputs.append((list(inputs).index(u), delay))
+            driving.append(symbol(f"term{len(seen)}_late_{name}"))
+            driving_rates.append(symbol(f"term{len(seen)}_late_{name}_rate"))
+            before |= {name: driving[-1], f"{OWN}{name}": driving[-1]}
+        for name, f in term.rates.items():
+            _known(name, states, f"{here}, rates")
+            rates[position[name]] += parsed(f, {**words, **before}, f"{here}, rate of {name}")
+        for name, f in term.observed.items():
+            _known(name, observed, f"{here}, observed")
+            found = parsed(f, {**channel_names, **words}, f"{here}, observed {name}")
+            observed[name] += found.xreplace(shown)
+        clock = parsed(term.clock, {**without_motion, **mine}, f"{here}, clock")
+        for c in late:
+            late[c] += clock
+        for name, f in term.lag.items():
+            _known(name, late, f"{here}, lag")
+            late[name] -= parsed(f, {**without_motion, **mine}, f"{here}, lag of {name}")
+    widths: dict[sympy.Expr, sympy.Symbol] = {}
+    rates = [smooth(e, widths) for e in rates]
+    rates = _solved(equations, rates, everything)
+    return Formulas(
+        equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(driving),
+        tuple(driving_rates), tuple(rates), tuple(smooth(e, widths) for e in observed.values()),
+        tuple(late.values()), widths, along, tuple(late_inputs),
+    )  # fmt: skip
+
+
+def _solved(equations: Equations, forces: list[sympy.Expr], symbols: Mapping[str, sympy.Symbol]) -> list[sympy.Expr]:
+    """M^-1 forces, where a mass matrix is declared; the states that it couples are solved together."""
+    if not equations.mass:
+        return forces
+    n, position = len(forces), {name: i for i, name in enumerate(equations.rates)}
+    M = sympy.eye(n)
+    for (a, b), f in equations.mass.items():
+        i, j = position[a], position[b]
+        M[i, j] = M[j, i] = parsed(f, symbols, f"mass ({a}, {b})")
+    coupled = [i for i in range(n) if any(M[i, j] != (1 if i == j else 0) for j in range(n))]
+    solved = M.extract(coupled, coupled).LUsolve(sympy.Matrix([forces[i] for i in coupled]))
+    for row, i in enumerate(coupled):
+        forces[i] = solved[row]
+    return forces
+
+
+def _parameter(given: float | Parameter) -> Parameter:
+    return given if isinstance(given, Parameter) else Parameter(float(given))
+
+
+def _known(name: str, known: Mapping[str, Any], where: str) -> None:
+    if name not in known:
+        raise AnalysisError(f"{where}: {unknown_name(name, known)}")
+
+
+@lru_cache(maxsize=64)
+def _compiled_source(source: str, name: str) -> Any:
+    """The same equations are compiled once, however many runs are asked about."""
+    kernel.prepare()
+    scope = {k: getattr(math, k) for k in dir(math) if not k.startswith("_")}
+    exec(source, scope)
+    compiled = njit(kernel.RHS, error_model="numpy", nogil=True)(scope[name])
+    # its address, once: asked for at every call, it takes as long as a short stretch's motion
+    return CompileResultWAP(compiled.get_compile_result(kernel.RHS))

@@ -1,0 +1,719 @@
+"""A force that no term names, learned from what the equations leave: a function of one state, of an input or of time.
+
+The function is a normal process: a line, cosines over the range that the motion visits, and for velocities a jump at
+rest, each amplitude with a standard deviation that falls with its wave number (Solin & Sarkka 2020). How large and how
+smooth it is follows from the data (evidence, MacKay 1992); so does which equation it acts in, and along what. It stands
+in the equations as any term does, with exact derivatives. Where the declared equations are far from the data, it is
+first learned over stretches of half a turn with a start each, and these are joined two by two.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import sympy
+from scipy import linalg
+
+from calibration.arrays import Array
+from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
+from disctrack.discrepancy.equations.expressions import Formula, parsed
+from disctrack.discrepancy.equations.formulas import Formulas, formulas
+from disctrack.discrepancy.equations.start import guessed, trusted, turn
+from disctrack.discrepancy.equations.system import EquationSystem
+from disctrack.discrepancy.fit import Fit, compress, covariance_within, fit, prior_rows, solve_bounded
+from disctrack.discrepancy.held_out import HeldOut, held_out
+from disctrack.discrepancy.row_noise import THIRD
+from disctrack.discrepancy.search import CLASS_GAIN, OBVIOUS, Diagnosis, Found, Tried
+from disctrack.discrepancy.significance import price_of_a_number
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
+
+NAME = "learned"  # of the term
+HARMONICS = 24
+MARGIN = 0.2  # of the range that is visited, beyond it: what cosines do at their ends is not the law's
+SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers from which on amplitudes fall ...
+FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: without kinks, and with some
+FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
+FINEST = 400  # wave number up to which the law may have waves that are not fitted
+SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
+FAR = 10.0  # variances of the noise, from which on the motion is learned from in short stretches
+MOST_STATES = 80  # starts of such stretches
+FEWEST = 10  # samples of each
+MOST_SAMPLES = 2000  # with which laws compete; the one that is told is fitted to all
+A_TURN = 40  # samples of a turn that are kept at least
+MOST_LAWS = 40  # that are looked at in any case
+REFITTED = 4  # laws that are fitted in full ...
+MOST_BESIDE = 2  # ... beside each of so many known terms, where none describes the data by itself
+WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
+ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
+PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
+ALIKE = 10.0  # the same, by which two laws differ that both describe the data
+ROUNDS = 3  # in which size and smoothness follow the fit, and the fit them
+ITERATIONS, ATTEMPTS = 12, 60  # of a fit, and of one within a region of trust
+POINTS = 61  # of the course that is told
+TURNING = 2  # times that a velocity changes its sign, from which on friction may jump with it
+
+
+@dataclass(frozen=True)
+class Along:
+    """Where a law acts, and what it is a function of."""
+
+    equation: str  # state whose equation it stands in
+    variable: str  # state, input, or "t"
+    jumps: bool = False  # with the variable's sign, as friction does
+    fine: bool = False  # of finer waves near nought, as drag that falls with speed has them
+
+    @property
+    def title(self) -> str:
+        """In words."""
+        of = "time" if self.variable == "t" else self.variable
+        return f"a force on {self.equation} that is a function of {of}"
+
+
+@dataclass(frozen=True)
+class LearnedForce:
+    """A law with its course."""
+
+    along: Along
+    candidate: Candidate
+    beside: tuple[Candidate, ...]  # known terms that were fitted with it
+    fit: Fit
+    held_out: HeldOut
+    held: tuple[str, ...]  # parameters that are a part of the law, and held as declared
+    variable: Array  # (POINTS,) from the least to the largest that is visited
+    force: Array  # (POINTS,) beyond the declared equations
+    sigma: Array  # (POINTS,)
+    length: float  # -2 log evidence of the data with it, with what it pays for having been looked for
+    alike: tuple[Along, ...]  # others whose evidence is within ALIKE
+    replaces: tuple[Candidate, ...] = ()  # known terms that describe the data too ...
+    their_length: float = np.inf  # ... with this
+    theirs: Array | None = None  # (POINTS,) what they make together at the same places
+    at_noise: bool = True  # is what it leaves noise?
+    system: EquationSystem | None = None  # that knows the law
+
+    def is_named(self, diagnosis: Diagnosis) -> bool:
+        """Is it this law that describes the data best, or comes nearest where no term is certain?"""
+        return self.is_shorter and (self.at_noise or not diagnosis.found)
+
+    @property
+    def is_shorter(self) -> bool:
+        """Than the known terms that come nearest to the data?"""
+        return self.length < self.their_length
+
+    def document(self) -> dict[str, Any]:
+        """Its course in JSON's types, with the names of what describes the data too."""
+        return {
+            "equation": self.along.equation,
+            "variable": self.along.variable,
+            "jumps_with_its_sign": self.along.jumps,
+            "beyond": list(self.held),
+            "beside": [c.name for c in self.beside],
+            "at": self.variable,
+            "force": self.force,
+            "sigma": self.sigma,
+            "at_noise": self.at_noise,
+            "minus_2_log_evidence": self.length,
+            "cannot_be_told_from": [{"equation": a.equation, "variable": a.variable} for a in self.alike],
+            "known_terms": [c.name for c in self.replaces],
+            "minus_2_log_evidence_of_known_terms": self.their_length,
+            "force_of_known_terms": self.theirs,
+        }
+
+    def text(self, units: Mapping[str, str]) -> str:
+        """Its course at five places."""
+        at = np.linspace(0, len(self.variable) - 1, 5).round().astype(int)
+        course = ", ".join(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {self.variable[i]:.3g}" for i in at)
+        unit = units.get(self.along.variable, "s" if self.along.variable == "t" else "1")
+        held = f", beyond {' and '.join(self.held)} as declared" if self.held else ""
+        return f"{self.along.title} [{NAME}{held}]: {course}{'' if unit == '1' else f' {unit}'}"
+
+
+def learn(
+    system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
+) -> LearnedForce | None:
+    """The law of one variable with which the data are most probable, beside known terms where it takes them.
+
+    channels : formulas of what is observed, without terms
+    judged : the system with its noise as judged, if that remembers
+    None where no law describes most of what is missing, or where there are too many runs.
+    """
+    if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # more than are fitted side by side
+        return None
+    whole = _knowing(system, channels)
+    few = _thinned(whole) if judged is None else whole
+    over = _Competition(few, diagnosis, None if judged is None else judged)
+    best = over.best(())
+    several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
+    if several and (best is None or not over.at_noise(best.fit)):
+        others = [over.best((c,)) for c in over.beside()]
+        best = min((o for o in (best, *others) if o is not None), key=lambda trial: trial.length, default=None)
+    if best is None:
+        return None
+    law = over.told(best, whole)
+    return law if over.is_worth_telling(law) else None
+
+
+@dataclass(frozen=True)
+class _Trial:
+    along: Along
+    beside: tuple[Candidate, ...]
+    quantities: tuple[Quantity, ...]  # of the law, with their priors; typical: by the roughest that is not refuted
+    fit: Fit
+    length: float
+    alike: tuple[Along, ...] = ()
+
+
+class _Competition:
+    """Laws among each other and with the known terms that were found, by the evidence of the same samples."""
+
+    def __init__(self, system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> None:
+        self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
+        self._judged = judged
+        self.price = price_of_a_number(system.weights)
+        base = diagnosis.before
+        self.declared = {q.name: q.null for q in system.base if not q.name.startswith("state.")}
+        self.begin = dict(base.values)
+        chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
+        self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
+        self.laws = tuple(_laws(system, self.begin))
+        self.looked = 2.0 * float(np.log(len(self.laws)))
+
+    def view(self, system: EquationSystem) -> System:
+        """With the noise as judged, where the samples are those that were judged."""
+        of = getattr(self._judged, "over", None)
+        return system if of is None else of(system)
+
+    def arrived(self, fitted: Fit) -> bool:
+        """Could further steps gain no more than nothing? Along what only the prior holds, they go on for ever."""
+        return fitted.converged or fitted.promised < ALIKE * self.noise
+
+    def at_noise(self, fitted: Fit) -> bool:
+        """As the search has it."""
+        scatter = 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fitted.n_data, 1)))
+        limit = max(self.diagnosis.settings.at_noise, 1.0 + scatter)
+        return self.arrived(fitted) and fitted.reduced_chi_square <= limit * self.noise
+
+    def known(self, candidates: Sequence[Candidate], fitted: Fit) -> float:
+        """-2 log evidence of known terms: Schwarz's price, and that of having been chosen among so many."""
+        numbers = sum(len(c.names) for c in candidates)
+        looked = 2.0 * len(candidates) * float(np.log(max(len(self.system.candidates) - 1, 2)))
+        values = self.begin | fitted.values
+        residual, _ = self.view(self.system).linearise(values, [])
+        right, _ = prior_rows(self.system.base, values)
+        return float((np.sum(residual**2) + right @ right) / self.noise + self.price * numbers + looked)
+
+    def beside(self) -> list[Candidate]:
+        """Known terms that may act with a law: those that were found or help most."""
+        d = self.diagnosis
+        tried = sorted(d.tried, key=lambda t: -(t.score if t.gain is None else t.gain))
+        named = [*(f.candidate.name for f in d.found), *(c.name for c in d.partial), *(t.candidate.name for t in tried)]
+        own = {c.name: c for c in self.system.candidates}
+        return [own[name] for name in dict.fromkeys(named) if name in own][:MOST_BESIDE]
+
+    def is_worth_telling(self, law: LearnedForce) -> bool:
+        """Does it describe the data, or nearly all of what is missing, and samples that it has not seen as well?
+
+        As known terms are asked: where it is not noise that is left, they must leave more.
+        """
+        d = self.diagnosis
+        if not self.arrived(law.fit) or d.held_out_before is None:
+            return False
+        ahead = 2 * (law.held_out.log_density - d.held_out_before.log_density) / self.noise
+        gain = (d.before.cost - law.fit.cost) / self.noise
+        if not (ahead > 0 or (ahead > -CLASS_GAIN and gain > OBVIOUS * self.looked)):
+            return False
+        excess = [f.chi_square / self.noise - f.degrees_of_freedom for f in (d.before, law.fit)]
+        return law.at_noise or (law.is_shorter and excess[1] < d.settings.unexplained_share * excess[0])
+
+    def best(self, beside: tuple[Candidate, ...]) -> _Trial | None:
+        """The law that makes the data most probable beside these terms."""
+        shots = _shots(self.system) if self.far else [self.system]
+        first = shots[0]
+        values = self.begin
+        if self.far:
+            values = self.begin | self.declared | guessed(first)[0]
+            tied = tuple(q if q.name.startswith("state.") else _tied(q) for q in first.base)
+            values = fit(first, tied, values, ITERATIONS).values
+        scans = []
+        for law in self.laws:
+            if all(law.variable not in _variables(self.system.formulas, c.name) for c in beside):
+                length, quantities = self._scanned(first, law, beside, values)
+                scans.append((length, law, quantities))
+        scans.sort(key=lambda scan: scan[0])
+        if not scans:
+            return None
+        trials: list[_Trial] = []
+        bars = np.full(len(shots), np.inf)
+        for length, law, quantities in scans[:REFITTED]:
+            # along short stretches that the declared equations do not follow the first order says little
+            if length > scans[0][0] * (ROUGHLY if self.far else 1.0) + WORTH:
+                break
+            if (trial := self._led(shots, law, beside, quantities, values, bars)) is not None:
+                trials.append(trial)
+        if not trials:
+            return None
+        trials = [trial for trial in trials if self.arrived(trial.fit)] or trials
+        shortest = min(trial.length for trial in trials)
+        alike = [trial for trial in trials if trial.length < shortest + ALIKE]
+        # a function of time describes any motion: one of the motion itself says more, and is tried by every other run
+        best = min(alike, key=lambda trial: (trial.along.variable == "t", trial.length))
+        others = (Along(t.along.equation, t.along.variable) for t in alike if t.along.title != best.along.title)
+        return replace(best, alike=tuple(dict.fromkeys(others)))
+
+    def _others(self, system: EquationSystem, beside: Sequence[Candidate]) -> tuple[Quantity, ...]:
+        return (*system.base, *(q for c in beside for q in c.quantities))
+
+    def _scanned(
+        self, system: EquationSystem, law: Along, beside: Sequence[Candidate], values: Values
+    ) -> tuple[float, tuple[Quantity, ...]]:
+        """-2 log evidence to first order, and the law's quantities with the priors that bring it."""
+        there, numbers = _set(system, law, values)
+        return self._evidence(there, law, beside, {**values, **numbers})
+
+    def _evidence(
+        self, system: EquationSystem, law: Along, beside: Sequence[Candidate], values: Values
+    ) -> tuple[float, tuple[Quantity, ...]]:
+        others, own = self._others(system, beside), _amplitudes(system, law)
+        names = [*(q.name for q in others), *(q.name for q in own)]
+        values = {q.name: q.null for q in (*others, *own)} | dict(values)
+        view = self.view(system) if len(system.stretches) == len(self.system.stretches) else system
+        right, matrix = compress(*view.linearise(values, names))
+        if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
+            return np.inf, own
+        prior, prior_matrix = prior_rows(others, values)
+        right = np.concatenate([right, prior])
+        matrix = np.vstack([matrix, np.column_stack([prior_matrix, np.zeros((len(prior), len(own)))])])
+        # the residual as it would be without the law
+        k = len(others)
+        right = right + matrix[:, k:] @ np.array([values[q.name] for q in own])
+        length = np.linalg.norm(matrix[:, :k], axis=0)
+        basis, R, _ = linalg.qr(matrix[:, :k] / np.where(length > 0, length, 1.0), mode="economic", pivoting=True)
+        basis = basis[:, np.abs(np.diag(R)) > 1e-9]
+        right, columns = (x - basis @ (basis.T @ x) for x in (right, matrix[:, k:]))
+        size = _size(system, law, values)
+        priors, lengths = [], []
+        for smooth, fall in product(SMOOTH, FALLS):
+            falls = _falls(own, smooth, fall)
+            # the faster driver gives up where columns are alike
+            U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
+            power = (U.T @ right) ** 2 / self.noise
+            gain = (SIZES[:, None] * size * singular) ** 2 / self.noise
+            found = np.sum(np.log1p(gain) - power * gain / (1 + gain), axis=1)
+            best = int(np.argmin(found))
+            priors.append(SIZES[best] * size * falls)
+            lengths.append(float(right @ right) / self.noise + float(found[best]))
+        best_prior = priors[int(np.argmin(lengths))]
+        # of those that the data do not refute the roughest: what it leaves open is not called known for being smooth
+        plausible = [p for p, length_ in zip(priors, lengths, strict=True) if length_ < min(lengths) + PLAUSIBLE]
+        roughest = max(plausible, key=lambda prior: float(prior[HARMONICS]))
+        return min(lengths) + self.looked, tuple(
+            replace(q, prior_sigma=float(sigma), scale=float(1e-3 * sigma), typical=float(rough))
+            for q, sigma, rough in zip(own, best_prior, roughest, strict=True)
+        )
+
+    def _led(
+        self, shots: Sequence[EquationSystem], law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...],
+        values: Values, bars: Array,
+    ) -> _Trial | None:  # fmt: skip
+        """The law's fit to stretches that are joined two by two; None where it loses the data, or to another law.
+
+        bars : (n,) -2 log evidence of the best law so far in each of these; this one's are put in
+        """
+        now = dict(values) | {q.name: 0.0 for q in own}
+        fitted: Fit | None = None
+        length = np.inf
+        first, numbers = _set(shots[0], law, now)
+        now |= numbers
+        for i, system in enumerate(shots):
+            there = system.with_(widths=first.widths)
+            last = system is shots[-1]
+            others = self._others(there, beside)
+            for _ in range(ROUNDS if last else 1):
+                view = self.view(there) if last else there
+                fitted = self._fitted(view, (*others, *own), now)
+                if not fitted.reduced_chi_square < FAR * self.noise:  # joined, it leaves more
+                    return None
+                now = dict(fitted.values)
+                before = length
+                length, own = self._evidence(there, law, beside, now)
+                if abs(before - length) < 1.0:
+                    break
+            if length > bars[i] + WORTH:
+                return None
+            bars[i] = min(bars[i], length)
+            if not last:
+                now |= _joining(now, there)
+        if fitted is None:
+            return None
+        fitted = self._fitted(self.view(there), (*others, *own), now)
+        price = sum(self.price * len(c.names) + self.looked for c in beside)
+        return _Trial(law, beside, own, fitted, length + price)
+
+    def _fitted(self, system: System, quantities: Sequence[Quantity], values: Values) -> Fit:
+        """The fit; where its steps have to be halved again and again, with a region of trust for each number.
+
+        Amplitudes that the data hardly show may go far to first order, and shift the phase in second.
+        """
+        found = fit(system, quantities, values, ITERATIONS)
+        ahead = (found.chi_square - found.promised) / max(
+            found.degrees_of_freedom, 1
+        )  # were the rest of the way linear
+        if self.arrived(found) or not ahead < FAR * self.noise:
+            return found
+        return fit(system, quantities, trusted(system, quantities, found.values, ATTEMPTS), ITERATIONS)
+
+    def _roughly(self, view: System, fitted: Fit, own: Sequence[Quantity]) -> tuple[Array, Array]:
+        """Step (k,) to where the roughest law leads that the data do not refute, and the covariance (k, k) there."""
+        rough = {q.name: q.typical for q in own}
+        quantities = [replace(q, prior_sigma=rough.get(q.name, q.prior_sigma)) for q in fitted.quantities]
+        right, matrix = compress(*view.linearise(fitted.values, fitted.names))
+        scale = np.sqrt(self.noise * max(1.0, fitted.reduced_chi_square / self.noise))
+        prior, prior_matrix = prior_rows(quantities, fitted.values)
+        right, matrix = np.concatenate([right / scale, prior]), np.vstack([matrix / scale, prior_matrix])
+        x = np.array([fitted.values[n] for n in fitted.names])
+        lower, upper = np.array([q.lower for q in quantities]), np.array([q.upper for q in quantities])
+        return solve_bounded(right, matrix, lower - x, upper - x), covariance_within(matrix, right, x, lower, upper)
+
+    def told(self, best: _Trial, whole: EquationSystem) -> LearnedForce:
+        """The law fitted to all data, with its course, beside the known terms that describe them too."""
+        law, d = best.along, self.diagnosis
+        there, fitted = _set(whole, law, best.fit.values)[0], best.fit
+        view = self.view(there)
+        if len(whole.time) != len(self.system.time):
+            others = self._others(there, best.beside)
+            fitted = self._fitted(view, (*others, *best.quantities), fitted.values)
+        held = held_out(view, fitted.quantities, fitted.values, whole.training)
+        x = np.linspace(*_range(there, law, fitted.values), POINTS)
+        columns = _columns(best.quantities, law, x, fitted.values)
+        force = columns @ np.array([fitted.values[q.name] for q in best.quantities])
+        # what a declared number has become is a part of the law, where it acts as such a one would
+        part = sorted(_part_of_law(there.formulas, law, there.held))
+        moved, by_number = _declared_part(there, law, part, fitted.values, x)
+        force, columns = force + moved, np.column_stack([columns, by_number])
+        at = [fitted.names.index(n) for n in (*(q.name for q in best.quantities), *part)]
+        moved_by, covariance = self._roughly(view, fitted, best.quantities)
+        variance = np.einsum("ij,jk,ik->i", columns, covariance[np.ix_(at, at)], columns)
+        variance = np.maximum(variance, 0.0) + (columns @ moved_by[at]) ** 2
+        sigma = np.sqrt(variance + _of_finer_waves(best.quantities))
+        candidate = Candidate(NAME, NAME, "motion", law.title, "learned from what is left", best.quantities)
+        sums = tuple(f.candidate for f in d.found) or d.partial
+        of_sums = d.after if d.found else d.nearest
+        their_length = self.known(sums, of_sums) if of_sums is not None and sums else np.inf
+        theirs = None
+        if of_sums is not None and sums and not there.formulas.equations.mass:
+            theirs = _sum_of(there, law, of_sums.values, x, part)
+        return LearnedForce(law, candidate, best.beside, fitted, held, tuple(part), x, force, sigma, best.length,
+                            best.alike, sums, their_length, theirs, self.at_noise(fitted), there)  # fmt: skip
+
+
+def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
+    """Every law that is looked for: in every equation of a force, along every state, input, and time.
+
+    In a large system, along what stands in that equation already, and time.
+    """
+    equations = system.formulas.equations
+    everything = (*equations.states, *equations.inputs, "t")
+    many = len(_forced(equations)) * len(everything) > MOST_LAWS
+    absent = {s: 0 for name, (s, _) in system.formulas.fitted.items() if "." in name}
+    for equation in _forced(equations):
+        rate = system.formulas.rates[equations.states.index(equation)].subs(absent)
+        there = {s.name for s in rate.free_symbols} | {"t"}
+        for variable in everything:
+            if many and variable not in there:
+                continue
+            yield Along(equation, variable)
+            if variable in _velocities(equations, equation):
+                yield Along(equation, variable, fine=True)
+                if _turns(system, variable, values):
+                    yield Along(equation, variable, jumps=True)
+
+
+def _forced(equations: Equations) -> list[str]:
+    """States whose equations are more than a definition (x' = v)."""
+    return [s for s, f in equations.rates.items() if str(f).strip() not in equations.rates]
+
+
+def _velocities(equations: Equations, equation: str) -> set[str]:
+    return {str(f).strip() for f in equations.rates.values()} & set(equations.rates) | {equation}
+
+
+def _turns(system: EquationSystem, state: str, values: Values) -> bool:
+    """Does a state change its sign again and again along the motion?"""
+    i = system.formulas.equations.states.index(state)
+    count = 0
+    for found in system.predictions(values):
+        if found is not None:
+            count += int(np.sum(np.diff(np.sign(found.states[:, i])) != 0))
+    return count >= TURNING
+
+
+def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> EquationSystem:
+    """The same system with the law as one more term; where it acts, and along what, is said by numbers."""
+    f = system.formulas
+    e = f.equations
+    argument = " + ".join(f"{NAME}_of_{name}*{name}" for name in (*e.states, *e.inputs, "t"))
+    place = f"({NAME}_bend*asinh(({argument})/{NAME}_bend) - {NAME}_from)/{NAME}_span"
+    waves = " + ".join(f"own_a{k}*cos({k}*pi*{place})" for k in range(1, HARMONICS + 1))
+    course = f"own_a0 + own_slope*({argument})/{NAME}_reach + {waves} + own_jump*sign({argument})"
+    numbers = [f"{NAME}_of_{name}" for name in (*e.states, *e.inputs, "t")] + [f"{NAME}_on_{s}" for s in _forced(e)]
+    scales = [f"{NAME}_span", f"{NAME}_reach", f"{NAME}_bend"]
+    constants = {**e.constants, **dict.fromkeys([*numbers, f"{NAME}_from"], 0.0), **dict.fromkeys(scales, 1.0)}
+    term = Term(
+        NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},
+        parameters={name: Parameter(0.0) for name in _names()}, title="a force that no term names",
+    )  # fmt: skip
+    known = formulas(replace(e, constants=constants), (*f.terms, term), channels)
+    widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
+    new = {w.name: 1.0 for w in known.widths.values() if w.name not in widths}
+    return EquationSystem(known, system.stretches, system.sizes, widths | new, system.promoted, system.held,
+                          system.typical, system.aims)  # fmt: skip
+
+
+def _names() -> list[str]:
+    return [f"a{k}" for k in range(HARMONICS + 1)] + ["slope", "jump"]
+
+
+def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
+    """Of the law, without priors as yet."""
+    own = {q.name: q for c in system.candidates if c.name == NAME for q in c.quantities}
+    return tuple(own[f"{NAME}.{n}"] for n in _names() if law.jumps or n != "jump")
+
+
+def _falls(own: Sequence[Quantity], smooth: float, power: float) -> Array:
+    """Prior sigma of each amplitude over that of the first."""
+    found = []
+    for q in own:
+        number = q.name.partition(".a")[2]
+        found.append((1.0 + (int(number) / smooth) ** 2) ** -power if number else 1.0)
+    return np.array(found)
+
+
+def _of_finer_waves(own: Sequence[Quantity]) -> float:
+    """Variance of the law by waves shorter than those that are fitted, as the prior of these goes on."""
+    priors = {q.name.partition(".")[2]: q.typical for q in own}
+    first, last = priors["a0"], priors[f"a{HARMONICS}"]
+    finer = np.arange(HARMONICS + 1, FINEST)
+    # the smoothness that was chosen is that whose last amplitude is this one
+    smooth, fall = min(
+        product(SMOOTH, FALLS), key=lambda sf: abs(np.log(first * (1 + (HARMONICS / sf[0]) ** 2) ** -sf[1] / last))
+    )
+    return float(0.5 * np.sum((first * (1 + (finer / smooth) ** 2) ** -fall) ** 2))
+
+
+def _columns(own: Sequence[Quantity], law: Along, x: Array, values: Values) -> Array:
+    """(n, k) what each amplitude adds at these values of the variable."""
+    bend = values[f"{NAME}_bend"]
+    place = (bend * np.arcsinh(x / bend) - values[f"{NAME}_from"]) / values[f"{NAME}_span"]
+    whole = {"jump": np.sign(x), "slope": x / values[f"{NAME}_reach"]}
+    found = []
+    for q in own:
+        name = q.name.partition(".")[2]
+        found.append(whole[name] if name in whole else np.cos(int(name[1:]) * np.pi * place))
+    return np.column_stack(found)
+
+
+def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
+    """The system for one law, and the numbers that say where it acts and over which range."""
+    low, high = _range(system, law, values)
+    reach = max(abs(low), abs(high), 1e-12)
+    bend = reach * (FINE if law.fine else STRAIGHT)
+    low, high = (float(bend * np.arcsinh(end / bend)) for end in (low, high))
+    span = max(high - low, 1e-12 * reach)
+    of, on = f"{NAME}_of_", f"{NAME}_on_"
+    numbers = {n: 0.0 for n in system.formulas.constants if n.startswith((of, on))}
+    numbers |= {of + law.variable: 1.0, on + law.equation: 1.0}
+    numbers |= {f"{NAME}_from": low - MARGIN * span, f"{NAME}_span": (1 + 2 * MARGIN) * span}
+    numbers |= {f"{NAME}_reach": reach, f"{NAME}_bend": bend}
+    mine = [w.name for a, w in system.formulas.widths.items() if any(s.name.startswith(of) for s in a.free_symbols)]
+    size = float(np.sqrt(np.mean(np.concatenate(_visited(system, law.variable, values)) ** 2)))
+    return system.with_(widths=system.widths | {w: 1e-3 * (size or 1.0) for w in mine}), numbers
+
+
+def _visited(system: EquationSystem, variable: str, values: Values) -> list[Array]:
+    """Values of a state, an input or time at the samples of each stretch."""
+    e = system.formulas.equations
+    if variable == "t":
+        return [s.time for s in system.stretches]
+    if variable in e.inputs:
+        return [system.inputs_of(s)[list(e.inputs).index(variable)] for s in system.stretches]
+    i = e.states.index(variable)
+    found = [p.states[:, i] for p in system.predictions(values) if p is not None]
+    return found or [np.array([-1.0, 1.0])]
+
+
+def _range(system: EquationSystem, law: Along, values: Values) -> tuple[float, float]:
+    visited = np.concatenate(_visited(system, law.variable, values))
+    return float(visited.min()), float(visited.max())
+
+
+def _size(system: EquationSystem, law: Along, values: Values) -> float:
+    """Force that by itself makes the rms of the equation in which the law stands, along the motion."""
+    f = system.formulas
+    i, constant = f.equations.states.index(law.equation), f.names.index(f"{NAME}.a0")
+    found = [system.along(values, s)[:2] for s in system.stretches]
+    own = np.concatenate([rates[:, i] for rates, _ in found])
+    acting = np.concatenate([by_number[:, i, constant] for _, by_number in found])
+    return float(np.sqrt(np.mean(own**2) / max(np.mean(acting**2), 1e-300))) or 1.0
+
+
+def _variables(f: Formulas, term: str) -> set[str]:
+    """Of what a motion's term is a function, if of one state or input alone; else nothing."""
+    numbers = [s for name, (s, _) in f.fitted.items() if name.startswith(f"{term}.")]
+    found: set[str] = set()
+    for rate in f.rates:
+        for number in numbers:
+            found |= {s.name for s in rate.diff(number).free_symbols}
+    found &= {s.name for s in (*f.states, *f.inputs)} | {"t"}
+    return found if len(found) == 1 else set()
+
+
+def _symbols(f: Formulas) -> dict[str, sympy.Symbol]:
+    """By their names all that the declared equations are made of."""
+    own = (s for name, (s, _) in f.fitted.items() if "." not in name)
+    known = {s.name: s for s in (*f.states, *f.inputs, *f.input_rates, *f.constants.values(), *own)}
+    return known | {"t": sympy.Symbol("t", real=True)}
+
+
+def _part_of_law(f: Formulas, law: Along, held: Sequence[str] = ()) -> set[str]:
+    """Parameters that act in the law's equation as a function of its variable alone, and nowhere else."""
+    known = _symbols(f)
+    rates = {state: parsed(rate, known, f"equation of {state}") for state, rate in f.equations.rates.items()}
+    rate = rates.pop(law.equation)
+    driving = {s.name for s in (*f.states, *f.inputs, *f.input_rates)} | {"t"}
+    elsewhere = set().union(*(e.free_symbols for e in (*rates.values(), *f.observed, *f.late)))
+    masses = {s for m in f.equations.mass.values() for s in parsed(m, known, "mass").free_symbols}
+    found = set()
+    for name, (symbol, parameter) in f.fitted.items():
+        if "." in name or parameter.per or name in held or symbol in elsewhere | masses:
+            continue
+        acts = rate.diff(symbol)
+        if acts != 0 and {s.name for s in acts.free_symbols} & driving <= {law.variable}:
+            found.add(name)
+    return found
+
+
+def _declared_part(
+    system: EquationSystem, law: Along, part: Sequence[str], values: Values, x: Array
+) -> tuple[Array, Array]:
+    """What these parameters make where the law acts beyond their declared values (n,), and by each of them (n, k)."""
+    f = system.formulas
+    rate = parsed(f.equations.rates[law.equation], _symbols(f), f"equation of {law.equation}")
+    numbers = dict(zip(f.numbers, system.numbers(values, system.stretches[0]).tolist(), strict=True))
+    symbols = {n: f.fitted[n][0] for n in part}
+    known = {s: v for s, v in numbers.items() if s not in symbols.values()}
+    variable = sympy.Symbol(law.variable, real=True)
+    own = rate.xreplace(known)
+    own = own - own.xreplace({s: sympy.Float(f.fitted[n][1].value) for n, s in symbols.items()})
+    formulas_ = [own, *(own.diff(s) for s in symbols.values())]
+    here = {s: numbers[s] for s in symbols.values()}
+    simple = [sympy.simplify(e.xreplace(here)) for e in formulas_]
+    found = [np.broadcast_to(np.asarray(sympy.lambdify(variable, e, "numpy")(x), float), x.shape) for e in simple]
+    return found[0], np.reshape(found[1:], (len(part), len(x))).T
+
+
+def _sum_of(system: EquationSystem, law: Along, values: Values, x: Array, part: Sequence[str]) -> Array:
+    """(POINTS,) what known terms, and parameters that moved for them, make where the law acts."""
+    i = system.formulas.equations.states.index(law.equation)
+    absent = {q.name: q.null for c in system.candidates for q in c.quantities}
+    back = absent | {n: system.formulas.fitted[n][1].value for n in part}
+    at, force = [], []
+    plain = {k: v for k, v in values.items() if not k.startswith(f"{NAME}_")}
+    for s, found in zip(system.stretches, system.predictions(plain), strict=True):
+        if found is not None:
+            with_, without = (
+                system._rates(s, system.numbers(v, s), s.time, found.states)[0][:, i] for v in (plain, plain | back)
+            )
+            at.append(_visited(system.with_(stretches=[s]), law.variable, plain)[0])
+            force.append(with_ - without)
+    if not at:
+        return np.full(len(x), np.nan)
+    here, there = np.concatenate(at), np.concatenate(force)
+    number = np.clip(np.round((here - x[0]) / max(x[1] - x[0], 1e-300)), 0, len(x) - 1).astype(int)
+    count, total = np.bincount(number, minlength=len(x)), np.bincount(number, there, minlength=len(x))
+    seen = count > 0
+    return np.asarray(np.interp(x, x[seen], total[seen] / count[seen]), float)
+
+
+def _tied(q: Quantity) -> Quantity:
+    """A parameter that short stretches do not tell stays near what was declared."""
+    return replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
+
+
+def _thinned(system: EquationSystem) -> EquationSystem:
+    """Samples enough for laws to compete."""
+    every = int(sum(len(s.time) for s in system.stretches) / MOST_SAMPLES)
+    turns = min(turn(s) / float(np.median(np.diff(s.time))) for s in system.stretches)
+    every = min(every, int(turns / A_TURN))
+    if every < 2:
+        return system
+    some = []
+    for s in system.stretches:
+        time, data, sigma = (np.ascontiguousarray(column[::every]) for column in (s.time, s.data, s.sigma))
+        some.append(replace(s, time=time, data=data, sigma=sigma))
+    return system.with_(stretches=some)
+
+
+def _shots(system: EquationSystem) -> list[EquationSystem]:
+    """The stretches cut into shorter ones of half a turn, and these joined two by two until they are whole again."""
+    n, stretches = len(system.formulas.states), system.stretches
+    turns = max(float(s.time[-1] - s.time[0]) / (0.5 * turn(s)) for s in stretches)
+    samples = min(len(s.time) for s in stretches) / FEWEST
+    most = max(1.0, min(turns, samples, MOST_STATES / (n * len(stretches))))
+    found = []
+    for level in range(int(np.log2(most)), -1, -1):
+        found.append(system.with_(stretches=[part for s in stretches for part in _cut(s, 2**level)]))
+    return found
+
+
+def _cut(s: Samples, count: int) -> list[Samples]:
+    edges = np.round(np.arange(count + 1) * len(s.time) / count).astype(int)
+    # names are those of the stretch for its first part, and its own for every other
+    return [s.part(int(edges[i]), int(edges[i + 1]), s.stretch + 1000 * i) for i in range(count)]
+
+
+def _joining(values: Values, system: EquationSystem) -> dict[str, float]:
+    """Starts of stretches twice as long, from those that began there."""
+    found = {}
+    for s in system.stretches:
+        number, own = divmod(s.stretch, 1000)
+        if number % 2 == 0:
+            joined = replace(s, stretch=own + 1000 * (number // 2))
+            for state in system.formulas.equations.states:
+                key = f"state.{state}[{s.name}]"
+                if key in values:
+                    found[f"state.{state}[{joined.name}]"] = values[key]
+    return found
+
+
+def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
+    """The answer with the law in place of known terms, and with those that act beside it.
+
+    Where more than noise is left, it is the nearest description.
+    """
+    level = f"{law.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {diagnosis.noise:.3g}"
+    if not law.at_noise:
+        reason = (
+            f"chi-square stays at {diagnosis.before.reduced_chi_square:.3g}, with a law that was learned at {level}"
+        )
+        tried = tuple(_instead(t, ()) for t in diagnosis.tried)
+        return replace(
+            diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,
+            held_out_after=diagnosis.held_out_before, partial=(*law.beside, law.candidate), nearest=law.fit,
+        )  # fmt: skip
+    ahead = diagnosis.held_out_before
+    held_gain = 2 * (law.held_out.log_density - (ahead.log_density if ahead else -np.inf)) / diagnosis.noise
+    gain = (diagnosis.before.cost - law.fit.cost) / diagnosis.noise
+    found = tuple(Found(c, gain, held_gain, 0.0, ()) for c in (*law.beside, law.candidate))
+    own = Tried(law.candidate, gain, gain, held_gain, "chosen")
+    tried = (own, *(_instead(t, law.beside) for t in diagnosis.tried))
+    return replace(
+        diagnosis, verdict="found", reason=f"with a law that no term names, chi-square falls to {level}", found=found,
+        after=law.fit, held_out_after=law.held_out, tried=tried, partial=(), nearest=None,
+    )  # fmt: skip
+
+
+def _instead(tried: Tried, beside: Sequence[Candidate]) -> Tried:
+    if tried.candidate.name in {c.name for c in beside}:
+        return replace(tried, reason="chosen")
+    return replace(tried, reason="the law that was learned describes more") if tried.reason == "chosen" else tried

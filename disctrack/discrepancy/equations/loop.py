@@ -1,0 +1,667 @@
+"""From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
+
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+from scipy.linalg import qr
+
+from calibration.arrays import Array
+from disctrack.discrepancy.equations import terms as library
+from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.discrepancy.equations.expressions import Formula
+from disctrack.discrepancy.equations.formulas import formulas
+from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
+from disctrack.discrepancy.equations.noise import (
+    Remembering,
+    autoregression,
+    fast_part,
+    persistence,
+    step_of,
+    with_noise,
+)
+from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, turn
+from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
+from disctrack.discrepancy.fit import Fit, fit, solve_bounded
+from disctrack.discrepancy.held_out import held_out
+from disctrack.discrepancy.own import Own
+from disctrack.discrepancy.search import (
+    CLASS_GAIN,
+    NOT_CONVERGED,
+    Diagnosis,
+    Found,
+    Rival,
+    Settings,
+    Tried,
+    diagnose,
+)
+from disctrack.discrepancy.shape import refine_shapes
+from disctrack.discrepancy.significance import wald
+from disctrack.discrepancy.system import Quantity, System
+from disctrack.errors import AnalysisError
+
+JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
+SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over the first
+BLUNT = 0.1  # of chi-square, by which a sharper jump may move the motion: numbers then move by 0.3 sigma at most
+REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
+SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
+NO_SENSOR = 5.0  # times the declared noise: nobody knows a sensor so badly
+FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
+SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
+SCANNED = 8  # values along the motion that are tried for a limit
+ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
+NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
+PATIENCE = 60.0  # [s] of a search without a word
+ENOUGH_A_TURN = 40  # samples of a turn: more of them tell little more than the noise of each
+MOST_LED = 2  # terms with which a fit is led anew over growing windows
+ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that no term describes
+USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
+
+
+@dataclass(frozen=True)
+class Answered:
+    """The search's answer with all that it was asked of."""
+
+    diagnosis: Diagnosis
+    system: EquationSystem  # in the stretches that were judged
+    judged: System  # the same with its noise as judged
+    samples: tuple[Samples, ...]  # whole runs
+    notes: tuple[str, ...]
+    memory: Array | None  # (w, order) autoregression of the noise, where it remembers
+    law: LearnedForce | None = None  # where one describes the data: in place of known terms, or beside them
+
+
+def ask(
+    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None,
+    stretch: float | None = None,
+) -> Answered:  # fmt: skip
+    """Fit the equations to the runs and look for what they lack.
+
+    terms : None: the usual ones (`terms.usual`)
+    stretch : [s] after which every run begins anew with a state of its own; None: as far as the model follows
+    """
+    samples: list[Samples] = []
+    with _word_of_patience(samples):
+        return _asked(equations, runs, terms, settings, stretch, samples)
+
+
+@contextmanager
+def _word_of_patience(samples: list[Samples]) -> Iterator[None]:
+    """After a minute, a line on stderr: what makes the search shorter. `samples` may be filled in meanwhile."""
+    timer = threading.Timer(PATIENCE, lambda: print(_shorter(samples), file=sys.stderr, flush=True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _shorter(samples: Sequence[Samples]) -> str:
+    count = sum(len(s.time) for s in samples)
+    text = f"the search goes on after {PATIENCE:.0f} s; there are {count} samples"
+    a_turn = min((min(turn(s), _pace(s)) / float(np.median(np.diff(s.time))) for s in samples), default=0.0)
+    if a_turn > 2 * ENOUGH_A_TURN:
+        every = int(a_turn / ENOUGH_A_TURN)
+        return f"{text}, {a_turn:.0f} a turn. One in {every} tells nearly as much, sooner: Run(time[::{every}], ...)."
+    return f"{text}. A part of the record, or fewer terms, are answered sooner; what they tell can be declared."
+
+
+def _asked(
+    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None, settings: Settings | None,
+    stretch: float | None, read: list[Samples],
+) -> Answered:  # fmt: skip
+    runs = [runs] if isinstance(runs, Run) else list(runs)
+    settings = settings or Settings(unexplained_share=NEARLY)
+    given = checked(equations, runs)
+    if all(fitted_rows(s).all() for s in given):
+        raise AnalysisError("no run keeps samples back to judge the fit: give one of them a smaller fit_until.")
+    channels = equations.channels(runs[0])
+    offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
+    compiled = formulas(equations, offered, channels)
+    samples = with_noise(given)
+    read += samples
+    notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
+    system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
+    system, declared = _prepared(system)
+    start: Start | None = None
+    leading: dict[str, Start] = {}
+    if stretch is None:
+        start = led(system, declared)
+        followed = system.with_(stretches=first_part(system.stretches, start.followed))
+        held, remark = redundant(followed, start.values) if start.followed > 0.0 else ((), "")
+        if held:
+            system, notes = system.with_(held=held), [*notes, remark]
+            start = led(system, declared)
+        if start.followed < min(turn(s) for s in system.stretches):
+            leading = _leading(system, declared)
+            if start.followed == 0.0 and not leading:
+                raise AnalysisError(_not_followed(system, declared))
+            notes.append(_lost_soon(start, leading))
+    if leading:
+        term, way = next(iter(leading.items()))
+        system, diagnosis = _whole(system.with_(promoted=(term,)), (term,), way.values, settings)
+        others = tuple(f.candidate.name for f in diagnosis.found[1:])
+        if others and _wald(diagnosis.found[0].candidate.names, diagnosis.after) <= diagnosis.found[0].threshold:
+            # it led to those that take its place
+            values = _without(diagnosis.after.values, (term,))
+            leading = {others[0]: replace(way, values=values)}
+            system, diagnosis = _whole(system.with_(promoted=others), others, values, settings)
+            notes[-1] = f"the fit goes by way of {term}, which is nothing beside what was found"
+        if diagnosis.found[0].gain > diagnosis.found[0].threshold:
+            diagnosis = _with_equals(system, diagnosis, leading)
+        else:  # it showed the way, no more: from where it leads the equations follow by themselves
+            notes[-1] = f"the fit goes by way of {term}: without it, growing windows lose the data on the way"
+            values = diagnosis.before.values
+            system, diagnosis = _searched(_sized(system, values), values, settings)
+    else:
+        system, diagnosis, more = _as_far_as_followed(system, declared, start, settings, stretch)
+        notes += more
+    if not np.isfinite(diagnosis.before.chi_square):
+        raise AnalysisError(
+            "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
+            "at a stiff contact. Write the contact wider, or cut the data into runs without it."
+        )
+    if start is not None and not start.whole and not leading and diagnosis.found:
+        system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
+        notes.append(remark)
+    judged: System = diagnosis.judged or system
+    memory = None
+    if settings.noise is None:
+        sensor_known = all(np.isfinite(s.sigma).all() for s in given)
+        again, memory, remark = _with_memory(system, diagnosis, settings, sensor_known)
+        if again is not None:
+            diagnosis, judged = again, again.judged or judged
+            notes.append(remark)
+    law = _law(system, diagnosis, channels, judged)
+    if law is not None and law.system is not None and law.is_named(diagnosis):
+        judged = law.system if judged is system else getattr(judged, "over", lambda s: s)(law.system)
+        system, diagnosis = law.system, with_law(diagnosis, law)
+        if law.at_noise:
+            notes = [n for n in notes if not n.startswith(ERROR_THAT_LASTS)]
+    elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
+        diagnosis, shapes = refine_shapes(judged, diagnosis)
+        notes += list(shapes)
+    return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory, law)
+
+
+def _law(
+    system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System
+) -> LearnedForce | None:
+    """A law of one variable where known terms leave something, or where it takes several of them to describe it."""
+    if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
+        return None
+    return learn(system, diagnosis, channels, None if judged is system else judged)
+
+
+def _as_far_as_followed(
+    system: EquationSystem, declared: Mapping[str, float], start: Start | None, settings: Settings,
+    stretch: float | None,
+) -> tuple[EquationSystem, Diagnosis, list[str]]:  # fmt: skip
+    """The search over whole runs, or over stretches as long as the model follows them; and a note that says so."""
+    values: Mapping[str, float] = declared if start is None else start.values
+    notes = []
+    if start is None or not start.whole:
+        length = stretch or (SAFE * start.followed if start else np.inf)
+        system, values, note = _in_stretches(system, values, length)
+        notes.append(note)
+    if not np.isfinite(system.linearise(values, [])[0]).all():
+        raise AnalysisError(_not_followed(system, values))
+    return *_searched(_sized(system, values), values, settings), notes
+
+
+def _searched(
+    system: EquationSystem, values: Mapping[str, float], settings: Settings
+) -> tuple[EquationSystem, Diagnosis]:
+    """The engine's search, with jumps as sharp as the motion asks, and limits where they tell most."""
+    system = _aimed(system, values)
+    scans = SCANNED * len(system.formulas.along)
+    if scans:  # each value that was looked at is a chance more
+        share = len(system.candidates) / (len(system.candidates) + scans)
+        settings = replace(settings, false_alarm=settings.false_alarm * share)
+    diagnosis = diagnose(system, values, settings, system.training)
+    if (anew := _led_with_terms(system, diagnosis)) is not None:
+        diagnosis = diagnose(system, diagnosis.before.values, settings, system.training, anew)
+    sharper = _sharp_enough(system, diagnosis.after)
+    if sharper is system:
+        return system, diagnosis
+    return sharper, diagnose(sharper, diagnosis.before.values, settings, sharper.training, diagnosis)
+
+
+def _led_with_terms(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis | None:
+    """A better description with a term whose refit did not converge: led to it over growing windows; None: none is.
+
+    Of an arm that friction stops, no step leads from a motion that goes on for ever to the instant at which it stops.
+    """
+    if diagnosis.verdict != "unexplained" or diagnosis.found:
+        return None
+    stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
+    best, lowest = None, (diagnosis.nearest or diagnosis.before).cost
+    for t in sorted(stuck, key=lambda t: -t.score)[:MOST_LED]:
+        promoted = system.with_(promoted=(*system.promoted, t.candidate.name))
+        fitted = fit(promoted, promoted.base, led(promoted, guessed(system)[0]).values)
+        if fitted.converged and fitted.cost < lowest:
+            best, lowest = replace(diagnosis, partial=(t.candidate,), nearest=fitted), fitted.cost
+    return best
+
+
+def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
+    """With a start for every term that has a number to be tried along the motion, where it explains most."""
+    f = system.formulas
+    if not f.along:
+        return system
+    passed: list[list[Array]] = []
+    for s, motion in zip(system.stretches, system.predictions(values), strict=True):
+        if motion is not None:
+            p = system.numbers(values, s)
+            found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
+            passed.append([np.broadcast_to(x, s.time.shape) for x in found])
+    own = Own(system, system.base)
+    names = [q.name for q in system.base if not q.slot]
+    amounts = {c.name: c for c in system.with_(aims={}).candidates if any(n.startswith(f"{c.name}.") for n in f.along)}
+    best: dict[str, tuple[float, dict[str, float]]] = {}
+    # a term that every fit has keeps its limit: without an aim no fit would move it
+    kept = {n: v for n, v in system.aims.items() if n.partition(".")[0] in system.promoted}
+    for share in (np.arange(SCANNED) + 0.5) / SCANNED:
+        tried = {}
+        for i, name in enumerate(f.along):
+            value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
+            bounds = f.fitted[name][1]
+            tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
+        there = system.with_(aims=kept | tried)
+        asked = [*names, *(n for c in amounts.values() for n in c.names)]
+        residual, derivative = there.linearise(values, [*own.slots, *asked])
+        if not np.isfinite(derivative).all():
+            continue
+        right, matrix, _ = own.reduced(residual, derivative, values)
+        for c in amounts.values():
+            mine = [asked.index(n) for n in c.names]
+            gain, amounts_there = _first_order(right, matrix[:, : len(names)], matrix[:, mine], c.quantities)
+            if gain > best.get(c.name, (0.0, {}))[0]:
+                limits = {n: v for n, v in tried.items() if n.startswith(f"{c.name}.")}
+                best[c.name] = gain, limits | dict(zip(c.names, amounts_there.tolist(), strict=True))
+    return system.with_(aims=kept | {n: v for _, aims in best.values() for n, v in aims.items()})
+
+
+def _first_order(right: Array, base: Array, columns: Array, quantities: Sequence[Quantity]) -> tuple[float, Array]:
+    """Gain of chi-square when these quantities are fitted beside the base, within their bounds; and their values."""
+    free = np.full(base.shape[1], np.inf)
+    lower, upper = ([getattr(q, side) - q.null for q in quantities] for side in ("lower", "upper"))
+    both = np.column_stack([base, columns])
+    step = solve_bounded(right, both, np.concatenate([-free, lower]), np.concatenate([free, upper]))
+    without = right - base @ solve_bounded(right, base, -free, free)
+    values = step[base.shape[1] :] + np.array([q.null for q in quantities])
+    return float(without @ without - np.sum((right - both @ step) ** 2)), values
+
+
+def _leading(system: EquationSystem, values: Mapping[str, float]) -> dict[str, Start]:
+    """Terms with which the model follows to their end data that it loses within a turn; best first."""
+    ways = {c.name: led(system.with_(promoted=(c.name,)), dict(values)) for c in system.candidates}
+    left = {name: misfit(system, way.values) for name, way in ways.items() if way.whole}
+    return {name: ways[name] for name in sorted(left, key=lambda name: left[name])}
+
+
+def _lost_soon(start: Start, leading: Mapping[str, Start]) -> str:
+    text = f"the model loses the data after {start.followed:.2g} s, less than a turn"
+    if leading:
+        return f"{text}; with {' or '.join(leading)} it follows them to their end: {next(iter(leading))} does so best"
+    return f"{text}: sizes of terms mean little"
+
+
+def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
+    """With sizes of states and widths of jumps read off the data, and initial states."""
+    values, sizes = guessed(system)
+    system = system.with_(sizes=sizes)
+    return system.with_(widths=_widths(system, _along_guess(system, values, sizes))), values
+
+
+def _along_guess(system: EquationSystem, values: Mapping[str, float], sizes: Array) -> list[tuple[Samples, Array]]:
+    """States of the size that the data show, in place of a motion that is not known yet."""
+    s = system.stretches[0]
+    phase = 2 * np.pi * np.arange(64) / 64
+    return [(s, np.sqrt(2) * sizes * np.cos(phase[:, None] + np.arange(len(sizes))))]
+
+
+def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> dict[str, float]:
+    """Of every jump, from the rms of what jumps along these motions."""
+    f = system.formulas
+    square, count = np.zeros(len(f.widths)), 0
+    for s, states in along:
+        t, p = np.linspace(s.time[0], s.time[-1], len(states)), system.numbers({}, s)
+        with np.errstate(all="ignore"):
+            arguments = f.jump_arguments(t, list(states.T), p, system.inputs_of(s, t))
+        square += [float(np.nansum(np.broadcast_to(a, t.shape) ** 2)) for a in arguments]
+        count += len(states)
+    size = np.sqrt(square / max(count, 1))
+    return {w.name: JUMP * (x or 1.0) for w, x in zip(f.widths.values(), size, strict=True)}
+
+
+def _sharp_enough(system: EquationSystem, fitted: Fit) -> EquationSystem:
+    """With jumps so sharp that sharper ones would move the motion by nothing that matters; mostly as it is.
+
+    A thousandth of what jumps is much where a ball's contact is as short, or where a motion starts from rest.
+    """
+    first, share = system.widths, 1.0
+    if not first or not np.isfinite(fitted.chi_square):
+        return system
+    residual = system.linearise(fitted.values, [])[0]
+    while share > SHARPEST:
+        share *= SHARPER
+        sharper = system.with_(widths={name: share * w for name, w in first.items()})
+        moved = residual - (residual := sharper.linearise(fitted.values, [])[0])
+        if np.sum(moved**2) < BLUNT * max(1.0, fitted.reduced_chi_square):
+            break
+        system = sharper
+    return system
+
+
+def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
+    """With sizes and widths of the motion as fitted, and what each term's numbers would typically be."""
+    found = [(s, m) for s, m in zip(system.stretches, system.predictions(values), strict=True) if m is not None]
+    if not found:
+        return system
+    sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
+    system = system.with_(sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
+    return system.with_(typical=_typical(system, values))
+
+
+def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, float]:
+    f = system.formulas
+    n_fitted = len(f.fitted)
+    own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
+    shown, seen = np.zeros(len(f.channels)), np.zeros((len(f.channels), n_fitted))
+    for s in system.stretches:
+        rates, by_number, h, H_p = system.along(values, s)
+        own += np.sum(rates**2, axis=0)
+        acting += np.sum(by_number[..., :n_fitted] ** 2, axis=0)
+        shown += np.sum((h - h.mean(axis=0)) ** 2, axis=0)
+        seen += np.sum(H_p[..., :n_fitted] ** 2, axis=0)
+    found = {}
+    for i, name in enumerate(f.fitted):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sizes = np.concatenate([np.sqrt(own / acting[:, i]), 0.1 * np.sqrt(shown / seen[:, i])])
+        sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+        if "." in name and sizes.size:
+            found[name] = USUAL_SHARE * float(sizes.min())
+    return found
+
+
+def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tuple[str, ...], str]:
+    """Parameters that the data cannot part from others, to be held as declared; and how to say that."""
+    # of many runs with numbers of their own a few tell it
+    system = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
+    states = [q for q in system.base if q.name.startswith("state.")]
+    free = [q for q in system.base if not q.name.startswith("state.") and np.isinf(q.prior_sigma)]
+    own = Own(system, states)
+    states = [q for q in states if not q.slot]
+    residual, derivative = system.linearise(values, [*own.slots, *(q.name for q in (*states, *free))])
+    if len(free) < 2 or not np.isfinite(derivative).all():
+        return (), ""
+    _, matrix, _ = own.reduced(residual, derivative, values)
+    k = len(states)
+    basis = np.linalg.qr(matrix[:, :k] / np.maximum(np.linalg.norm(matrix[:, :k], axis=0), 1e-300))[0]
+    size = np.array([max(abs(values.get(q.name, q.null)), q.scale) for q in free])
+    before = size * np.linalg.norm(derivative[..., -len(free) :], axis=(0, 1))
+    columns = matrix[:, k:] * size
+    cleared = columns - basis @ (basis.T @ columns)
+    shares, stems = cleared / np.where(before > 0, before, 1.0), np.array([q.name.partition("[")[0] for q in free])
+    weak: list[str] = []
+    while (left := np.flatnonzero(~np.isin(stems, weak))).size:
+        _, R, order = qr(shares[:, left], mode="economic", pivoting=True)
+        open_ = [str(stems[left[j]]) for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
+        if not open_:
+            break
+        weak.append(max(reversed(open_), key=open_.count))  # runs may leave one or the other of two open
+    if not weak:
+        return (), ""
+    names, others = sorted(weak), sorted(set(stems.tolist()) - set(weak))
+    return tuple(names), (
+        f"{', '.join(names)} cannot be told from {', '.join(others) or 'the initial states'} with these data and "
+        f"{'is' if len(names) == 1 else 'are'} held as declared; values of the others hold for that"
+    )
+
+
+def _in_stretches(
+    system: EquationSystem, values: Mapping[str, float], length: float
+) -> tuple[EquationSystem, dict[str, float], str]:
+    """The runs cut where the model loses them, each stretch with a start of its own."""
+    pieces = cut(system.stretches, length)
+    chosen = spread(pieces, len(system.formulas.states), at_least=len(system.stretches))
+    system = system.with_(stretches=chosen)
+    shared = {k: v for k, v in values.items() if not k.startswith("state.")}
+    guesses, _ = guessed(system)
+    start = led(system, shared | guesses)
+    text = f"runs are taken in {len(pieces)} stretches of {length:.3g} s with an initial state each"
+    if len(chosen) < len(pieces):
+        text += f", of which {len(chosen)} spread over the runs are used"
+    return system, start.values, text
+
+
+def _joined(
+    system: EquationSystem, samples: Sequence[Samples], diagnosis: Diagnosis, settings: Settings
+) -> tuple[EquationSystem, Diagnosis, str]:
+    """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
+    names = tuple(f.candidate.name for f in diagnosis.found)
+    whole = system.with_(stretches=samples, promoted=names)
+    # a run's first stretch begins where the run does, under the same name
+    start = led(whole, guessed(whole)[0] | diagnosis.after.values)
+    if not start.whole:
+        return system, diagnosis, f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"
+    plain, merged = _whole(whole, names, start.values, settings, diagnosis)
+    return plain, merged, "with what was found the model follows the whole runs, and they are judged whole"
+
+
+def _whole(
+    whole: EquationSystem, names: tuple[str, ...], values: Mapping[str, float], settings: Settings,
+    stretches: Diagnosis | None = None,
+) -> tuple[EquationSystem, Diagnosis]:  # fmt: skip
+    """Whole runs, judged with terms that the model cannot follow them without.
+
+    stretches : where those terms were found, if not for that reason alone
+    """
+    whole, rest = _searched(_sized(whole, values), values, settings)
+    plain = whole.with_(promoted=())
+    before = fit(plain, plain.base, _without(rest.before.values, names))
+    held = held_out(plain, plain.base, before.values, plain.training)
+    found, tried = [], list(rest.tried)
+    for c in (c for c in plain.candidates if c.name in names):
+        smaller = whole.with_(promoted=tuple(n for n in names if n != c.name))
+        without = fit(smaller, smaller.base, _without(rest.before.values, (c.name,)))
+        gain = float((without.cost - rest.before.cost) / rest.noise)
+        ahead = rest.held_out_before.log_density if rest.held_out_before else -np.inf
+        limit = float(stats.chi2.isf(settings.false_alarm / len(plain.candidates), len(c.quantities)))
+        found.append(Found(c, gain, float(2 * (ahead - held.log_density) / rest.noise), limit, ()))
+        tried.insert(0, Tried(c, gain, gain, found[-1].held_out_gain, "chosen"))
+    if stretches is not None:
+        known = {f.candidate.name: f for f in stretches.found}
+        found, tried = [replace(known[f.candidate.name], gain=f.gain) for f in found], list(stretches.tried)
+    return plain, replace(
+        rest, verdict="found" if rest.verdict == "nothing missing" else rest.verdict, found=(*found, *rest.found),
+        before=before, held_out_before=held, tried=tuple(tried), reason=f"over the whole runs {rest.reason}",
+    )  # fmt: skip
+
+
+def _with_equals(system: EquationSystem, diagnosis: Diagnosis, leading: Mapping[str, Start]) -> Diagnosis:
+    """Which of the other terms that lead to the end describe the data as well as the one that was taken?"""
+    first, *others = diagnosis.found
+    rivals = []
+    for c in (c for c in system.candidates if c.name in list(leading)[1:]):
+        names = (c.name, *(f.candidate.name for f in others))
+        whole = system.with_(promoted=names)
+        values = _without(diagnosis.after.values, (first.candidate.name,)) | leading[c.name].values
+        fitted = fit(whole, whole.base, values)
+        loss = (fitted.cost - diagnosis.after.cost) / diagnosis.noise
+        if fitted.converged and loss < CLASS_GAIN:
+            ours, theirs = (
+                system.linearise(diagnosis.before.values, [])[0] - system.linearise(f.values, [])[0]
+                for f in (diagnosis.after, fitted)
+            )
+            cosine = np.sum(ours * theirs) / (np.linalg.norm(ours) * np.linalg.norm(theirs))
+            rivals.append(Rival(c, float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(loss), fitted))
+    return replace(diagnosis, found=(replace(first, cannot_be_told_from=tuple(rivals)), *others))
+
+
+def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, float]:
+    """Values in which these terms' numbers are absent."""
+    return {k: v for k, v in values.items() if k.partition(".")[0] not in terms}
+
+
+def _with_memory(
+    system: EquationSystem, diagnosis: Diagnosis, settings: Settings, sensor_known: bool
+) -> tuple[Diagnosis | None, Array | None, str]:
+    """Search again with noise that remembers, where what is left of the best model does.
+
+    sensor_known : all noise was declared; what is left may be larger than that, but not as it pleases
+    """
+    if diagnosis.held_out_before is None:
+        return None, None, ""
+    residual, _ = system.linearise(diagnosis.after.values, [])
+    present = np.zeros(residual.shape, bool)
+    for rows, s in zip(system.rows, system.stretches, strict=True):
+        present[rows] = np.isfinite(s.data)
+    coefficients, share = autoregression(residual, present, system.rows)
+    if not coefficients.any():
+        return None, None, ""
+    size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
+    lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
+    shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
+    # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
+    as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
+    as_noise &= not (sensor_known and size > NO_SENSOR)
+    remembering = Remembering(system, system.rows, coefficients, present)
+    base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
+    if diagnosis.verdict == "unexplained" and (base is None or not base.converged):
+        block = max(2 * shortest_turn, 5 * lasting)
+        reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
+        spread = replace(_certain(system, diagnosis, block), reason=reason)
+        text = f"{ERROR_THAT_LASTS} ({block:.2g} s taken as one error), not of the noise alone"
+        return spread, None, text
+    if base is None or not base.converged:
+        return None, None, ""
+    noise = float(share * size**2)
+    scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
+    known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
+    again = diagnose(remembering, base.values, known, system.training, diagnosis)
+    order = int(np.max(np.nonzero(coefficients)[1])) + 1
+    text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
+    return replace(again, judged=again.judged or remembering), coefficients, text
+
+
+def _pace(s: Samples) -> float:
+    """Turn [s] of the oscillation that would lose its memory as fast as the data do, which an input may drive at will.
+
+    Of such data the strongest line is the slowest, and says nothing of how fast they change.
+    """
+    rows = np.isfinite(s.data)
+    away = np.where(rows, (s.data - np.nanmean(s.data, axis=0)) / s.sigma, 0.0)
+    return persistence(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
+
+
+def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diagnosis:
+    """Sigmas as what is left makes them, and of what was found only what stands out from them (Wald's test)."""
+    found, after = diagnosis.found, robust(system, diagnosis.after, block)
+    while found:
+        gains = {f.candidate.name: _wald(f.candidate.names, after) for f in found}
+        certain = tuple(f for f in found if gains[f.candidate.name] > f.threshold)
+        if len(certain) == len(found):
+            found = tuple(replace(f, gain=gains[f.candidate.name]) for f in found)
+            break
+        found = certain
+        kept = {n for f in found for n in f.candidate.names}
+        if not found:  # what the others made of themselves beside terms that are gone again leads nowhere
+            after = robust(system, diagnosis.before, block)
+            break
+        start = {k: v for k, v in after.values.items() if k in kept or "." not in k or k.startswith("state.")}
+        quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
+        fits = [fit(system, quantities, values) for values in (start, diagnosis.before.values)]
+        after = robust(system, min(fits, key=lambda f: f.cost), block)
+    names = {f.candidate.name for f in found}
+    if diagnosis.found and not found:  # none of them is certain, but it is they that describe the data best
+        partial = tuple(f.candidate for f in diagnosis.found)
+        diagnosis = replace(diagnosis, partial=partial, nearest=robust(system, diagnosis.after, block))
+    tried = tuple(
+        replace(t, reason="does not stand out from what is left")
+        if t.reason == "chosen" and t.candidate.name not in names
+        else t
+        for t in diagnosis.tried
+    )
+    return replace(
+        diagnosis,
+        found=found,
+        before=robust(system, diagnosis.before, block),
+        after=after,
+        held_out_after=held_out(system, after.quantities, after.values, system.training),
+        tried=tried,
+    )
+
+
+def _wald(names: Sequence[str], fitted: Fit) -> float:
+    """Square of the distance from nought in standard deviations, of numbers that move together."""
+    here = [fitted.shared.index(n) for n in names]
+    return wald(np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(here, here)])
+
+
+def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
+    """The fit with the covariance that its own residual brings about, errors within `block` [s] taken together.
+
+    The sandwich of Huber and White over blocks: what is left need be neither white nor as large as stated. The fit
+    bends as many sums over blocks to nought as it has numbers: data that hold too few blocks are cut into shorter ones,
+    which are then taken as wholly alike for as long as an error lasts (the largest that their sum can be).
+    """
+    own = Own(system, fitted.quantities)
+    names = fitted.shared
+    residual, full = system.linearise(fitted.values, [*own.slots, *names])
+    heads = own.reduced(residual, full, fitted.values)[2]
+    derivative = own.cleared(full, heads)
+    length = np.linalg.norm(derivative.reshape(-1, len(names)), axis=0)
+    scale = np.where(length > 0, length, 1.0)
+    J = derivative / scale
+    normal = np.einsum("nwi,nwj->ij", J, J)
+    duration = sum(float(np.ptp(system.time[rows])) for rows in system.rows)
+    cut = min(block, duration / (ENOUGH * len(fitted.names)))
+    parts = [
+        [np.flatnonzero(number == b) + rows.start for b in np.unique(number)]
+        for rows in system.rows
+        for number in [((system.time[rows] - system.time[rows.start]) / cut).astype(int)]
+    ]
+    S = np.array([np.einsum("nwi,nw->i", J[here], residual[here]) for of_run in parts for here in of_run])
+    few = len(S) / max(len(S) - len(fitted.names), 1)
+    alike = min(block, duration) / cut
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    spread = few * alike * inverse @ (S.T @ S) @ inverse / np.outer(scale, scale)
+    free = np.diag(fitted.covariance) > 0
+    size, spread_heads = np.sqrt(few * alike), []
+    for of_block, head in zip(own.blocks, heads, strict=True):
+        of_own = [
+            np.einsum("nwi,nw->i", full[here][..., of_block.columns], residual[here])
+            for here in parts[of_block.quantities[0].block]
+        ]
+        # what errors do to both own and shared numbers at once is left out here
+        spread_heads.append(replace(head, root=size * head.root @ (head.root.T @ np.array(of_own).T)))
+    spread = np.where(np.outer(free, free), spread, 0.0)
+    return replace(fitted, covariance=spread, heads=tuple(spread_heads), own=own.known(spread_heads))
+
+
+def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
+    lost = misfit(system, dict(values))
+    what = "is nothing like the data"
+    if not np.isfinite(lost):
+        what = "has no value somewhere on the way (the root of a negative number, a division by zero, no end of growth)"
+    guess = ", ".join(f"{k.partition('.')[2]} = {v:.4g}" for k, v in list(values.items())[:4] if k.startswith("state."))
+    return (
+        f"the model does not follow the data even over a short time (residual over {LOST:.0%} of the signal): "
+        f"as declared it {what}. Guessed start: {guess}. Check signs and units of the equations, declare parameters "
+        "nearer to the truth, or give Run(start={...})."
+    )
+
+
+def _step_note(samples: Sequence[Samples], channel: int, name: str) -> str:
+    values = [s.data[:, channel] for s in samples if np.isnan(s.sigma[:, channel]).any()]
+    if not values or not (step := step_of(values)):
+        return ""
+    text = f"{name} stands on steps of {step:.4g}, which alone scatter by {step / np.sqrt(12):.3g}"
+    return text if fast_part(values) < 3 * step else ""

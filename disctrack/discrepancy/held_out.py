@@ -1,0 +1,115 @@
+"""Fit on the first part, free run over the rest: the judge that a flexible model cannot flatter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.arrays import Array, Mask
+from disctrack.discrepancy.fit import Fit, fit, triangle
+from disctrack.discrepancy.own import Head, Own
+from disctrack.discrepancy.score import INVISIBLE, cleared, span
+from disctrack.discrepancy.system import Quantity, Subset, System, Values
+
+TRAIN_FRACTION = 0.65  # of the time
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Prediction of samples that the fit has not seen."""
+
+    train: Fit
+    test_rows: Mask  # (n,)
+    chi_square: float  # of the free run on the test rows; infinite where it ends too early
+    expected: float  # what noise and the fitted quantities' uncertainty make of it
+    log_density: float  # of the test data under the predictive distribution (up to a constant)
+    n_data: int
+
+    @property
+    def ratio_to_floor(self) -> float:
+        """Rms of the free run's residual over what noise and uncertainty of the fit allow; 1 is perfect."""
+        return float(np.sqrt(self.chi_square / self.expected)) if self.expected > 0 else float("nan")
+
+
+def training_rows(system: System, fraction: float = TRAIN_FRACTION) -> Mask:
+    """(n,) True in the first part of the time that has data."""
+    seen = system.time[system.weights > 0]
+    return np.asarray(system.time <= seen[0] + fraction * (seen[-1] - seen[0]), bool)
+
+
+def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows: Mask) -> HeldOut:
+    """Fit on `rows`, then predict the others from that fit alone.
+
+    The predictive distribution of the test data is normal with covariance 1 + J P J^T (P: covariance of the fit), so
+    that a quantity which the first part leaves open is not punished for it. Of quantities that a block of rows has of
+    its own and that the first part says nothing of (those of a run that is kept back), what they cannot move is judged.
+    """
+    train = fit(Subset(system, rows), quantities, start)
+    test = ~rows & (system.weights > 0)
+    own = Own(system, train.quantities)
+    kept = [b for b in own.blocks if test[b.rows].any() and not (rows & (system.weights > 0))[b.rows].any()]
+    if kept:  # near their best values the prediction is linear in them
+        alone = np.zeros(len(test), bool)
+        alone[np.concatenate([b.rows for b in kept])] = True
+        theirs = fit(Subset(system, alone), [q for b in kept for q in b.quantities], train.values)
+        train = replace(train, values=theirs.values)
+    residual, derivative = system.linearise(train.values, [*own.slots, *train.shared])
+    n_data = int(np.sum(system.weights[test]))
+    finite = np.isfinite(residual[test]).all() and np.isfinite(derivative[test]).all()
+    if not finite or len(train.heads) < len(own.blocks):
+        return HeldOut(train, test, np.inf, float(n_data), -np.inf, n_data)
+    root = _square_root(train.covariance)
+    k = root.shape[1]
+    # B: the prediction's derivative by independent numbers of variance one that make up what the fit leaves open
+    both = np.zeros((*residual.shape, k + 1))
+    m, w = int(np.sum(test)), residual.shape[1]
+    by_shared = own.cleared(derivative, train.heads)[test].reshape(m * w, k)
+    both[test, :, :k], both[test, :, k] = (by_shared @ root).reshape(m, w, k), residual[test]
+    parts = [both[own.rest][test[own.rest]].reshape(-1, k + 1)]
+    foretold, log_determinant, spread = [parts[0]], 0.0, 0.0
+    for block, head in zip(own.blocks, train.heads, strict=True):
+        here = block.rows[test[block.rows]]
+        part, J = both[here].reshape(-1, k + 1), derivative[here][..., block.columns].reshape(-1, len(block.columns))
+        if block in kept:  # of what is known beforehand, that is the expectation
+            known = [np.isfinite(q.prior_sigma) for q in block.quantities]
+            away = [train.values[q.name] - q.null for q in block.quantities]
+            part[:, k] += J @ np.where(known, away, 0.0)
+        part, R, B, free = _beside_own(part, J, head)
+        n_data -= free
+        spread += float(np.sum(B * B))
+        log_determinant += float(np.sum(np.log(np.abs(np.diag(R)[: B.shape[1]]))))
+        foretold.append(R[B.shape[1] :, B.shape[1] :])
+        parts.append(part)
+    everything, whitened = np.concatenate(parts), np.concatenate(foretold)
+    R = _over_ones(whitened[:, :k], whitened[:, k:])
+    quadratic = R[k, k] ** 2 if R.shape[0] > k else 0.0
+    log_density = -0.5 * (quadratic + 2 * (np.sum(np.log(np.abs(np.diag(R)[:k]))) + log_determinant))
+    expected = n_data + spread + float(np.sum(everything[:, :k] ** 2))
+    return HeldOut(train, test, float(np.sum(everything[:, k] ** 2)), expected, float(log_density), n_data)
+
+
+def _beside_own(part: Array, J: Array, head: Head) -> tuple[Array, Array, Array, int]:
+    """Rows (m, k + 1) of a block without what its own quantities may be; R of them beside the own ones; these; number.
+
+    J : (m, p) by the own quantities. What nothing that was fitted determines (all of a run that is kept back) may be
+    what it likes and is cleared; the others are as uncertain as the fit leaves them.
+    """
+    open_, largest = J @ head.open, np.linalg.norm(J, axis=0) @ np.abs(head.open)
+    free = span(open_[:, np.linalg.norm(open_, axis=0) > INVISIBLE * largest])
+    part, B = cleared(part, free), cleared(J @ head.root, free)
+    return part, _over_ones(B, part), B, free.shape[1]
+
+
+def _over_ones(B: Array, others: Array) -> Array:
+    """R of [B, others] over [1, 0]: the squares of B, which a run-away motion would make singular, are never formed."""
+    ones = np.eye(B.shape[1], B.shape[1] + others.shape[1])
+    return triangle(np.concatenate([np.concatenate([B, others], axis=1), ones]))
+
+
+def _square_root(covariance: Array) -> Array:
+    if covariance.size == 0:  # a model without quantities
+        return covariance
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(scale > 0, scale, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    return np.asarray(safe[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)), float)

@@ -1,0 +1,167 @@
+"""Score test: what each effect would gain, and which effects look alike, from one linearisation.
+
+Every candidate's derivative columns are cleared of what the fitted quantities can absorb. To first order the best
+value, its sigma and the gain in chi-square follow from inner products, so that a whole catalogue costs one fit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from calibration.arrays import Array
+from disctrack.discrepancy.fit import Fit, compress, prior_rows, solve_bounded
+from disctrack.discrepancy.nuisances import is_linear, projection
+from disctrack.discrepancy.own import Own
+from disctrack.discrepancy.system import Candidate, Quantity, System
+
+DEPENDENT = 1e-9  # singular value over the largest, below which columns are combinations of the others
+INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
+
+
+@dataclass(frozen=True)
+class Score:
+    """First-order answer for one candidate."""
+
+    candidate: Candidate
+    values: Array  # (k,) best values within bounds
+    sigma: Array  # (k,) standard deviations; infinite where the data do not see the quantity
+    gain: float  # decrease of chi-square
+    visible: bool
+
+
+class Linearisation:
+    """All derivatives at one fit, compressed: residual and columns by name, priors included."""
+
+    def __init__(self, system: System, fit: Fit, candidates: Sequence[Candidate]) -> None:
+        """Linearise at the fit for its own quantities and for those of all candidates.
+
+        A candidate may free what the fit holds within a prior: its column then stands beside that of the fit.
+        """
+        known = {q.name: q for q in fit.quantities}
+        of_candidates = {q.name: q for c in candidates for q in c.quantities}
+        new = {n: q for n, q in of_candidates.items() if n not in known or _frees(q, known[n])}
+        common = projection(system, fit.quantities, fit.values)
+        own = Own(system, fit.quantities)
+        self.fitted = tuple(q for q in fit.quantities if not (is_linear(q) or q.slot))
+        values = {name: q.null for name, q in new.items()} | fit.values
+        values |= dict(zip(common.names, common.null.tolist(), strict=True))
+        names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
+        residual, derivative = system.linearise(values, [*own.slots, *names])
+        if own.blocks:
+            right, matrix, _ = own.reduced(residual, derivative, values)
+        else:
+            right, matrix = compress(residual, derivative, common)
+        everything = [*self.fitted, *new.values()]
+        prior, prior_matrix = prior_rows(everything, values)
+        self.right = np.concatenate([right, prior])
+        self.matrix = np.vstack([matrix[:, [names.index(q.name) for q in everything]], prior_matrix])
+        self.column = {q.name: i for i, q in enumerate(everything)}  # of what is there twice, the free one
+        self.quantities = {q.name: q for q in everything}
+        self.values = values | {name: q.null for name, q in new.items()}
+        self._at = np.array([*(values[q.name] for q in self.fitted), *(q.null for q in new.values())])
+        self._free = self._free_columns()
+        self._basis = np.linalg.qr(_normalised(self.matrix[:, self._free]))[0]
+
+    def _free_columns(self) -> list[int]:
+        return [i for i, q in enumerate(self.fitted) if q.lower < self._at[i] < q.upper]
+
+    def columns(self, names: Sequence[str]) -> Array:
+        """Columns (m, k) as they are."""
+        return self.matrix[:, [self.column[n] for n in names]]
+
+    def cleared(self, columns: Array) -> Array:
+        """Columns without what the fitted quantities can absorb."""
+        return cleared(columns, self._basis)
+
+    def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
+        """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
+        mine = [self.column[n] for n in names]
+        fitted = [i for i in range(len(self.fitted)) if i not in mine]
+        A, x0 = self.matrix[:, [*fitted, *mine]], self._at[[*fitted, *mine]]
+        quantities = [*(self.fitted[i] for i in fitted), *(self.quantities[n] for n in names)]
+        lower = np.array([q.lower for q in quantities]) - x0
+        upper = np.array([q.upper for q in quantities]) - x0
+        step = solve_bounded(self.right, A, lower, upper)
+        gain = self.right @ self.right - np.sum((self.right - A @ step) ** 2)
+        return float(max(gain, 0.0)), (x0 + step)[len(fitted) :]
+
+
+def _frees(q: Quantity, fitted: Quantity) -> bool:
+    return not np.isfinite(q.prior_sigma) and bool(np.isfinite(fitted.prior_sigma))
+
+
+def cleared(columns: Array, basis: Array) -> Array:
+    """Columns (m,) or (m, k) without what an orthonormal basis (m, b) can absorb."""
+    for _ in range(2):  # twice is enough (Kahan): the first pass leaves rounding of the size of what it removes
+        columns = columns - basis @ (basis.T @ columns)
+    return columns
+
+
+def span(columns: Array) -> Array:
+    """(m, b) orthonormal basis of what columns (m, k) of any sizes span."""
+    length = np.linalg.norm(columns, axis=0)
+    U, singular, _ = np.linalg.svd(columns[:, length > 0] / length[length > 0], full_matrices=False)
+    return np.asarray(U[:, singular > DEPENDENT * singular[0]] if singular.size else U, float)
+
+
+def _normalised(columns: Array) -> Array:
+    length = np.linalg.norm(columns, axis=0)
+    return columns / np.where(length > 0, length, 1.0)
+
+
+def score(linear: Linearisation, candidate: Candidate) -> Score:
+    """Gain, values and sigmas of one candidate to first order."""
+    columns = linear.columns(candidate.names)
+    cleared = linear.cleared(columns)
+    before, after = np.linalg.norm(columns, axis=0), np.linalg.norm(cleared, axis=0)
+    visible = bool((after > INVISIBLE * np.maximum(before, 1e-300)).any() and (after > 0).any())
+    k = len(candidate.names)
+    if not visible:
+        return Score(candidate, np.full(k, np.nan), np.full(k, np.inf), 0.0, False)
+    gain, values = linear.gain_of(candidate.names)
+    return Score(candidate, values, _sigmas(cleared, before), gain, True)
+
+
+def _sigmas(cleared: Array, before: Array) -> Array:
+    length = np.where(before > 0, before, 1.0)
+    normal = (cleared / length).T @ (cleared / length)
+    eigenvalues, vectors = np.linalg.eigh(normal)
+    floor = INVISIBLE**2
+    seen = eigenvalues > floor
+    variance = (vectors[:, seen] ** 2) @ (1.0 / eigenvalues[seen])
+    variance[np.any(np.abs(vectors[:, ~seen]) > INVISIBLE, axis=1)] = np.inf
+    return np.asarray(np.sqrt(variance) / length, float)
+
+
+def score_all(linear: Linearisation, candidates: Sequence[Candidate]) -> list[Score]:
+    """Scores of all candidates, largest gain first."""
+    return sorted((score(linear, c) for c in candidates), key=lambda s: -s.gain)
+
+
+def score_pairs(linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate]]:
+    """Gain of every pair of candidates, largest first."""
+    gains = []
+    for a, b in combinations(candidates, 2):
+        names = list(dict.fromkeys([*a.names, *b.names]))
+        gains.append((linear.gain_of(names)[0], a, b))
+    return sorted(gains, key=lambda item: -item[0])
+
+
+def angle(linear: Linearisation, signal: Array, names: Sequence[str]) -> float:
+    """Angle [rad] between a predicted residual (m,) and what the named quantities can predict, both cleared.
+
+    0: no fit tells them apart; pi/2: nothing in common.
+    """
+    signal = linear.cleared(signal[:, None])[:, 0]
+    columns = linear.columns(names)
+    cleared = linear.cleared(columns)
+    keep = np.linalg.norm(cleared, axis=0) > INVISIBLE * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    length = float(np.linalg.norm(signal))
+    if length == 0 or not keep.any():
+        return float(np.pi / 2)
+    U, singular, _ = np.linalg.svd(_normalised(cleared[:, keep]), full_matrices=False)
+    U = U[:, singular > 1e-9 * singular[0]]
+    within = U @ (U.T @ signal)
+    return float(np.arctan2(np.linalg.norm(signal - within), np.linalg.norm(within)))

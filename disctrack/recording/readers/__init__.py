@@ -1,0 +1,45 @@
+"""Frames of one camera, whatever file they lie in: one small module per format, one interface."""
+
+from importlib import import_module
+from pathlib import Path
+
+from disctrack.errors import RecordingError
+from disctrack.recording.readers.base import (
+    CINE_SUFFIXES,
+    HDF5_SUFFIXES,
+    IMAGE_SUFFIXES,
+    MRAW_SUFFIXES,
+    NUMBER,
+    VIDEO_SUFFIXES,
+    FrameReader,
+    split_member,
+)
+from disctrack.recording.readers.files import match_files
+
+# Suffixes of a format, the module that reads it, and its function (files, camera) -> FrameReader.
+FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
+    (IMAGE_SUFFIXES, "images", "open_images"),
+    (VIDEO_SUFFIXES, "video", "open_video"),
+    (MRAW_SUFFIXES, "mraw", "open_mraw"),
+    (CINE_SUFFIXES, "cine", "open_cine"),
+    (HDF5_SUFFIXES, "hdf5", "open_hdf5"),
+)
+
+
+def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
+    """Reader of one camera's frames: a file pattern, relative to `folder`.
+
+    pattern : "left/*.png", "left.mkv", "stack.tif", or "frames.h5:/left" for a data set in an HDF5 file;
+        "left/*_{number}_a.png" where the names alone do not tell which digits count the frames
+    camera  : "left" or "right", for messages
+    Raises RecordingError if nothing matches, or if no frame can be read.
+    """
+    pattern, member = split_member(pattern)
+    files = match_files(pattern, Path(folder), camera)
+    suffix = files[0].suffix.lower()
+    module, function = next((module, function) for suffixes, module, function in FORMATS if suffix in suffixes)
+    if NUMBER in member and suffix not in IMAGE_SUFFIXES:
+        raise RecordingError(f"{files[0]}: {NUMBER} in a pattern numbers images of a file each; leave it out here.")
+    opener = getattr(import_module(f"disctrack.recording.readers.{module}"), function)
+    reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
+    return reader

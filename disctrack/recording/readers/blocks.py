@@ -1,0 +1,163 @@
+"""Blocks of image pairs, read ahead by several threads in bounded memory."""
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Mask
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.recording.readers.base import FrameReader
+
+BLOCK_BYTES = 16 << 20  # large enough to hide the switch between blocks, small enough for six of them in 100 MB
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """One image that could not be read."""
+
+    frame: int
+    camera: int  # 0 left, 1 right
+    reason: str
+
+
+@dataclass(frozen=True)
+class PairBlock:
+    """Consecutive image pairs.
+
+    `images` may be a buffer that is filled anew: it is valid until the next block is asked for; copy what must stay.
+    """
+
+    frames: NDArray[np.int64]  # (n,)
+    images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 where not readable
+    unreadable: tuple[Unreadable, ...] = ()
+
+    @property
+    def readable(self) -> Mask:
+        """(n, 2) True where the image could be read."""
+        good = np.ones(self.images.shape[:2], bool)
+        for image in self.unreadable:
+            good[image.frame - self.frames[0], image.camera] = False
+        return good
+
+
+def check_pair(left: FrameReader, right: FrameReader) -> None:
+    """Raise RecordingError unless both sequences have the same number of frames and size, and 8 bit or more."""
+    if len(left) != len(right):
+        short = CAMERAS[int(len(right) < len(left))]
+        last = min(len(left), len(right)) - 1
+        raise RecordingError(
+            f"left has {len(left)} frames ({left.describe(0)} ...), right has {len(right)} ({right.describe(0)} ...). "
+            f"Frame i of both must belong together: bring the missing {short} images, or move the surplus ones away "
+            f"(the last pair would be {left.describe(last)} with {right.describe(last)})."
+            + "".join(f" Note: {note}." for reader in (left, right) for note in reader.notes)
+        )
+    for what, unit in (("image_size", "px"), ("bit_depth", "bit")):
+        ours, theirs = (getattr(reader, what) for reader in (left, right))
+        alike = ours == theirs if what == "image_size" else (ours > 8) == (theirs > 8)
+        if not alike:
+            shown = [f"{v[0]} x {v[1]}" if isinstance(v, tuple) else f"{v}" for v in (ours, theirs)]
+            instead = ", or declare parts of one size: [cameras] left_part and right_part" * (what == "image_size")
+            raise RecordingError(
+                f"left images ({left.describe(0)}) have {shown[0]} {unit}, right images ({right.describe(0)}) have "
+                f"{shown[1]} {unit}. Export both cameras alike{instead}."
+            )
+
+
+# Of processes side by side: one thread each, more would wait for one another.
+ONE_THREAD = {
+    name: "1"
+    for name in (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "BLIS_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "OPENCV_FOR_THREADS_NUM",
+    )
+}
+
+
+def default_threads() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def iter_pair_blocks(
+    left: FrameReader,
+    right: FrameReader,
+    start: int = 0,
+    stop: int | None = None,
+    block: int | None = None,
+    threads: int | None = None,
+    breaks: Sequence[int] = (),
+) -> Iterator[PairBlock]:
+    """Pairs start..stop-1 in blocks of `block` pairs, two blocks read ahead while the caller works on a third.
+
+    breaks : pairs that a block begins with, whatever came before
+
+    An image that cannot be read is named in the block's `unreadable`; the others are delivered. The default block
+    holds BLOCK_BYTES, so that the memory is independent of the recording's length and of the image size.
+    Raises RecordingError if the two sequences do not belong together (`check_pair`).
+    """
+    check_pair(left, right)
+    stop = len(left) if stop is None else min(stop, len(left))
+    width, height = left.image_size
+    dtype = np.uint8 if left.bit_depth == 8 else np.uint16
+    block = block or int(np.clip(BLOCK_BYTES // (2 * width * height * np.dtype(dtype).itemsize), 1, 256))
+    parts = [start, *(edge for edge in sorted(breaks) if start < edge < stop), stop]
+    starts = [first for a, b in pairwise(parts) for first in range(a, b, block)]
+    stops = [*starts[1:], stop]
+    n_ahead = min(2, max(len(starts) - 1, 0))
+    ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]
+    pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
+    # what is read fastest in order has a thread of its own: two blocks at once would send it back and forth
+    pools = [
+        pool if reader.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for reader in (left, right)
+    ]
+    pending: list[list[Future[list[Unreadable]]]] = []
+    try:
+        for number, first in enumerate(starts):
+            for ahead in range(number + len(pending), min(number + n_ahead + 1, len(starts))):
+                pending.append(
+                    _submit(pools, (left, right), range(starts[ahead], stops[ahead]), ring[ahead % len(ring)])
+                )
+            unreadable = [image for future in pending.pop(0) for image in future.result()]
+            frames = np.arange(first, stops[number])
+            yield PairBlock(frames, ring[number % len(ring)][: len(frames)], tuple(unreadable))
+    finally:
+        for threads_of_one in {pool, *pools}:
+            threads_of_one.shutdown(wait=True, cancel_futures=True)
+
+
+def _submit(
+    pools: Sequence[ThreadPoolExecutor], readers: tuple[FrameReader, FrameReader], frames: range, images: NDArray
+) -> list[Future[list[Unreadable]]]:
+    """Reading of one block as tasks: a few frames each, or a camera's whole block where files are read in order."""
+    tasks = []
+    for camera, reader in enumerate(readers):
+        size = 4 if reader.random_access else len(frames)
+        for i in range(0, len(frames), size):
+            tasks.append(
+                pools[camera].submit(_fill, images[i : i + size, camera], reader, camera, frames[i : i + size])
+            )
+    return tasks
+
+
+def _fill(images: NDArray, reader: FrameReader, camera: int, frames: range) -> list[Unreadable]:
+    """Fill images (n, height, width) with the reader's frames; those that could not be read are 0 and returned."""
+    failed = []
+    for image, frame in zip(images, frames, strict=False):
+        try:
+            reader.read(frame, image)
+        except RecordingError as error:
+            image[...] = 0
+            failed.append(Unreadable(frame, camera, str(error)))
+    return failed

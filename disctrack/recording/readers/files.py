@@ -1,0 +1,49 @@
+"""Which files a pattern means, and in which order."""
+
+import glob
+import os
+import re
+from pathlib import Path
+
+from disctrack.errors import RecordingError
+from disctrack.files.inputs import keep
+from disctrack.recording.readers.base import SUFFIXES
+
+
+def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
+    """Image or video files that the pattern matches, in natural order (2 before 10).
+
+    Raises RecordingError if there is none, naming what lies there instead.
+    """
+    found = glob.glob(os.path.join(glob.escape(str(folder)), pattern), recursive=True)
+    files = [Path(name) for name in found if Path(name).suffix.lower() in SUFFIXES]
+    if not files:
+        raise RecordingError(
+            f"{folder / pattern}: no image matched for the {camera} camera. {_what_is_there(pattern, folder)}"
+        )
+    for file in files:
+        keep(file)
+    return sorted(files, key=lambda file: natural_key(str(file)))
+
+
+def _what_is_there(pattern: str, folder: Path) -> str:
+    place = (folder / pattern).parent
+    if glob.has_magic(str(place)) or not place.is_dir():
+        return f"There is no folder {place}." if not place.is_dir() else "Correct the pattern."
+    names = sorted(os.listdir(place), key=natural_key)
+    if not names:
+        return f"The folder {place} is empty."
+    shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return f"The folder holds {shown}; frames are {', '.join(sorted(SUFFIXES))}. Correct the pattern."
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key in which runs of digits count as numbers: frame_2 before frame_10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def file_number(file: Path) -> int | None:
+    """The last run of digits in a file's name, which is the frame's number as the camera counted; None without one."""
+    runs = re.findall(r"[0-9]+", file.stem)
+    return int(runs[-1]) if runs else None

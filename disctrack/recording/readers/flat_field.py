@@ -1,0 +1,233 @@
+"""Dark and flat images of a camera: each pixel's offset and gain taken out of its frames.
+
+    corrected = (frame - dark) m / (flat - dark),   m the median of flat - dark
+
+so that grey values keep their level. They are handed on with 16 bits, whatever the camera has: rounded to whole grey
+values, a pixel would be off by the same part of one in every frame, which is a pattern again. A pixel that is clipped
+stays so. One that hardly answers the light, or far more than its neighbours, is dead: it gets the median of these.
+"""
+
+import glob
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calibration.arrays import Array32, Image, Mask
+from calibration.stuck_pixels import repair
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
+from disctrack.recording.readers.files import match_files
+
+ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
+MOST_DEAD = 0.01  # of all pixels: more, and it is the flat image that is wrong
+MOST_SATURATED = 0.002  # of all pixels: more is no matter of single hot ones
+LEAST_LIGHT = 0.1  # of full scale: a flat that is darker tells gains worse than they differ
+FULL_SCALE = 65535  # [grey] of corrected frames
+ENOUGH = 10  # images averaged, from which on the flat's own noise (1 % of one image) is below usual patterns
+
+
+@dataclass(frozen=True, eq=False)
+class FlatField:
+    """What is taken out of one camera's frames."""
+
+    dark: Array32  # (height, width) [grey]
+    gain: Array32  # (height, width) factor
+    dead: Mask | None  # (height, width)
+    bit_depth: int  # of the frames as the camera wrote them
+    sha256: str  # (hex) of the images it was made from
+    notes: tuple[str, ...] = ()
+
+    def fits(self, image: Image) -> bool:
+        """Is this a grey image of the camera's size and depth?"""
+        return image.shape == self.dark.shape and image.dtype == _stored(self.bit_depth)
+
+    def corrected(self, image: Image, out: Image | None = None) -> Image:
+        """(height, width) uint16, full scale 65535, with offsets and gains taken out; into `out` if given."""
+        clipped = image >= 2**self.bit_depth - 1
+        signal = cv2.subtract(image, self.dark, dtype=cv2.CV_32F)
+        found = np.empty(image.shape, np.uint16) if out is None else out
+        found[...] = cv2.multiply(signal, self.gain, scale=2.0 ** (16 - self.bit_depth), dtype=cv2.CV_16U)
+        found[clipped] = FULL_SCALE
+        if self.dead is not None:
+            repair(found, self.dead)
+        return found
+
+
+def _stored(bit_depth: int) -> type[np.uint8] | type[np.uint16]:
+    return np.uint8 if bit_depth == 8 else np.uint16
+
+
+class FlatFielded:
+    """A camera's frames with its pixels' offsets and gains taken out; in all else the reader that it wraps."""
+
+    def __init__(self, reader: FrameReader, field: FlatField) -> None:
+        """Reader of the frames as the camera wrote them."""
+        self._reader, self._field = reader, field
+        self.notes = (*reader.notes, *field.notes)
+        self.bit_depth = 16
+
+    def __len__(self) -> int:
+        return len(self._reader)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._reader, name)
+
+    def read(self, index: int, out: Image | None = None) -> Image:
+        """Frame `index`, corrected."""
+        return self._field.corrected(self._reader.read(index), out)
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """Of frames and of the images by which they are corrected."""
+        frames = self._reader.content_sha256(start, stop)
+        return hashlib.sha256(f"{frames} {self._field.sha256}".encode()).hexdigest()
+
+
+FlatFields = tuple[FlatField | None, FlatField | None]  # of the left and of the right camera
+
+
+def flat_fields(folder: Path, patterns: Sequence[tuple[str | None, str | None]]) -> FlatFields:
+    """Of the left and of the right camera, None where nothing is declared. Raises RecordingError.
+
+    patterns : of each camera its flat and its dark images, relative to `folder`: a file, a pattern, or a folder
+    """
+    left, right = (_flat_field(*images, folder, camera) for images, camera in zip(patterns, CAMERAS, strict=True))
+    return left, right
+
+
+def flat_fielded(readers: Sequence[FrameReader], fields: FlatFields) -> list[FrameReader]:
+    """Both cameras' readers, with frames corrected where there is a field; the other's are brought to 16 bits, too.
+
+    Raises RecordingError where dark and flat images do not fit the frames.
+    """
+    if fields == (None, None):
+        return list(readers)
+    return [_corrected(reader, field, name) for reader, field, name in zip(readers, fields, CAMERAS, strict=True)]
+
+
+def _corrected(reader: FrameReader, field: FlatField | None, camera: str) -> FrameReader:
+    shape, depth = reader.image_size[::-1], reader.bit_depth
+    if field is None:
+        zero = np.zeros(shape, np.float32)
+        return FlatFielded(reader, FlatField(zero, zero + 1, None, depth, "none"))
+    if field.dark.shape != shape or field.bit_depth != depth:
+        w, h = reader.image_size
+        raise RecordingError(
+            f"{reader.describe(0)}: {camera} frames are {w} x {h} px of {depth} bit, but [cameras] {camera}_flat and "
+            f"{camera}_dark have {field.dark.shape[1]} x {field.dark.shape[0]} px of {field.bit_depth} bit. Take these "
+            "with the settings of the recording, or leave them out."
+        )
+    return FlatFielded(reader, field)
+
+
+@dataclass(frozen=True)
+class _Mean:
+    """Of the images that a key names."""
+
+    where: str  # for messages
+    mean: Array32
+    clipped: Mask  # in more than a twentieth of the images
+    n: int
+    bit_depth: int
+    sha256: str
+
+    @property
+    def described(self) -> str:
+        """Size and depth."""
+        return f"{self.mean.shape[1]} x {self.mean.shape[0]} px of {self.bit_depth} bit"
+
+
+def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
+    """Mean of the frames of one file, or of all images that lie in a folder or match a pattern."""
+    if (folder / pattern).is_dir():
+        pattern = str(Path(pattern) / "*")
+    files = match_files(split_member(pattern)[0], folder, f"{camera} camera's {kind}")
+    what = f"{camera}_{kind}"
+    if files[0].suffix.lower() in IMAGE_SUFFIXES:
+        readers = [open_frames(glob.escape(file.name), file.parent, what) for file in files]
+    else:
+        readers = [open_frames(pattern, folder, what)]
+    first = readers[0]
+    total = np.zeros(first.image_size[::-1])
+    clipped = np.zeros(total.shape, np.int64)
+    digest, n = hashlib.sha256(), 0
+    for reader in readers:
+        if reader.image_size != first.image_size or reader.bit_depth != first.bit_depth:
+            raise RecordingError(
+                f"[cameras] {what}: {reader.describe(0)} is {reader.image_size[0]} x {reader.image_size[1]} px of "
+                f"{reader.bit_depth} bit, but {first.describe(0)} is {first.image_size[0]} x {first.image_size[1]} px "
+                f"of {first.bit_depth} bit. Images that are averaged must be alike: take the other one away."
+            )
+        for index in range(len(reader)):
+            image = reader.read(index)
+            total += image
+            clipped += image >= 2**first.bit_depth - 1
+            n += 1
+        digest.update(reader.content_sha256(0, len(reader)).encode())
+    where = f"{first.describe(0)} ([cameras] {what})"
+    mean = (total / n).astype(np.float32)
+    return _Mean(where, mean, clipped > 0.05 * n, n, first.bit_depth, digest.hexdigest())
+
+
+def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, camera: str) -> FlatField | None:
+    flat = None if flat_images is None else _mean(flat_images, folder, camera, "flat")
+    dark = None if dark_images is None else _mean(dark_images, folder, camera, "dark")
+    one = flat or dark
+    if one is None:
+        return None
+    if flat and dark and flat.described != dark.described:
+        raise RecordingError(
+            f"{flat.where}: {flat.described}, but {dark.where} has {dark.described}. Take both with the settings of "
+            "the recording."
+        )
+    offset = np.zeros_like(one.mean) if dark is None else dark.mean
+    gain, dead = np.ones_like(offset), np.zeros(offset.shape, bool)
+    notes = []
+    if flat is not None:
+        gain, dead = _gain(flat, offset, dark)
+        if flat.n < ENOUGH:
+            notes.append(
+                f"[cameras] {camera}_flat is the mean of {flat.n} image(s): its own noise becomes a pattern of the "
+                f"sensor. Average {ENOUGH} or more"
+            )
+    if dead.any():
+        notes.append(f"{camera} camera: {dead.sum()} dead pixel(s) by its flat image, replaced by their neighbours")
+    digest = " ".join(m.sha256 if m else "-" for m in (flat, dark))
+    return FlatField(offset, gain, dead if dead.any() else None, one.bit_depth, digest, tuple(notes))
+
+
+def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Mask]:
+    """Factors on the pixels' signals, and which pixels are dead. Raises RecordingError."""
+    saturated = float(np.mean(flat.clipped))
+    if saturated > MOST_SATURATED:
+        raise RecordingError(
+            f"{flat.where}: {100 * saturated:.2g} % of its pixels are saturated, so that their gains are not "
+            "known. Take it with less light, or a shorter exposure: half of full scale is good."
+        )
+    answer = flat.mean - offset
+    level = float(np.median(answer))
+    if dark is not None and level <= 0:
+        raise RecordingError(
+            f"{flat.where} is not brighter (median {np.median(flat.mean):.1f}) than {dark.where} (median "
+            f"{np.median(offset):.1f}): are the two exchanged?"
+        )
+    if level < LEAST_LIGHT * 2**flat.bit_depth:
+        raise RecordingError(
+            f"{flat.where}: its median is {level:.1f} grey values above the dark image, of {2**flat.bit_depth - 1}. "
+            "That is too dark to tell gains. Take it of an evenly lit white surface, at about half of full scale."
+        )
+    around = cv2.medianBlur(answer, 5)
+    dead = np.asarray((np.abs(answer - around) > ODD * around) | flat.clipped | (answer <= 0.1 * level))
+    if dead.mean() > MOST_DEAD:
+        raise RecordingError(
+            f"{flat.where}: {100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their "
+            "neighbours. Take it out of focus, of an evenly lit white surface without an edge in view."
+        )
+    gain = np.where(dead, 1.0, level / np.where(dead, 1.0, answer)).astype(np.float32)
+    return gain, dead

@@ -1,0 +1,293 @@
+"""Frames in an HDF5 file: a data set (n, height, width) of 8 or 16 bit whole numbers.
+
+recording.toml names it `frames.h5:/path`, or the file alone where it holds only one such data set. Attributes of the
+data set (or of its group) that are understood: `frame_rate` [Hz], `bit_depth`; and `timestamps` [s], an attribute or a
+data set (n,) beside it. A data set that lies in one piece is read at the speed of memory.
+"""
+
+import contextlib
+import hashlib
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from calibration.arrays import Array, Image
+from disctrack.errors import RecordingError
+from disctrack.recording.readers._inflate import inflated
+from disctrack.recording.readers.base import FrameReader, Frames
+from disctrack.recording.readers.raw import RawFile, RawFrames, check_frame_size
+
+_MOST_OBJECTS = 10_000  # looked at in the search for the one stack
+_LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
+_LARGEST_CHUNK = 512 << 20  # bytes: what the library takes at once, whatever the file's size
+_DEPTHS = (10, 12, 14, 16)  # of 16-bit whole numbers
+_DEFLATE, _SHUFFLE = 1, 2  # filters by their registered numbers
+_SMALL = 1 << 12  # bytes: what deflate may add to what it cannot compress
+
+
+def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
+    """Reader of one data set. Raises RecordingError if there is none, or several and none is named."""
+    if len(files) != 1:
+        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one HDF5 file.")
+    file = files[0]
+    try:
+        handle = h5py.File(file, "r", rdcc_nbytes=_LARGEST_CACHE, rdcc_w0=1.0)
+    except OSError as error:
+        raise RecordingError(f"{file}: not a readable HDF5 file ({error}). Copy it again.") from error
+    try:
+        stack = _named(handle, member, file) if member else _only_stack(handle, file)
+        return _open(handle, stack, file, camera)
+    except RecordingError:
+        handle.close()
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever a damaged file makes of it
+        handle.close()
+        raise RecordingError(f"{file}: the HDF5 file is damaged ({error}). Copy it again.") from error
+
+
+def _is_stack(item: Any) -> bool:
+    return isinstance(item, h5py.Dataset) and item.ndim == 3 and item.dtype.kind == "u" and item.dtype.itemsize <= 2
+
+
+def _named(handle: Any, member: str, file: Path) -> Any:
+    item = handle.get(member)
+    if _is_stack(item):
+        return item
+    found = "nothing" if item is None else "a group"
+    if isinstance(item, h5py.Dataset):
+        found = f"a data set {item.shape} of {item.dtype}"
+    stacks = ", ".join(stack.name for stack in stacks_of(handle))
+    raise RecordingError(
+        f"{file}:{member} is {found}; expected frames (n, height, width) of 8 or 16 bit without sign. "
+        + (f"There are {stacks}." if stacks else "The file holds none.")
+    )
+
+
+def _only_stack(handle: Any, file: Path) -> Any:
+    stacks = stacks_of(handle)
+    if len(stacks) == 1:
+        return stacks[0]
+    if not stacks:
+        raise RecordingError(f"{file}: holds no frames (n, height, width) of 8 or 16 bit without sign.")
+    names = ", ".join(stack.name for stack in stacks)
+    raise RecordingError(f"{file}: holds several stacks of frames: {names}. Name one: {file.name}:{stacks[0].name}")
+
+
+def stacks_of(handle: Any) -> list[Any]:
+    """Data sets that may be frames; links to other files are not followed."""
+    found: list[Any] = []
+    seen = 0
+
+    def look(name: str, item: Any) -> bool | None:
+        nonlocal seen
+        seen += 1
+        if _is_stack(item):
+            found.append(item)
+        return True if seen > _MOST_OBJECTS else None
+
+    handle.visititems(look)
+    return found
+
+
+def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
+    n, height, width = stack.shape
+    where = f"{file}:{stack.name}"
+    check_frame_size(width, height, where)
+    if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > _LARGEST_CHUNK:
+        raise RecordingError(
+            f"{where}: one chunk {stack.chunks} holds more than {_LARGEST_CHUNK >> 20} MB, all of which is read for "
+            "any frame in it. Write it again with chunks of one frame."
+        )
+    stored = _frames_stored(stack)
+    if n == 0 or stored == 0:
+        raise RecordingError(f"{where}: a stack without frames.")
+    if n > 2 * stored:  # a few that are missing are lost frames; a header may announce any number
+        raise RecordingError(
+            f"{where}: announces {n} frames, but at most {stored} were ever written. The recording was cut short: "
+            "write it again, or give the data set its true length."
+        )
+    _check_other_files(stack, file, where)
+    rate = _attribute(stack, "frame_rate")
+    bits = _attribute(stack, "bit_depth")
+    common: dict[str, Any] = {
+        "bit_depth": int(bits) if bits in _DEPTHS and stack.dtype.itemsize == 2 else None,
+        "timestamps": _timestamps(stack, n, where),
+        "frame_rate": rate if rate is not None and rate > 0 else None,
+    }
+    offset = stack.id.get_offset() if stack.chunks is None and not stack.external and not stack.is_virtual else None
+    if offset is not None and _fills_its_bytes(stack):
+        size = height * width * stack.dtype.itemsize
+        dtype = stack.dtype
+        handle.close()
+        return RawFrames(
+            [RawFile(file)], np.zeros(n, int), offset + size * np.arange(n), (width, height), dtype, camera, **common
+        )
+    return Hdf5Frames(file, handle, stack, camera, **common)
+
+
+def _frames_stored(stack: Any) -> int:
+    """Most frames that can have been written, by the space they take."""
+    if stack.is_virtual or stack.external:
+        return int(stack.shape[0])
+    if stack.chunks is None:
+        return int(stack.id.get_storage_size() // max(1, int(np.prod(stack.shape[1:])) * stack.dtype.itemsize))
+    return int(stack.id.get_num_chunks()) * int(stack.chunks[0])
+
+
+def _fills_its_bytes(stack: Any) -> bool:
+    """False where a pixel's bits lie somewhere within its bytes: the library brings them to where they belong."""
+    kind = stack.id.get_type()
+    return bool(kind.get_precision() == 8 * kind.get_size() and kind.get_offset() == 0)
+
+
+def _check_other_files(stack: Any, file: Path, where: str) -> None:
+    """Raise RecordingError where pixels lie in other files that are not there: the library would deliver zeros."""
+    if stack.is_virtual:
+        for name in sorted({source.file_name for source in stack.virtual_sources()} - {"."}):
+            if "%" not in name and not (file.parent / name).exists() and not Path(name).exists():
+                raise RecordingError(f"{where}: takes frames from {name}, which is not there. Copy it beside {file}.")
+    needed = int(np.prod(stack.shape, dtype=np.int64)) * stack.dtype.itemsize
+    present = 0
+    for name, start, size in stack.external or ():
+        if not Path(name).exists():  # by the library's rule, from the folder that the command is given in
+            raise RecordingError(f"{where}: its pixels lie in {name}, which is not there. Write them into {file}.")
+        present += max(0, min(Path(name).stat().st_size - start, size))
+    if stack.external and present < needed:
+        raise RecordingError(
+            f"{where}: its pixels lie in {stack.external[0][0]}, which holds {present} of their {needed} bytes. "
+            "Copy it again."
+        )
+
+
+def _filters(stack: Any) -> set[int]:
+    plist = stack.id.get_create_plist()
+    return {int(plist.get_filter(i)[0]) for i in range(plist.get_nfilters())}
+
+
+def _attribute(stack: Any, name: str) -> float | None:
+    """A number among the attributes of the data set or of its group."""
+    for owner in (stack, stack.parent):
+        if name in owner.attrs:
+            value = np.asarray(owner.attrs[name])
+            if value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all():
+                return float(value.reshape(-1)[0])
+    return None
+
+
+def _timestamps(stack: Any, n: int, where: str) -> Array | None:
+    stamps = stack.attrs.get("timestamps", stack.parent.get("timestamps"))
+    if stamps is None or (isinstance(stamps, h5py.Dataset) and stamps.shape != (n,)):
+        if isinstance(stamps, h5py.Dataset) and stamps.ndim == 1:
+            raise RecordingError(f"{where}: {n} frames, but {stamps.shape[0]} timestamps. Write one for each frame.")
+        return None
+    values = np.asarray(stamps[()] if isinstance(stamps, h5py.Dataset) else stamps)
+    if values.dtype.kind not in "iuf" or values.shape != (n,):
+        raise RecordingError(f"{where}: timestamps are {values.shape} of {values.dtype}; expected {n} times in s.")
+    return values.astype(np.float64)
+
+
+class Hdf5Frames(Frames):
+    """A data set in chunks, with or without compression; see FrameReader.
+
+    The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are, it delivers
+    the compressed bytes only, and frames are inflated side by side.
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        handle: Any,
+        stack: Any,
+        camera: str,
+        bit_depth: int | None,
+        timestamps: Array | None,
+        frame_rate: float | None,
+    ) -> None:
+        self.file, self.camera = file, camera
+        self._handle, self._stack = handle, stack
+        self._lock = threading.Lock()
+        self.image_size = (int(stack.shape[2]), int(stack.shape[1]))
+        self.dtype = stack.dtype.newbyteorder("=")
+        self.bit_depth = bit_depth or 8 * self.dtype.itemsize
+        self.timestamps, self.frame_rate = timestamps, frame_rate
+        self._digests: list[bytes | None] = [None] * int(stack.shape[0])
+        self._shuffled = _SHUFFLE in _filters(stack)
+        self.random_access = self._inflated_here = bool(
+            stack.chunks == (1, *stack.shape[1:])
+            and _DEFLATE in _filters(stack) <= {_SHUFFLE, _DEFLATE}
+            and _fills_its_bytes(stack)
+        )
+        frames_per_chunk = stack.chunks[0] if stack.chunks else 1
+        chunk_row = frames_per_chunk * self.image_size[0] * self.image_size[1] * self.dtype.itemsize
+        self.notes: tuple[str, ...] = ()
+        if frames_per_chunk > 1 and chunk_row > _LARGEST_CACHE:
+            self.notes = (
+                f"{camera} camera: chunks of {frames_per_chunk} frames are decompressed anew for each of them; "
+                "chunks of one frame are read faster",
+            )
+
+    def __len__(self) -> int:
+        return int(self._stack.shape[0])
+
+    def describe(self, index: int) -> str:
+        """File, data set and frame."""
+        return f"{self._place(index)}, frame {index}"
+
+    def _place(self, index: int) -> str:
+        return f"{self.file}:{self._stack.name}"
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        image, content = self._buffer(out), None
+        with self._lock:
+            try:
+                size = self._stored_size(index)
+                if size == 0:
+                    raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
+                if self._inflated_here and size <= 2 * image.nbytes + _SMALL:
+                    mask, content = self._stack.id.read_direct_chunk((index, 0, 0))
+                    content = None if mask else content  # some filter was left out
+                if content is None:
+                    self._stack.read_direct(image, np.s_[index])
+            except (OSError, RuntimeError, ValueError) as error:
+                raise RecordingError(f"{where}: cannot be read ({error}). Copy the file again.") from error
+        if content is not None:
+            self._inflate(content, image, where)
+        self._digests[index] = hashlib.sha256(image.data).digest()
+        return image
+
+    def _inflate(self, content: bytes, image: Image, where: str) -> None:
+        """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
+        whole = inflated(content, image.nbytes)
+        if whole is None:
+            raise RecordingError(
+                f"{where}: damaged (its {len(content)} compressed bytes do not hold the {image.nbytes} of an image). "
+                "Copy the file again."
+            )
+        raw = np.frombuffer(whole, np.uint8)
+        if self._shuffled and self.dtype.itemsize > 1:
+            raw = np.ascontiguousarray(raw.reshape(self.dtype.itemsize, -1).T).reshape(-1)
+        image[...] = raw.view(self._stack.dtype).reshape(image.shape)
+
+    def _stored_size(self, index: int) -> int:
+        """Bytes of the frame's chunks; 0 where one is missing: the library would deliver zeros without a word."""
+        if self._stack.chunks is None:
+            return 1
+        (frames, rows, columns), (_, height, width) = self._stack.chunks, self._stack.shape
+        corners = ((index - index % frames, y, x) for y in range(0, height, rows) for x in range(0, width, columns))
+        found = [self._stack.id.get_chunk_info_by_coord(corner) for corner in corners]
+        return 0 if any(info.byte_offset is None for info in found) else sum(int(info.size) for info in found)
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """SHA-256 of size, type and grey values of frames start..stop-1; those already read are not read again."""
+        digest = hashlib.sha256(f"{self.image_size} {self.dtype.str}".encode())
+        image = np.empty(self.image_size[::-1], self.dtype)
+        for index in range(start, stop):
+            if self._digests[index] is None:
+                with contextlib.suppress(RecordingError):
+                    self.read(index, image)
+            digest.update(self._digests[index] or b"unreadable")
+        return digest.hexdigest()

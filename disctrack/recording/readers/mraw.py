@@ -1,0 +1,277 @@
+"""Photron recordings: a header, .cih (text) or .cihx (XML), beside an .mraw file of frames without a gap."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from disctrack.errors import RecordingError
+from disctrack.recording.readers.camera_frames import (
+    PIXELS_PER_GROUP,
+    CameraFrames,
+    PixelLayout,
+    bit_depth_of,
+    check_present,
+)
+from disctrack.recording.readers.camera_header import CameraHeader
+from disctrack.recording.readers.raw import RawFile, check_frame_size
+
+_MOST_HEADER_BYTES = 16 << 20  # real ones have 5 to 100 kB
+
+# Where the entries that matter lie: name in the .cih, path below <cih> in the .cihx.
+_ENTRIES = {
+    "Camera Type": "deviceInfo/deviceName",
+    "User Defined Camera Name": "basicInfo/cameraName",
+    "Record Rate(fps)": "recordInfo/recordRate",
+    "Shutter Speed(s)": "recordInfo/shutterSpeed",
+    "Shutter Type2(nsec)": "recordInfo/shutterSpeedNsec",
+    "Trigger Mode": "recordInfo/triggerMode/mode",
+    "Total Frame": "frameInfo/totalFrame",
+    "Original Total Frame": "frameInfo/recordedFrame",
+    "Start Frame": "frameInfo/startFrame",
+    "Save Step": "frameInfo/skipFrame",
+    "Image Width": "imageDataInfo/resolution/width",
+    "Image Height": "imageDataInfo/resolution/height",
+    "Color Type": "imageDataInfo/colorInfo/type",
+    "Color Bit": "imageDataInfo/colorInfo/bit",
+    "File Format": "imageFileInfo/fileFormat",
+    "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
+    "EffectiveBit Side": "imageDataInfo/effectiveBit/side",
+    "Date": "fileInfo/date",
+    "Time": "fileInfo/time",
+}
+# Codes of the trigger modes in a .cihx; those above have parameters in their low bytes and are compared as numbers.
+_TRIGGERS = ("Start", "Center", "End", "Random", "Manual", "Random Reset", "Random Center", "Random Manual")
+
+
+def open_mraw(files: Sequence[Path], camera: str) -> CameraFrames:
+    """Frames of one camera. files: the header, or the .mraw file, or both.
+
+    Raises RecordingError if header or frames are missing, do not fit each other, or are not grey values.
+    """
+    header_file, data_file = _pair_of(files, camera)
+    entries = _Entries(header_file)
+    layout, saturation = _layout(entries)
+    file = RawFile(data_file)
+    n = entries.whole("Total Frame")
+    check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
+    layout, saturation, notes = _as_stored(file, layout, saturation)
+    header, remarks, doubts = _header(entries, saturation)
+    if file.size >= (n + 1) * layout.frame_bytes:
+        notes.append(f"{data_file.name} is longer than the {n} frames of its header; what follows them is not read")
+    offsets = np.arange(n, dtype=np.int64) * layout.frame_bytes
+    return CameraFrames(file, camera, layout, offsets, header, (header.sentence(), *remarks, *notes), doubts=doubts)
+
+
+def _as_stored(file: RawFile, layout: PixelLayout, saturation: int) -> tuple[PixelLayout, int, list[str]]:
+    """Layout and saturation, corrected where the first frame has larger values than the header allows."""
+    if layout.stored_bits != 16 or saturation == 0xFFFF:
+        return layout, saturation, []
+    largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file.path)), "<u2").max())
+    if largest <= saturation:
+        return layout, saturation, []
+    note = f"grey values go up to {largest}, not {saturation} as the header says; used as they are"
+    return dataclasses.replace(layout, bit_depth=16), 0xFFFF, [note]
+
+
+def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
+    """Header and frames, from one of them or both. PFV writes either header, or both alike: .cihx is taken."""
+    stems = {file.with_suffix("") for file in files}
+    if len(stems) > 1:
+        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one recording.")
+    stem = stems.pop()
+    try:
+        beside = {file.suffix.lower(): file for file in stem.parent.iterdir() if file.with_suffix("") == stem}
+    except OSError as error:
+        raise RecordingError(f"{stem.parent}: cannot be read: {error.strerror}.") from error
+    header = beside.get(".cihx", beside.get(".cih"))
+    if header is None:
+        raise RecordingError(
+            f"{files[0]}: there is no {stem.name}.cihx or .cih beside it for the {camera} camera. It tells size and "
+            "depth of the frames: copy it from the camera's folder."
+        )
+    if ".mraw" not in beside:
+        raise RecordingError(
+            f"{header}: there is no {stem.name}.mraw beside it for the {camera} camera. Copy it from the camera's "
+            "folder, or name the image files that were exported instead."
+        )
+    return header, beside[".mraw"]
+
+
+class _Entries:
+    """Entries of a header as texts, under their names in the .cih; the methods convert one or refuse it."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        content = _content(file)
+        self._texts = _from_xml(content, file) if file.suffix.lower() == ".cihx" else _from_text(content)
+
+    def text(self, name: str) -> str:
+        """The entry, "" where there is none."""
+        return self._texts.get(name, "")
+
+    def whole(self, name: str) -> int:
+        """A number of at least 0; RecordingError where there is none."""
+        found = self.text(name)
+        if not re.fullmatch(r"[0-9]{1,15}", found):
+            raise RecordingError(f"{self.file}: '{name}' is {found[:40]!r}; expected a whole number. {_EXPORT}")
+        return int(found)
+
+    def number(self, name: str) -> float | None:
+        """A positive finite number, or None. "1/800" is one, too."""
+        numerator, _, denominator = self.text(name).partition("/")
+        try:
+            value = float(numerator) / (float(denominator) if denominator else 1.0)
+        except (ValueError, ZeroDivisionError):
+            return None
+        return value if math.isfinite(value) and value > 0 else None
+
+
+_EXPORT = "Export the recording again, or copy its header again."
+
+
+def _content(file: Path) -> bytes:
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(_MOST_HEADER_BYTES + 1)
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}. Copy it again.") from error
+    if len(content) > _MOST_HEADER_BYTES:
+        raise RecordingError(f"{file}: more than {_MOST_HEADER_BYTES >> 20} MB, too much for a camera's header.")
+    return content
+
+
+def _from_text(content: bytes) -> dict[str, str]:
+    """Lines "name : value"; the first of a name counts."""
+    texts: dict[str, str] = {}
+    for line in content.decode("utf-8", "replace").splitlines():
+        name, separator, value = line.partition(" : ")
+        if separator:
+            texts.setdefault(name.strip(), value.strip())
+    return texts
+
+
+def _from_xml(content: bytes, file: Path) -> dict[str, str]:
+    """The XML between <cih> and </cih>, which lies in a binary container.
+
+    What stands before is left out, and with it every document type that could define entities.
+    """
+    start, stop = content.find(b"<cih>"), content.rfind(b"</cih>")
+    if start < 0 or stop < start:
+        raise RecordingError(f"{file}: holds no <cih> ... </cih>, so it is no Photron header, or cut short. {_EXPORT}")
+    try:
+        root = ElementTree.fromstring(content[start : stop + len(b"</cih>")].decode("utf-8", "replace"))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise RecordingError(f"{file}: the XML in it is damaged ({error}). {_EXPORT}") from error
+    texts = {name: (root.findtext(path) or "").strip() for name, path in _ENTRIES.items()}
+    texts["Trigger Mode"] = _trigger_name(texts["Trigger Mode"], root.findtext("recordInfo/triggerMode/pdcMode") or "")
+    rate = texts["Shutter Speed(s)"]  # here it is 1/s
+    texts["Shutter Speed(s)"] = f"1/{rate}" if rate else ""
+    return texts
+
+
+def _trigger_name(mode: str, pdc_mode: str) -> str:
+    """Name of a trigger mode; newer cameras write the code into the highest byte of `pdcMode`."""
+    code = mode.strip() or pdc_mode.strip()
+    if not re.fullmatch(r"[0-9]{1,10}", code):
+        return code[:40]
+    number = int(code) if mode.strip() else int(code) >> 24 if int(code) % (1 << 24) == 0 else len(_TRIGGERS)
+    return _TRIGGERS[number] if number < len(_TRIGGERS) else f"mode {code}"
+
+
+def _layout(entries: _Entries) -> tuple[PixelLayout, int]:
+    """How the pixels lie, and the largest grey value that the header allows."""
+    file = entries.file
+    if entries.text("File Format").lower() != "mraw":
+        raise RecordingError(
+            f"{file}: the frames were saved as {entries.text('File Format')[:20] or 'nothing known'}, not as MRAW. "
+            "Name the image files instead."
+        )
+    _refuse_colour(entries)
+    width, height = entries.whole("Image Width"), entries.whole("Image Height")
+    check_frame_size(width, height, str(file))
+    bits, effective = entries.whole("Color Bit"), entries.whole("EffectiveBit Depth")
+    if bits not in (8, 10, 12, 16):
+        raise RecordingError(
+            f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames in one of these."
+        )
+    if width * height % PIXELS_PER_GROUP[bits]:
+        raise RecordingError(
+            f"{file}: frames of {width} x {height} px with {bits} bit do not fill whole groups of bytes. Save them "
+            "with 16 bit."
+        )
+    effective = effective if 0 < effective <= bits else bits
+    high = bits == 16 and entries.text("EffectiveBit Side").lower() == "higher"
+    depth = 16 if high else bit_depth_of(bits, effective)
+    layout = PixelLayout(width, height, bits, depth)
+    return layout, ((1 << effective) - 1) << (bits - effective if high else 0)
+
+
+def _refuse_colour(entries: _Entries) -> None:
+    kind, device = entries.text("Color Type").lower(), entries.text("Camera Type")
+    mosaic = kind == "raw" and re.search(r"-C\b", device)  # the type's letter: -M- monochrome, -C- colour
+    if kind not in ("mono", "raw", "") or mosaic:
+        found = "a colour mosaic" if mosaic else f"of colour type {kind[:20]!r}"
+        raise RecordingError(
+            f"{entries.file}: the frames are {found} "
+            f"({device[:60]}); expected grey values. A conversion here would mix what the sensor measured: record with "
+            "a monochrome camera."
+        )
+
+
+def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
+    """Settings of the recording, what about them cannot be, and what had to be assumed of the frames' times."""
+    rate = entries.number("Record Rate(fps)")
+    if rate is None:
+        shown = entries.text("Record Rate(fps)")[:40]
+        raise RecordingError(f"{entries.file}: 'Record Rate(fps)' is {shown!r}; expected a number above 0. {_EXPORT}")
+    step, doubts = _saved_step(entries)
+    remarks: list[str] = []
+    nanoseconds = entries.number("Shutter Type2(nsec)")
+    exposure = nanoseconds / 1e9 if nanoseconds else entries.number("Shutter Speed(s)")
+    if exposure is not None and exposure * rate > 1.001:
+        remarks.append(f"the header's exposure of {exposure:g} s is longer than a frame of {1 / rate:g} s; not used")
+        exposure = None
+    first = entries.text("Start Frame")
+    name = entries.text("User Defined Camera Name")
+    header = CameraHeader(
+        file=str(entries.file),
+        device=entries.text("Camera Type")[:80] + (f" ({name[:40]})" if name else ""),
+        frame_rate=rate / step,
+        step=step,
+        exposure=exposure,
+        trigger=entries.text("Trigger Mode")[:40],
+        first_frame=int(first) if re.fullmatch(r"-?[0-9]{1,15}", first) else None,
+        first_time=None,
+        trigger_time=None,
+        locked_clock=False,
+        recorded=_date(entries.text("Date"), entries.text("Time")),
+        saturation=saturation,
+    )
+    return header, remarks, tuple(doubts)
+
+
+def _saved_step(entries: _Entries) -> tuple[int, list[str]]:
+    """Of how many recorded frames one was saved; 1 and why where the header contradicts itself."""
+    step, n = int(entries.number("Save Step") or 1), entries.whole("Total Frame")
+    recorded = entries.number("Original Total Frame")
+    if step > 1 and recorded is not None and (n - 1) * step >= recorded:
+        return 1, [
+            f"the header says that one frame in {step} was saved, but {n} of {recorded:g} recorded frames are there; "
+            "taken as consecutive"
+        ]
+    return max(step, 1), []
+
+
+def _date(date: str, time: str) -> datetime | None:
+    for form in ("%Y/%m/%d %H:%M:%S", "%Y/%m/%d %H:%M", "%Y/%m/%d"):
+        try:
+            return datetime.strptime(f"{date} {time}".strip() if "H" in form else date, form)
+        except ValueError:
+            continue
+    return None

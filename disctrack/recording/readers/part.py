@@ -1,0 +1,88 @@
+"""A part of every image as the images of a camera: of one sensor behind mirrors, or of two images stored in one."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Image
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.recording.readers.base import FrameReader
+
+
+@dataclass(frozen=True)
+class ImagePart:
+    """Columns x to x + width - 1 and rows y to y + height - 1 [px] of an image."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    def of(self, image: NDArray) -> NDArray:
+        """The part of an image (h, w) or (h, w, channels); an image of the part's own size is that part already."""
+        if image.shape[:2] == (self.height, self.width):
+            return image
+        return np.ascontiguousarray(image[self.y : self.y + self.height, self.x : self.x + self.width])
+
+    def lies_in(self, width: int, height: int) -> bool:
+        """Whether an image of this size [px] has the whole part."""
+        return self.x + self.width <= width and self.y + self.height <= height
+
+    def __str__(self) -> str:
+        return f"[{self.x}, {self.y}, {self.width}, {self.height}]"
+
+
+ImageParts = tuple[ImagePart | None, ImagePart | None]  # of the left and of the right camera
+
+
+def image_parts(declared: Sequence[tuple[int, int, int, int] | None]) -> ImageParts:
+    """Parts of the left and of the right camera, each as (x, y, width, height) [px] or None."""
+    left, right = (None if part is None else ImagePart(*part) for part in declared)
+    return left, right
+
+
+class FramesInPart:
+    """A camera's frames where they are a part of the file's; in all else the reader that it wraps."""
+
+    def __init__(self, reader: FrameReader, part: ImagePart) -> None:
+        """Reader of the whole images."""
+        self._reader, self._part = reader, part
+        self.image_size = (part.width, part.height)
+
+    def __len__(self) -> int:
+        return len(self._reader)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._reader, name)
+
+    def read(self, index: int, out: Image | None = None) -> Image:
+        """The part of frame `index`."""
+        image = self._part.of(self._reader.read(index))
+        if out is None:
+            return image
+        out[...] = image
+        return out
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """Of frames and part."""
+        return hashlib.sha256(f"{self._reader.content_sha256(start, stop)} {self._part}".encode()).hexdigest()
+
+
+def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> list[FrameReader]:
+    """Both cameras' readers, of the declared parts. Raises RecordingError, which begins with `where`, if one is cut."""
+    found: list[FrameReader] = []
+    for reader, part, camera in zip(readers, parts, CAMERAS, strict=True):
+        width, height = reader.image_size
+        if part is not None and not part.lies_in(width, height):
+            raise RecordingError(
+                f"{where}: [cameras] {camera}_part is {part}, columns {part.x} to {part.x + part.width - 1} and rows "
+                f"{part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It is "
+                "[x, y, width, height] in pixels, from the upper left corner."
+            )
+        found.append(reader if part is None else FramesInPart(reader, part))
+    return found

@@ -1,0 +1,325 @@
+"""One camera's frames in a video file (AVI, MP4, MKV, MOV), read through PyAV; needs the extra `disctrack[video]`."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import threading
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.arrays import Image
+from disctrack.errors import RecordingError
+from disctrack.recording.readers._ffv1 import checksums_hold
+from disctrack.recording.readers.base import Frames, first_readable
+from disctrack.recording.readers.decoding import as_grey
+from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size
+
+# Nothing but containers for frames: a play list under a video's name could make the library open other files.
+_CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
+_LOSSLESS = frozenset({"ffv1", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "magicyuv", "png", "tiff", "v210", "qtrle"})
+_MOST_CURSORS = 2  # stretches of a recording that may be read side by side
+_LOOKED_AT = 8  # packets: one with a right checksum among the first tells that there are checksums
+_DECODED_ON = 8  # frames: opening the file anew and seeking costs more than to decode these and drop them
+
+_Decoded = tuple[int, Any, str]  # index of a frame, the frame or None, what is wrong with it
+
+
+def open_video(files: Sequence[Path], camera: str) -> VideoFile:
+    """Reader of one video. Raises RecordingError if PyAV is not installed or the file is no video."""
+    if len(files) != 1:
+        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one video.")
+    return VideoFile(files[0], camera)
+
+
+class VideoFile(Frames):
+    """Frames of a video in order of presentation; see FrameReader. Best read forwards, by one thread.
+
+    Grey values are the luma plane as it is stored, not stretched from limited to full range. Frames are found by their
+    time in the container: going back starts at the key frame before.
+    """
+
+    random_access = False  # and without time stamps: those of the container are a player's, not the camera's
+
+    def __init__(self, file: Path, camera: str) -> None:
+        self.file, self.camera = file, camera
+        self._lock = threading.Lock()
+        self._cursors: list[_Cursor] = []  # the last used one last
+        self._digest: bytes | None = None
+        with _opened(file, camera) as container:
+            codec = container.streams.video[0].codec_context
+            check_frame_size(codec.width, codec.height, str(file))
+            codec_name = str(codec.name)
+            self._index = _index(container, codec_name, file)
+
+        def looked_at(index: int) -> tuple[Any, Image]:
+            frame = self._frame(index, self.describe(index))
+            return frame, _luma(frame, self.describe(index))
+
+        frame, first = first_readable(len(self), camera, looked_at)
+        notes = _format_notes(frame)
+        self.image_size, self.dtype, self.bit_depth = first.shape[::-1], first.dtype, _depth(frame)
+        if codec_name not in _LOSSLESS:
+            notes.append(f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss")
+        self.notes = tuple(f"{camera} camera: {note}" for note in notes)
+        self.doubts = tuple(f"{camera} camera: {doubt}" for doubt in _gap_doubts(self._index.times))
+
+    def __len__(self) -> int:
+        return len(self._index.times)
+
+    def describe(self, index: int) -> str:
+        """File and frame."""
+        return f"{self.file}, frame {index}"
+
+    def _place(self, index: int) -> str:
+        return str(self.file)
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        with self._lock:
+            image = _luma(self._frame(index, where), where)
+            return image.copy() if out is None else image
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """SHA-256 of the file and the range: compressed frames cannot be told apart without decoding them."""
+        if self._digest is None:
+            try:
+                with self.file.open("rb") as stream:
+                    self._digest = hashlib.file_digest(stream, "sha256").digest()
+            except OSError:  # the file went away: what was measured stays, but no other run will be taken for the same
+                self._digest = b"unreadable" + os.urandom(16)
+        return hashlib.sha256(self._digest + f"{start}:{stop}".encode()).hexdigest()
+
+    def _frame(self, index: int, where: str) -> Any:
+        try:
+            cursor = self._cursor_near(index)
+        except RecordingError as error:  # the file is opened anew to go back
+            raise RecordingError(f"{where}: {error}") from error
+        return cursor.frame(index, where)
+
+    def _cursor_near(self, index: int) -> _Cursor:
+        """A place in the file from which frame `index` is reached soonest."""
+        start = min(self._index.key_before(index), max(index - _DECODED_ON, 0))
+        behind = [cursor for cursor in self._cursors if start <= cursor.next <= index]
+        if behind:
+            cursor = max(behind, key=lambda cursor: cursor.next)
+            self._cursors.remove(cursor)
+        else:
+            if len(self._cursors) >= _MOST_CURSORS:
+                self._cursors.pop(0).close()
+            cursor = _Cursor(self.file, self.camera, self._index, self._index.key_before(index))
+        self._cursors.append(cursor)
+        return cursor
+
+
+@dataclass(frozen=True)
+class _Index:
+    """Where the frames of a video are in its own time."""
+
+    times: NDArray[np.int64]  # (n,) in order of presentation, in units of the container
+    key_frames: NDArray[np.int64]  # indices of the frames at which decoding can begin; 0 is one
+    timed: bool  # False where the container has no times: frames are counted
+    checked: bool  # packets carry checksums that the decoder does not enforce
+
+    def key_before(self, index: int) -> int:
+        return int(self.key_frames[np.searchsorted(self.key_frames, index, side="right") - 1])
+
+
+def _index(container: Any, codec: str, file: Path) -> _Index:
+    """Times of all packets; in containers without usable times, their numbers, and one key frame: the first."""
+    import av
+
+    times: list[int | None] = []
+    order: list[int | None] = []
+    keys: list[bool] = []
+    checked = False
+
+    try:
+        for packet in container.demux(container.streams.video[0]):
+            if packet.size:
+                if codec == "ffv1" and not checked and len(times) < _LOOKED_AT:
+                    checked = checksums_hold(bytes(packet))
+                times.append(packet.pts)
+                order.append(packet.dts)
+                keys.append(bool(packet.is_keyframe))
+    except (av.FFmpegError, OSError) as error:
+        if not times:
+            raise RecordingError(f"{file}: damaged video ({error}). Copy it again.") from error
+    if not times:
+        raise RecordingError(f"{file}: a video without frames. Export it again.")
+    if None in times or len(set(times)) < len(times):
+        times = order
+    if None in times or len(set(times)) < len(times):
+        return _Index(np.arange(len(times)), np.zeros(1, np.int64), False, checked)
+    stamps = np.array(times, np.int64)
+    presented = np.argsort(stamps, kind="stable")
+    key_frames = np.flatnonzero(np.array(keys)[presented])
+    return _Index(stamps[presented], np.union1d(key_frames, [0]), True, checked)
+
+
+class _Cursor:
+    """A decoder at some place of the file. Frames that it must pass over are decoded and dropped."""
+
+    def __init__(self, file: Path, camera: str, index: _Index, start: int) -> None:
+        self.next = start
+        self._index = index
+        self._container = _opened(file, camera)
+        self._held: _Decoded | None = None  # decoded already, but not asked for yet
+        try:
+            if start:
+                stream = self._container.streams.video[0]
+                self._container.seek(int(index.times[start]), stream=stream, backward=True)
+        except (OSError, ValueError):
+            self._container.close()
+            self._container, self.next = _opened(file, camera), 0
+        self._frames = self._decode()
+
+    def close(self) -> None:
+        self._frames.close()
+        self._container.close()
+
+    def frame(self, index: int, where: str) -> Any:
+        """The decoded frame `index`, which must not lie before `next`."""
+        self.next = index + 1
+        position, frame, problem = self._held or (-1, None, "")
+        while position < index:
+            position, frame, problem = next(self._frames, (len(self._index.times), None, ""))
+        self._held = (position, frame, problem) if position > index else None
+        if position > index:
+            raise RecordingError(f"{where}: the video does not hold this frame, or it is cut short. Copy it again.")
+        if frame is None:
+            raise RecordingError(f"{where}: cannot be decoded ({problem}). Copy or export the video again.")
+        return frame
+
+    def _decode(self) -> Generator[_Decoded, None, None]:
+        """All frames from here on in order; after damage none is trusted up to the next key frame."""
+        import av
+
+        count, damage = self.next, ""
+        packets = self._container.demux(self._container.streams.video[0])
+        while True:
+            try:
+                packet = next(packets, None)
+            except (av.FFmpegError, OSError, ValueError):
+                return  # what follows is not to be found any more
+            if packet is None:
+                return
+            if packet.is_keyframe and packet.size:
+                damage = ""
+            try:
+                if self._index.checked and packet.size and not checksums_hold(bytes(packet)):
+                    damage = damage or "wrong checksum"
+                frames = packet.decode()
+            except (av.FFmpegError, OSError, ValueError) as error:
+                damage = damage or str(error)
+                if packet.size:
+                    yield self._position(packet, count), None, damage
+                    count += 1
+                continue
+            for frame in frames:
+                position = self._position(frame, count)
+                problem = damage or ("marked as corrupt" if frame.is_corrupt else "")
+                yield position, None if problem else frame, problem
+                count = position + 1
+
+    def _position(self, item: Any, count: int) -> int:
+        """Index of a packet or frame by its time; by counting where the container has no times."""
+        if not self._index.timed or item.pts is None:
+            return count
+        return int(np.searchsorted(self._index.times, item.pts))
+
+
+def _opened(file: Path, camera: str) -> Any:
+    try:
+        import av
+    except ImportError as error:
+        raise RecordingError(f"{file}: videos need PyAV. Install it: pip install disctrack[video]") from error
+    try:
+        container = av.open(str(file), options=_CONTAINERS)
+        codec = container.streams.video[0].codec_context
+        if codec is None:
+            raise ValueError("no decoder for it")
+        codec.thread_type = "NONE"  # the other camera's file is decoded beside this one
+        codec.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
+        return container
+    except (av.FFmpegError, IndexError, OSError, ValueError) as error:
+        raise RecordingError(f"{file}: not a readable video for the {camera} camera ({error}).") from error
+
+
+def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
+    """A doubt where the container's clock skips: the recorder lost frames there."""
+    steps = np.diff(times)
+    if len(steps) < 3:
+        return []
+    typical = float(np.median(steps))
+    gaps = np.flatnonzero(steps > 1.5 * typical + 1)
+    if not len(gaps) or len(gaps) > 0.1 * len(steps):
+        return []
+    lost = int(np.rint(steps[gaps] / typical - 1).sum())
+    shown = ", ".join(str(gap) for gap in gaps[:5]) + (", ..." if len(gaps) > 5 else "")
+    return [f"the video's clock skips after frame {shown}: {lost} frame(s) seem to be lost, and time shifts there"]
+
+
+def _depth(frame: Any) -> int:
+    """Significant bits of the grey values."""
+    return int(frame.format.components[0].bits)
+
+
+def _format_notes(frame: Any) -> list[str]:
+    """What the user should know of the pixel format."""
+    name, notes = frame.format.name, []
+    if name.startswith("yuvj") or (name.startswith("yuv") and frame.color_range == 2):
+        notes.append(f"luma of {name} (full range) is used as it is")
+    elif name.startswith(("yuv", "nv", "p0", "uyvy", "yuyv")):
+        notes.append(f"luma of {name} is used as it is, not stretched: limited range has black at 16 and white at 235")
+    if name.startswith(("yuv4", "yuvj4")) and _depth(frame) == 8 and any(_varies(p) for p in frame.planes[1:3]):
+        notes.append("the video has colour: its luma is a mixture of what the sensor measured")
+    return notes
+
+
+def _varies(plane: Any) -> bool:
+    rows = _rows(plane, plane.height)[:, : plane.width]
+    return bool((rows != rows[0, 0]).any())
+
+
+def _rows(plane: Any, height: int) -> NDArray[np.uint8]:
+    """Bytes of a plane's rows (height, bytes), the upper first; a view of its memory where that begins with them."""
+    size = abs(plane.line_size)
+    if plane.line_size >= 0:
+        return np.frombuffer(plane, np.uint8)[: size * height].reshape(height, size)
+    first = plane.buffer_ptr + (height - 1) * plane.line_size  # bottom up: the plane says where the upper row lies
+    return np.frombuffer(ctypes.string_at(first, size * height), np.uint8).reshape(height, size)[::-1]
+
+
+def _without_palette(frame: Any) -> bool:
+    """True where all entries are alike: a recorder of grey values left the palette out, and all would be black."""
+    colours = np.frombuffer(frame.planes[1], np.uint8)[:1024].reshape(256, 4)[:, :3]
+    return bool((colours == colours[0]).all())
+
+
+def _luma(frame: Any, where: str) -> Image:
+    """Grey values (h, w) of a decoded frame without conversion; a view of its memory where possible."""
+    name = frame.format.name
+    component = frame.format.components[0]
+    if name.startswith(("gray", "yuv", "yuyv", "nv12", "nv16", "nv21", "nv24", "p0", "uyvy")) and name[-2:] not in (
+        "be",
+        "32",
+    ):
+        plane = frame.planes[0]
+        dtype = np.uint8 if component.bits == 8 else np.dtype("<u2")
+        if component.bits in (8, 9, 10, 12, 14, 16):
+            step, first = {"yuyv422": (2, 0), "uyvy422": (2, 1)}.get(name, (1, 0))
+            rows = _rows(plane, frame.height).view(dtype)
+            return np.asarray(rows[:, first : step * frame.width : step])
+    if name in ("gray10be", "gray12be", "gray14be", "gray16be"):
+        return np.asarray(frame.to_ndarray(format=name)).astype(np.uint16)
+    if name == "pal8" and _without_palette(frame):
+        return _rows(frame.planes[0], frame.height)[:, : frame.width]
+    if name in ("rgb24", "bgr24", "bgr0", "rgba", "bgra", "argb", "gbrp", "pal8"):
+        return as_grey(np.asarray(frame.to_ndarray(format="rgb24")), where)
+    raise RecordingError(f"{where}: pixel format {name} is not read. Export as grey of 8, 10, 12 or 16 bit (ffv1).")

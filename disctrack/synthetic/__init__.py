@@ -1,0 +1,26 @@
+"""Synthetic recordings with known truth: what the two cameras would see, down to photons and quantisation.
+
+rays (own inverse of the lens) -> areas, disc_raster, board_raster -> optics (blur, lamp) -> sensor (noise, numbers)
+-> images (disc, chessboard) -> cameras (true rig, board poses) -> recording (folder) and truth (truth.h5).
+It shares no code with the location of markers and corners, so that those can be judged by it.
+"""
+
+from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
+from disctrack.synthetic.images import expected_disc, render_board, render_disc
+from disctrack.synthetic.recording import recording_toml, run_render, true_disc_of, write_recording
+from disctrack.synthetic.truth import Truth, read_truth
+
+__all__ = [
+    "Truth",
+    "board_poses",
+    "expected_disc",
+    "read_truth",
+    "recording_toml",
+    "render_board",
+    "render_disc",
+    "rig_after_faults",
+    "rig_of",
+    "run_render",
+    "true_disc_of",
+    "write_recording",
+]

@@ -1,0 +1,164 @@
+"""The true rig and the poses of the chessboard that a scene stands for: seeded, so that every recording has its own."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from calibration.arrays import Array
+from calibration.camera import Camera, StereoRig, placed_at
+from disctrack.errors import SceneError
+from disctrack.frames import rotation_from_vector
+from disctrack.synthetic.description import CameraFault, Scene
+
+
+class View(NamedTuple):
+    """One camera and where it stands: x_camera = R_camera_world x_world + t_camera_world."""
+
+    camera: Camera
+    R_camera_world: Array  # (3, 3)
+    t_camera_world: Array  # (3,) [m]
+
+
+def image_of(points_world: Array, view: View) -> Array:
+    """Pixels (..., 2) of points (..., 3) [m]: Brown's polynomial as printed, for bounding boxes and truth only.
+
+    Not `calibration.camera`'s, so that a mistake there shows up in the truth.
+    """
+    points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
+    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    k1, k2, p1, p2, k3 = view.camera.distortion
+    s = x**2 + y**2
+    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
+    xd = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x**2)
+    yd = y * radial + p1 * (s + 2 * y**2) + 2 * p2 * x * y
+    return np.stack([view.camera.fx * xd + view.camera.cx, view.camera.fy * yd + view.camera.cy], axis=-1)
+
+
+def rig_of(scene: Scene) -> StereoRig:
+    """The rig as it was while it was calibrated, with the table as world."""
+    rng = np.random.default_rng([scene.seed, 1])
+    left, right = (_camera(scene, index, rng) for index in (0, 1))
+    return StereoRig(left.camera, right.camera, **_places(left, right), world_is_table=True)
+
+
+def _places(*views: View) -> dict[str, Any]:
+    return placed_at([(view.R_camera_world, view.t_camera_world) for view in views])
+
+
+def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
+    """One camera, looking at the target from where the settings say, all with the seeded scatter."""
+    s, scatter = scene.rig, scene.rig.variation * rng.standard_normal(16)
+    target = np.array(s.target_mm) * 1e-3 + 2e-3 * scatter[0:3]
+    distance = s.distance_mm[index] * 1e-3 + 0.01 * scatter[3]
+    off_vertical, azimuth, roll = np.radians(
+        [
+            s.off_vertical_deg[index] + 2 * scatter[4],
+            s.azimuth_deg[index] + 2 * scatter[5],
+            s.roll_deg[index] + scatter[6],
+        ]
+    )
+    away = np.array(
+        [np.sin(off_vertical) * np.cos(azimuth), np.sin(off_vertical) * np.sin(azimuth), np.cos(off_vertical)]
+    )
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])  # image x: horizontal, camera z looks along -away
+    upright = np.stack([right, np.cross(-away, right), -away])
+    R = rotation_from_vector(np.array([0.0, 0.0, roll])) @ upright
+    width, height = s_size = scene.cameras.image_size
+    focal = s.distance_mm[index] / s.mm_per_px * (1 + 0.005 * scatter[7])
+    camera = Camera(
+        fx=float(focal),
+        fy=float(focal * (1 + 5e-4 * scatter[8])),
+        cx=float((width - 1) / 2 + 4 * scatter[9]),
+        cy=float((height - 1) / 2 + 4 * scatter[10]),
+        distortion=(
+            s.k1[index] + 0.01 * float(scatter[11]),
+            s.k2[index] + 0.03 * float(scatter[12]),
+            s.p1[index] + 2e-4 * float(scatter[13]),
+            s.p2[index] + 2e-4 * float(scatter[14]),
+            s.k3[index],
+        ),
+        image_size=s_size,
+    )
+    return View(camera, R, -R @ (target + distance * away))
+
+
+def rig_after_faults(rig: StereoRig, scene: Scene) -> StereoRig:
+    """The rig while the disc was filmed, in axes of the true table.
+
+    As calibrated, but for what `scene.faults` did to the cameras since, and for a table that is not where the
+    calibration's table view says.
+    """
+    turn_table = rotation_from_vector(np.radians([*scene.faults.table_turn_deg, 0.0]))
+    lift_table = np.array([0.0, 0.0, scene.faults.table_height_mm * 1e-3])
+    views = []
+    for camera, (R, t), fault in zip(
+        rig.cameras, rig.camera_poses(), (scene.faults.left, scene.faults.right), strict=True
+    ):
+        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
+        moved = turn @ (t + R @ lift_table - np.array(fault.translation_mm) * 1e-3)
+        views.append(View(_changed_lens(camera, fault), turn @ R @ turn_table, moved))
+    left, right = views
+    return replace(rig, left=left.camera, right=right.camera, **_places(left, right))
+
+
+def _changed_lens(camera: Camera, fault: CameraFault) -> Camera:
+    k1, k2, p1, p2, k3 = camera.distortion
+    return replace(
+        camera,
+        fx=camera.fx * fault.focal_scale,
+        fy=camera.fy * fault.focal_scale,
+        cx=camera.cx + fault.principal_point_change_px[0],
+        cy=camera.cy + fault.principal_point_change_px[1],
+        distortion=(k1 + fault.k1_change, k2, p1, p2, k3),
+    )
+
+
+def board_poses(scene: Scene, rig: StereoRig) -> tuple[Array, Array]:
+    """R_world_board (n, 3, 3) and t_world_board (n, 3) [m] of the calibration views; view 0 lies flat on the table.
+
+    The others are drawn at random until all squares lie inside both images and the board is not seen flatter than 65
+    degrees off its normal. Raises SceneError where the rig leaves no room for that.
+    """
+    board, rng = scene.board, np.random.default_rng([scene.seed, 2])
+    middle = (np.array([*board.inner_corners, 1.0]) - 1) / 2 * board.square_mm * 1e-3
+    R = [np.eye(3)]
+    t = [np.array([0.0, 0.0, board.thickness_mm * 1e-3])]
+    if not _in_view(R[0], t[0], rig, scene):
+        raise SceneError("board: lying flat on the table it is not inside both images; move the target or the cameras")
+    target = np.array([*scene.rig.target_mm[:2], 0.0]) * 1e-3
+    tries = 0
+    while len(R) < board.n_views:
+        tries += 1
+        if tries > 2000 * board.n_views:
+            raise SceneError(
+                f"board: only {len(R)} of {board.n_views} views found with all squares in both images;"
+                " lower board.shift_mm, board.max_tilt_deg or the number of views"
+            )
+        direction = rng.uniform(0, 2 * np.pi)
+        tilt = np.radians(board.max_tilt_deg) * np.sqrt(rng.uniform(0.05, 1.0))
+        turn = np.radians(rng.uniform(-board.max_turn_deg, board.max_turn_deg))
+        R_try = rotation_from_vector(tilt * np.array([np.cos(direction), np.sin(direction), 0.0])) @ (
+            rotation_from_vector(np.array([0.0, 0.0, turn]))
+        )
+        shift = np.array([*rng.uniform(-board.shift_mm, board.shift_mm, 2), rng.uniform(*board.height_mm)]) * 1e-3
+        t_try = target + shift - R_try @ middle
+        if _in_view(R_try, t_try, rig, scene):
+            R.append(R_try)
+            t.append(t_try)
+    return np.stack(R[: board.n_views]), np.stack(t[: board.n_views])
+
+
+def _in_view(R_world_board: Array, t_world_board: Array, rig: StereoRig, scene: Scene) -> bool:
+    board = scene.board
+    corners = np.array([[x, y, 0.0] for x in (-1, board.inner_corners[0]) for y in (-1, board.inner_corners[1])])
+    points = corners * board.square_mm * 1e-3 @ R_world_board.T + t_world_board
+    for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
+        pixels = image_of(points, View(camera, R, t))
+        size = np.array(camera.image_size)
+        if np.any(pixels < 8) or np.any(pixels > size - 9):
+            return False
+        eye = -R.T @ t - points.mean(axis=0)
+        if eye @ R_world_board[:, 2] < np.cos(np.radians(65)) * np.linalg.norm(eye):
+            return False
+    return True

@@ -1,0 +1,163 @@
+"""From the motion section of a scene to the pose of the disc at any instant: at rest, by a table, or rolling."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+from calibration.arrays import Array
+from disctrack.errors import SceneError
+from disctrack.rolling import Model, Motion, State, effects_from_tables, simulate, steady_precession, struck_disc
+from disctrack.synthetic.description import RollingMotion, Scene
+
+_SAMPLES_PER_FRAME = 4  # of the simulated motion; a cubic between them errs by 3e-8 of a nutation oscillation
+
+
+@dataclass(frozen=True)
+class SceneMotion:
+    """Pose of the disc over time, and for which frames it is known."""
+
+    pose: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) q, SI and radians, angles not wrapped
+    rates: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) dq/dt
+    n_frames: int
+    simulated: Motion | None = None  # the rolling model's own result, where the motion is one
+
+
+def true_frame_rate(scene: Scene) -> float:
+    """Frames per second that the cameras really took [Hz]."""
+    return scene.faults.frame_rate_hz or scene.cameras.frame_rate_hz
+
+
+def true_exposure(scene: Scene) -> float:
+    """Time over which a frame is exposed [s]."""
+    return scene.faults.exposure_s or scene.cameras.exposure_s
+
+
+def motion_of(scene: Scene) -> SceneMotion:
+    """Motion that the scene asks for; raises SceneError where it cannot be had."""
+    return {"static": _static, "table": _table, "rolling": _rolling}[scene.motion.kind](scene)
+
+
+def _static(scene: Scene) -> SceneMotion:
+    q = np.array(scene.motion.poses) * np.r_[np.full(3, 1e-3), np.full(3, np.pi / 180)]
+    rate = true_frame_rate(scene)
+
+    def pose(time: Array) -> Array:
+        return q[np.clip(np.rint(np.asarray(time) * rate).astype(int), 0, len(q) - 1)]
+
+    return SceneMotion(pose, lambda time: np.zeros_like(pose(time)), len(q))
+
+
+def _table(scene: Scene) -> SceneMotion:
+    path = scene.folder / scene.motion.table
+    try:
+        rows = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: no table of motion ({error}); expected rows t, x, y, z, psi, theta, phi") from error
+    if rows.ndim != 2 or rows.shape[1] != 7 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0).all():
+        raise SceneError(f"{path}: shape {rows.shape}; expected 2 or more rows of 7 with increasing t [s]")
+    if not np.isfinite(rows).all():
+        raise SceneError(f"{path}: row {np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]} holds no finite number")
+    spline = CubicSpline(rows[:, 0], rows[:, 1:])
+    n = _frames_within(scene, rows[0, 0], rows[-1, 0], str(path))
+    return SceneMotion(spline, spline.derivative(), n)
+
+
+def _rolling(scene: Scene) -> SceneMotion:
+    motion = simulate_scene(scene)
+    if len(motion) < 2:
+        raise SceneError(f"the rolling model: over before anything is filmed: {motion.end.value}")
+    spline = CubicHermiteSpline(motion.time, motion.q, motion.qdot)
+    n = _frames_within(scene, motion.time[0], motion.time[-1], "the rolling model")
+    return SceneMotion(spline, spline.derivative(), n, motion)
+
+
+def _margin(scene: Scene) -> tuple[float, float]:
+    """Time needed before the first and after the last mid exposure of the left camera [s]."""
+    half, delay = true_exposure(scene) / 2, scene.faults.right_delay_s
+    return half + max(-delay, 0.0), half + max(delay, 0.0)
+
+
+def _frames_within(scene: Scene, start: float, end: float, source: str) -> int:
+    before, after = _margin(scene)
+    if start > -before + 1e-9:
+        raise SceneError(f"{source}: begins at {start:g} s, after the first exposure at {-before:g} s; begin earlier")
+    n = int(np.floor((end - after) * true_frame_rate(scene) + 1e-6)) + 1
+    if n < 1:
+        raise SceneError(f"{source}: ends at {end:g} s, before the first frame is exposed")
+    return min(n, scene.cameras.n_frames)
+
+
+def rolling_model(scene: Scene) -> Model:
+    """Declared disc and gravity with the scene's effects; raises ModelError for an effect that does not exist."""
+    settings = scene.motion.rolling
+    effects = effects_from_tables(settings.effects, settings.formulas)
+    return Model(scene.declared_disc, scene.gravity_m_s2, effects, scene.air_density_kg_m3)
+
+
+def effects_in_words(scene: Scene) -> str:
+    """The effects of a rolling scene with their sizes, and which of the usual ones it leaves out."""
+    model = rolling_model(scene)
+    named = ", ".join(f"{k} = {v:g} {model.parameters[k].unit}" for k, v in model.values.items()) or "none"
+    without = ", ".join(name for name in RollingMotion().effects if model.effect(name) is None)
+    return f"{named}; without {without}, which only a scene that names no effect has" if without else named
+
+
+def rolling_start(scene: Scene) -> State:
+    """State at the beginning: regular precession with a nutation oscillation, changed by the scene's `state`.
+
+    Or, with `struck`, the upright disc just after a ball has hit it.
+    """
+    start = scene.motion.rolling
+    if start.struck:
+        return _struck(scene)
+    unknown = set(start.state) - set(State.__dataclass_fields__)
+    if unknown:
+        known = ", ".join(State.__dataclass_fields__)
+        raise SceneError(f"motion.rolling.state: unknown {', '.join(sorted(unknown))}; a state has {known}")
+    regular = steady_precession(
+        np.radians(start.theta_deg),
+        scene.declared_disc,
+        scene.gravity_m_s2,
+        omega3=None if np.isnan(start.omega3_rad_s) else start.omega3_rad_s,
+        nutation_amplitude=np.radians(start.nutation_deg),
+        nutation_phase=np.radians(start.nutation_phase_deg),
+        psi=np.radians(start.psi_deg),
+        phi=np.radians(start.phi_deg),
+        x=start.centre_mm[0] * 1e-3,
+        y=start.centre_mm[1] * 1e-3,
+    )
+    return regular.moved(**start.state)
+
+
+def _struck(scene: Scene) -> State:
+    start = scene.motion.rolling
+    wanted = {"lateral_mm", "vertical_mm", "impulse_N_s"}
+    given = set(start.struck)
+    if not wanted <= given <= wanted | {"friction"}:
+        raise SceneError(
+            f"motion.rolling.struck has {', '.join(sorted(given))}; expected {', '.join(sorted(wanted))} and, "
+            "if wanted, friction"
+        )
+    return struck_disc(
+        scene.declared_disc,
+        start.struck["lateral_mm"] * 1e-3,
+        start.struck["vertical_mm"] * 1e-3,
+        start.struck["impulse_N_s"],
+        friction=start.struck.get("friction", 0.0),
+        psi=np.radians(start.psi_deg),
+        phi=np.radians(start.phi_deg),
+        x=start.centre_mm[0] * 1e-3,
+        y=start.centre_mm[1] * 1e-3,
+    )
+
+
+def simulate_scene(scene: Scene) -> Motion:
+    """The rolling model's motion, four samples per frame; it ends early where the disc comes to rest."""
+    before, after = _margin(scene)
+    step = 1 / (_SAMPLES_PER_FRAME * true_frame_rate(scene))
+    first = -int(np.ceil(before / step + 1e-9))
+    last = _SAMPLES_PER_FRAME * (scene.cameras.n_frames - 1) + int(np.ceil(after / step + 1e-9))
+    times = np.arange(first, max(last, first + 1) + 1) * step
+    return simulate(rolling_model(scene), rolling_start(scene), times=times)

@@ -1,0 +1,42 @@
+"""From light to the numbers in a file: photons, read noise, hot pixels, quantisation."""
+
+import numpy as np
+
+from calibration.arrays import Array32, Image
+from disctrack.synthetic.description import SensorSettings
+
+MOST_ELECTRONS = np.float32(1e12)  # in a pixel; the generator takes no more than 1e18
+
+
+def digitise(
+    expected: Array32,
+    settings: SensorSettings,
+    bit_depth: int,
+    rng: np.random.Generator | None,
+    hot: Array32 | None = None,
+) -> Image:
+    """Image as the camera writes it, from the expected 8-bit grey values (..., height, width).
+
+    Electrons are Poisson with mean gain * grey, read noise is Gaussian, the sum is scaled to the bit depth, rounded and
+    clipped. Without `rng` the image is quantised only.
+    """
+    grey = expected if hot is None else expected + hot
+    if rng is not None:
+        gain = np.float32(settings.gain_e_per_dn)
+        if gain > 0:
+            electrons = rng.poisson(np.minimum(np.maximum(grey, 0.0) * gain, MOST_ELECTRONS))
+            grey = electrons.astype(np.float32) / gain
+        grey = grey + np.float32(settings.read_noise_dn) * rng.standard_normal(grey.shape, dtype=np.float32)
+    top = 2**bit_depth - 1
+    levels = np.rint((grey + np.float32(settings.black_level_dn)) * np.float32(top / 255.0))
+    return np.clip(levels, 0, top).astype(np.uint8 if bit_depth == 8 else np.uint16)
+
+
+def hot_pixels(settings: SensorSettings, image_size: tuple[int, int], rng: np.random.Generator) -> Array32 | None:
+    """Excess grey of the sensor's hot pixels (height, width), the same in every frame; None without any."""
+    if settings.hot_pixels == 0:
+        return None
+    excess = np.zeros((image_size[1], image_size[0]), np.float32)
+    where = rng.choice(excess.size, settings.hot_pixels, replace=False)
+    excess.flat[where] = rng.exponential(settings.hot_pixel_dn, settings.hot_pixels)
+    return excess

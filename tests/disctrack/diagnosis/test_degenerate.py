@@ -1,0 +1,127 @@
+"""Numbers that move together, at a bound or along a valley: errors are as large as the standard deviations say."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+
+from disctrack.diagnosis import DiscSystem
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.discrepancy.fit import covariance_within, fit
+from disctrack.discrepancy.shape import profiled
+from disctrack.discrepancy.system import Quantity
+from disctrack.synthetic.description import Faults
+from tests.oracles import newton_euler
+from tests.oracles.measured_disc import K_M, measured
+
+
+class SquareBesidePower:
+    """y = a t^2 + k t^p with noise; a may not be negative."""
+
+    candidates = ()
+    exponent = Quantity("p", "1", 0.1, null=1.5, lower=0.0, upper=4.0)
+
+    def __init__(self, a: float, seed: int) -> None:
+        self.time = np.linspace(0.7, 1.4, 100)
+        self.base = (Quantity("a", "1", 0.1, lower=0.0), Quantity("k", "1", 0.1, lower=0.0))
+        self.weights = np.ones(100)
+        noise = 3e-4 * np.random.default_rng(seed).standard_normal(100)
+        self.data = a * self.time**2 + self.time**1.2 + noise
+
+    def linearise(self, values, names):
+        power = self.time ** values["p"]
+        residual = self.data - values["a"] * self.time**2 - values["k"] * power
+        by = {"a": self.time**2, "k": power, "p": values["k"] * power * np.log(self.time)}
+        columns = np.zeros((100, 1, len(names)))
+        for i, name in enumerate(names):
+            columns[:, 0, i] = by[name] / 3e-4
+        return residual[:, None] / 3e-4, columns
+
+
+@pytest.mark.parametrize("inside", [0.0, 0.003])  # up to half a standard deviation of a
+def test_an_exponent_beside_a_law_at_its_bound(inside):
+    """Where the other law comes to stand at zero the profile of the exponent has a kink."""
+    pulls, naive = [], []
+    for seed in range(24):
+        system = SquareBesidePower(inside, seed)
+        nominal = fit(system, system.base, {"p": 1.5})
+        found = profiled(system, nominal, system.exponent, 0.1)
+        truth = np.array([inside, 1.0, 1.2])
+        values = np.array([found.values[n] for n in "akp"])
+        cost = lambda x, system=system: np.sum(system.linearise(dict(zip("akp", x, strict=True)), [])[0] ** 2)  # noqa: E731
+        assert found.cost <= cost(truth) + 0.1  # the lowest point of the valley
+        pulls.append((values - truth) / [found.sigma(n) for n in "akp"])
+        if values[0] == 0.0:
+            alone = fit(system, (system.base[1], system.exponent), {"a": 0.0, "k": 1.0, "p": 1.2})
+            naive.append((values[2] - 1.2) / alone.sigma("p"))
+    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
+    # half of the estimates stand at the bound and are better than their sigma, which allows for the truth inside
+    assert (rms < 1.0 + 3 / np.sqrt(48)).all()
+    assert (rms > 0.4).all()
+    assert np.abs(pulls).max() < 3.5
+    if inside:  # a law taken to be absent because it stands at zero: the exponent's error is many of its sigmas
+        assert np.sqrt(np.mean(np.square(naive))) > 3
+
+
+def test_a_quantity_far_beyond_its_bound_is_known_to_lie_near_it(rng):
+    """The tail of a normal distribution that begins t sigmas out has the mean square distance 2 / t^2."""
+    matrix, bound = np.array([[1.0, 0.9], [0.0, 0.5]]), np.array([0.0, -np.inf])
+    free = np.linalg.inv(matrix.T @ matrix)
+    for beyond in (0.0, 1.0, 3.0, 12.0):
+        optimum = np.array([-beyond * np.sqrt(free[0, 0]), 0.0])
+        found = covariance_within(matrix, matrix @ optimum, np.zeros(2), bound, np.full(2, np.inf))
+        x = rng.multivariate_normal(optimum, free, 400_000)
+        if beyond < 4:
+            kept = x[x[:, 0] > 0]
+            assert found[0, 0] == pytest.approx(np.mean(kept[:, 0] ** 2), rel=0.1)
+        else:
+            assert found[0, 0] == pytest.approx(2 * free[0, 0] / beyond**2)
+    assert covariance_within(matrix, np.zeros(2), np.ones(2), bound, np.full(2, np.inf)) == pytest.approx(free)
+
+
+def power_friction(k: float, p: float):
+    """Rolling friction with an exponent."""
+    law = lambda now: -k * abs(now.psidot / 100) ** p * np.sign(now.psidot) * now.m0  # noqa: E731
+    return lambda disc, now: (newton_euler.ZERO, law(now), newton_euler.ZERO)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("laws", "delay", "fitted", "shape", "truth"),
+    [
+        (
+            (newton_euler.precession_friction(K_M), newton_euler.pivoting_friction(60e-6)),
+            0.0, "kz.k_z", (), {"km.k_m": K_M, "kz.k_z": 60e-6},
+        ),
+        ((newton_euler.precession_friction(K_M),), 1e-4, "time_offset.delay", (), {"time_offset.delay": 1e-4}),
+        (
+            (power_friction(603e-6, 1.2),),
+            0.0, "rolling_power.k", ("rolling_power.p",),
+            {"km.k_m": 0.0, "rolling_power.k": 603e-6, "rolling_power.p": 1.2},
+        ),
+    ],
+    ids=["pivoting", "delay", "exponent"],
+)  # fmt: skip
+def test_pulls_over_many_recordings_of_one_motion(laws, delay, fitted, shape, truth):
+    """Motions by world vectors and quaternions; every recording has its own noise and error of calibration."""
+    disc = measured(n=50).disc
+    body = newton_euler.Disc(disc.radius, disc.half_thickness, disc.mass, laws=laws)
+    omega2 = 1.01 * np.sqrt(4 * 9.81 * np.sin(np.radians(10)) / body.r)
+    start = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, np.radians(10), -0.4, 0.0, omega2, 1.0)
+    times = np.arange(0, 0.82, 1 / 4000)
+    states = newton_euler.follow(body, start, times, atol=1e-13).y
+    moving = [newton_euler.Instant(body, s) for s in states.T]
+    speed = np.array([[*now.v, now.psidot, now.thetadot, now.phidot] for now in moving])
+    motion = CubicHermiteSpline(times, newton_euler.coordinates(body, states), speed)
+    pulls = []
+    for seed in range(24):
+        faults = Faults(right_delay_s=delay)
+        trajectory = measured(seed=seed, n=400, declared_rate=500.0, motion=motion, faults=faults)
+        system = DiscSystem(trajectory, declared_model(trajectory).model)
+        known = {q.name: q for c in system.candidates for q in (*c.quantities, *c.shape)}
+        found = fit(system, (*system.base, known[fitted]), system.start())
+        for name in shape:
+            found = profiled(system, found, known[name], 0.05)
+        pulls.append([(found.values[n] - v) / found.sigma(n) for n, v in truth.items()])
+    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert (rms < 1.0 + 3 / np.sqrt(48)).all()
+    assert np.abs(pulls).max() < 3.5

@@ -1,0 +1,153 @@
+"""What a diagnosis found has a place in a scene: simulated, rendered or given to the next diagnosis, it acts again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration.camera import rotation_from_vector
+from disctrack.diagnosis import DiscSystem, diagnose_trajectory
+from disctrack.diagnosis.disc.faults import measurement_candidates, predict
+from disctrack.diagnosis.disc.model_file import declared_model, model_toml
+from disctrack.diagnosis.disc.start import first_state
+from disctrack.frames import rotation_from_euler
+from disctrack.rolling import simulate
+from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_after_faults
+from disctrack.synthetic.description import Faults, load_scene
+from disctrack.synthetic.motion import rolling_model, rolling_start
+from disctrack.synthetic.recording import true_disc_of
+from tests.oracles.measured_disc import measured
+
+
+@pytest.fixture(scope="module")
+def short():
+    return measured(seed=61, n=60)
+
+
+def saved(system, values, folder):
+    path = folder / "model.toml"
+    path.write_text(model_toml(system, values, "of any\n= name"))
+    return path
+
+
+@pytest.fixture
+def everything_wrong(short, rng):
+    """Every number of every fault of the measurement, some steps from null."""
+    quantities = [q for c in measurement_candidates(short.disc) for q in c.quantities]
+    size = {q.name: float(10 * q.scale * rng.uniform(0.5, 1.5)) for q in quantities}
+    return {n: v if n.startswith("exposure") else v * rng.choice([-1, 1]) for n, v in size.items()}
+
+
+def test_every_fault_of_the_measurement_survives_the_file(short, everything_wrong, tmp_path):
+    system = DiscSystem(short, declared_model(short).model)
+    values = first_state(system.time, short.q) | {"km.k_m": 3e-8} | everything_wrong
+    values = {k: v for k, v in values.items() if not k.startswith("state.v_")}
+    again = declared_model(short, str(saved(system, values, tmp_path))).faults
+    assert set(again) == set(everything_wrong)
+    for name, value in everything_wrong.items():
+        assert again[name] == pytest.approx(value, rel=1e-12), name  # degrees and back, 1 + change and back
+
+
+def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, everything_wrong, tmp_path):
+    """The renderer moves cameras, table and dots by formulas of its own."""
+    system = DiscSystem(short, declared_model(short).model)
+    state = {k: v for k, v in first_state(system.time, short.q).items() if not k.startswith("state.v_")}
+    scene = load_scene(saved(system, state | everything_wrong, tmp_path))
+    rig, q = rig_of(scene), short.q[:5]
+    R = rotation_from_euler(*q[:, 3:].T)
+    centres = true_disc_of(scene).disc.marker_centres_body
+    rendered = rig_after_faults(rig, scene).project(centres @ np.swapaxes(R, 1, 2) + q[:, None, :3])
+    predicted = predict(np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, everything_wrong).pixels
+    # arithmetic; the faults move the dots by some pixels
+    assert_allclose(np.moveaxis(rendered, -3, 1), predicted, atol=1e-9)
+    plain = predict(np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, {}).pixels
+    assert np.abs(plain - predicted).max() > 0.1
+
+
+def test_a_saved_model_looks_at_the_disc_as_the_cameras_did(short, tmp_path):
+    system = DiscSystem(short, declared_model(short).model)
+    values = system.start()
+    rig = rig_of(load_scene(saved(system, values, tmp_path)))
+    points = short.q[:3, None, :3] + [[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.03, 0.0]]
+    # principal points 4 px off the middle and focal lengths 0.5 % apart are not in a scene
+    assert np.abs(rig.project(points) - short.rig.project(points)).max() < 20
+
+
+@pytest.mark.parametrize(
+    ("faults", "name"),
+    [
+        (Faults(table_turn_deg=(0.03, -0.02)), "table_plane"),
+        pytest.param(Faults(pattern_scale=1.0005), "pattern_scale", marks=pytest.mark.slow),
+        pytest.param(Faults(pattern_height_mm=0.1), "pattern_height", marks=pytest.mark.slow),
+    ],
+)
+def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_path):
+    """Found, saved, simulated anew with other noise, diagnosed against the saved model."""
+    first = diagnose_trajectory(measured(faults=faults, seed=62, n=150))
+    (found,) = first.diagnosis.found
+    assert name in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
+    path = saved(first.system, first.after_fit.values, tmp_path)
+    scene = load_scene(path)
+    model, start = rolling_model(scene), rolling_start(scene)
+    again = measured(
+        faults=scene.faults, seed=63, n=150, motion=lambda t: simulate(model, start, times=np.r_[0.0, t]).q[1:]
+    )
+    assert diagnose_trajectory(again).diagnosis.verdict == "found"  # it is there ...
+    second = diagnose_trajectory(again, str(path))
+    assert second.diagnosis.verdict == "nothing missing", second.sentence  # ... and known
+
+
+def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
+    from tests.disctrack.diagnosis.test_starts import sliding
+
+    trajectory = measured(motion=sliding(0.2, (0.08, 0.04)), seed=64, n=120)
+    first = diagnose_trajectory(trajectory)
+    path = saved(first.system, first.after_fit.values, tmp_path)
+    scene = load_scene(path)
+    motion = simulate(rolling_model(scene), rolling_start(scene), 0.1)
+    # noise 0.5 um a frame, some um from the rig
+    assert np.abs(motion.q[:100, :3] - trajectory.q[:100, :3]).max() < 2e-5
+    second = diagnose_trajectory(trajectory, str(path))
+    assert second.diagnosis.verdict == "nothing missing", second.sentence
+
+
+def test_derivative_by_every_fault_agrees_with_central_differences(short, everything_wrong):
+    """Through clocks, images and the motion: what each fault says of itself against the prediction as a whole."""
+    system = DiscSystem(short, declared_model(short).model)
+    state = {k: v for k, v in first_state(system.time, short.q).items() if not k.startswith("state.v_")}
+    values = state | {"km.k_m": 3e-8} | {name: 0.1 * value for name, value in everything_wrong.items()}
+    scale = {q.name: q.scale for c in measurement_candidates(short.disc) for q in c.quantities}
+    derivative = system.linearise(values, list(scale))[1]
+    inner = slice(2, -2)  # an acceleration by differences is one-sided at the ends
+    for column, (name, step) in enumerate(scale.items()):
+        sides = [system.linearise(values | {name: values[name] + sign * step}, [])[0][inner] for sign in (-1, 1)]
+        expected = (sides[0] - sides[1]) / (2 * step)
+        # faults act on each other: blur on what the others move, to 1e-3 of it
+        assert_allclose(
+            derivative[inner, :, column], expected, atol=3e-3 * np.abs(expected).max(), err_msg=name, rtol=0
+        )
+
+
+def test_table_that_the_rim_levelled_wrongly_is_no_fault_of_the_saved_scene(short, tmp_path):
+    """Paper on the face lifts the table by the rim; in the file the cameras stand above the one that is rolled on."""
+    state = {k: v for k, v in first_state(short.time, short.q).items() if not k.startswith("state.v_")}
+    height, slope = -1e-4, 2e-3
+    values = state | {"pattern_height.offset": 1e-4, "table_height.offset": height, "table_plane.tilt_x": slope}
+
+    def eyes(rig):
+        return np.array([-R.T @ t for R, t in rig.camera_poses()])
+
+    levelled = DiscSystem(replace(short, table_moved=(1e-4, 0.0, 2e-3)), declared_model(short).model)
+    scene = load_scene(saved(levelled, values, tmp_path))
+    assert (scene.faults.table_height_mm, scene.faults.table_turn_deg) == (0.0, (0.0, 0.0))
+    assert scene.faults.pattern_height_mm == pytest.approx(0.1)
+    # from the board's axes to those of the table, which leans about x and lies lower
+    lean = rotation_from_vector(np.array([slope, 0.0, 0.0]))
+    assert_allclose(eyes(rig_of(scene)), (eyes(short.rig) - [0.0, 0.0, height]) @ lean, atol=1e-10)
+
+    as_calibrated = DiscSystem(short, declared_model(short).model)  # nobody levelled it: a fault of the table view
+    scene = load_scene(saved(as_calibrated, values, tmp_path))
+    assert scene.faults.table_height_mm == pytest.approx(-0.1)
+    assert_allclose(eyes(rig_of(scene)), eyes(short.rig), atol=1e-10)

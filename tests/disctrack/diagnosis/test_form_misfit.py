@@ -1,0 +1,137 @@
+"""Sigmas that know of a law's form being another than the truth's, and slip that is not followed for ever."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis.disc import form_misfit
+from disctrack.diagnosis.disc.system import Patience
+from disctrack.discrepancy.system import GivenUp
+from disctrack.rolling import Model, sensitivities, simulate, steady_precession
+from disctrack.rolling.model import body_constants
+from disctrack.synthetic.description import Scene
+
+
+def test_numbers_beside_a_misfit_scatter_as_generalised_least_squares_has_it(rng, monkeypatch):
+    """Right = A p + f B u + noise: about the plain estimate, GLS' covariance and the square of what it moves by."""
+    A, B, right = rng.standard_normal((40, 3)), rng.standard_normal((40, 6)), rng.standard_normal(40)
+    monkeypatch.setattr(form_misfit, "SIZES", np.array([0.7]))
+    U, inverse = form_misfit._solver(A)
+    taken = inverse @ (U.T @ B)
+    second, misfit = form_misfit._second_moment(B - U @ (U.T @ B), right - U @ (U.T @ right), [6])
+    found = np.linalg.inv(A.T @ A) + taken @ second @ taken.T
+    weight = np.linalg.inv(np.eye(40) + 0.49 * B @ B.T)
+    covariance = np.linalg.inv(A.T @ weight @ A)
+    moved = covariance @ A.T @ weight @ right - np.linalg.lstsq(A, right, rcond=None)[0]
+    assert_allclose(found, covariance + np.outer(moved, moved), rtol=1e-9)
+    assert misfit == pytest.approx(0.7)
+
+
+def test_the_size_of_a_misfit_is_read_from_the_residual(rng):
+    """Where the residual holds none, next to nothing is allowed for; where it holds one, its size."""
+    B = 1e3 * rng.standard_normal((400, 60))
+    noise = rng.standard_normal(400)
+    none = form_misfit._second_moment(B, noise, [60])[1]
+    some = form_misfit._second_moment(B, noise + 0.1 * B @ rng.standard_normal(60), [60])[1]
+    assert none < 0.003
+    assert some == pytest.approx(0.1, rel=0.3)
+
+
+def test_what_the_recording_does_not_show_of_a_misfit_is_as_large_as_before_the_data(rng):
+    """Of three parts one is seen and absent, one is seen and there, one leaves no trace: each has a size of its own."""
+    B = 1e3 * rng.standard_normal((400, 60))
+    B[:, 40:] = 0.0
+    right = rng.standard_normal(400) + 0.1 * B[:, 20:40] @ rng.standard_normal(20)
+    second, _ = form_misfit._second_moment(B, right, [20, 20, 20])
+    sizes = [float(np.sqrt(np.mean(np.diag(second)[20 * i : 20 * i + 20]))) for i in range(3)]
+    assert sizes[0] < 0.003
+    assert sizes[1] == pytest.approx(0.1, rel=0.4)
+    assert sizes[2] == pytest.approx(float(np.sqrt(np.mean(form_misfit.SIZES**2))), rel=1e-6)
+
+
+def test_the_moment_of_a_law_of_the_air_is_that_of_the_air_of_the_recording():
+    """In a third of the air, a third of the moment on the same motion."""
+    disc = Scene().declared_disc
+    thick = Model(disc, air_density=1.2).with_values({"air_quadratic.a": 0.5})
+    motion = simulate(thick, steady_precession(np.radians(14.0), disc), times=np.linspace(0.0, 0.1, 10))
+    moments = [
+        form_misfit.moment_about_contact(SimpleNamespace(disc=disc, model_with=lambda _, m=model: m), {}, motion)
+        for model in (thick, replace(thick, air_density=0.4))
+    ]
+    assert np.abs(moments[0]).max() > 1e-8
+    assert_allclose(moments[1], moments[0] / 3, rtol=1e-12)
+
+
+def test_a_tilted_table_counts_as_the_force_along_it():
+    """The same moment as a level force m g tilt at the centre, on the same motion."""
+    disc = Scene().declared_disc
+    tilted = Model(disc).with_values({"table_tilt.tilt_x": 1e-3, "table_tilt.tilt_y": -4e-4})
+    motion = simulate(tilted, steady_precession(np.radians(14.0), disc), times=np.linspace(0.0, 0.1, 10))
+    body = body_constants(tilted, 0.01)
+    pulled = Model(disc).with_values({"spring.k": 0.0, "spring.F_x": disc.mass * body["g_x"]})
+    pulled = pulled.with_values({"spring.F_y": disc.mass * body["g_y"]})
+    moments = [
+        form_misfit.moment_about_contact(SimpleNamespace(disc=disc, model_with=lambda _, m=model: m), {}, motion)
+        for model in (tilted, pulled)
+    ]
+    assert np.abs(moments[1]).max() > 1e-6
+    assert_allclose(moments[0][:, 2], moments[1][:, 2], rtol=1e-9)
+    by_weight = 0.5 * (1e-3**2 + 4e-4**2) * disc.mass * 9.81 * disc.radius  # 1 - cos(tilt) of it is missing
+    assert_allclose(moments[0], moments[1], atol=1.01 * by_weight)
+
+
+def test_slip_that_takes_too_long_is_not_followed():
+    """A friction just below what rolling needs: thousands of steps for a tenth of a second, and no derivative."""
+    disc = Scene().declared_disc
+    start = steady_precession(np.radians(14.0), disc, omega3=1.0, nutation_amplitude=np.radians(0.5))
+    model, times = Model(disc).with_values({"slip.mu": 0.06}), np.linspace(0.0, 0.3, 30)
+    whole = sensitivities(model, start, times, components=["theta"])
+    assert np.isfinite(whole.dq).all()
+    assert whole.slip_steps > 1000
+    cut = sensitivities(model, start, times, components=["theta"], max_slip_steps=whole.slip_steps // 4)
+    assert not np.isfinite(cut.dq).all()
+    assert cut.slip_steps <= whole.slip_steps // 4
+    patience = Patience(100)
+    patience.take(99)
+    with pytest.raises(GivenUp):
+        patience.take(1)
+    patience.without_end()
+    patience.take(100)
+
+
+def test_a_sum_or_a_law_with_rivals_of_another_form_is_taken_for_another_s():
+    """One law that nothing else comes near to has its form nearly for certain; two that are needed have it not."""
+
+    def law(*families, rivals=()):
+        return SimpleNamespace(
+            families=[SimpleNamespace(kind=k, terms=[{c: "1.0"}]) for k, c in families], rivals=rivals
+        )
+
+    alone, other, other_axis = law(("angle", "M_n")), law(("hum", "X_n")), law(("angle", "M_z"))
+    assert form_misfit.form_is_another(alone) == form_misfit.SELDOM
+    assert form_misfit.form_is_another(law(("angle", "M_n"), ("hum", "X_n"))) == 1.0
+    assert form_misfit.form_is_another(alone, {"kz"}) == 1.0
+    for rival in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n")), law()):  # the last: known effects alone
+        assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=[(rival, 1.0)])) == pytest.approx(0.5)
+    same = [(law(("angle", "M_n")), 1.0)]  # a variation of the same idea, whose course is in the sigma anyway
+    assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=same)) == form_misfit.SELDOM
+
+
+def test_what_is_shorter_than_a_probe_may_be_anywhere_in_it(monkeypatch):
+    """A blow of a fifth of a probe counts by its mean square over it; a course that turns once in seven probes not."""
+    time, spacing = np.linspace(0.1, 0.9, 41), 0.02
+    blow = lambda t: 1.0 * (np.abs(t - time[20] - 0.005) < 0.1 * spacing)  # noqa: E731
+    slow = lambda t: np.sin(2 * np.pi * t / (7 * spacing))  # noqa: E731
+    moment = lambda t: np.stack([blow(t), slow(t), 0.0 * t], axis=1)  # noqa: E731
+    monkeypatch.setattr(form_misfit, "WITHIN", 50)
+    monkeypatch.setattr(form_misfit, "_motion", lambda system, values, t: np.concatenate([[0.0], t]))
+    monkeypatch.setattr(form_misfit, "moment_about_contact", lambda system, values, t: moment(t))
+    blocks = SimpleNamespace(time=time, spacing=spacing)
+    found = form_misfit._within_probes(None, SimpleNamespace(values={}), blocks, moment(time))
+    assert found[20, 0] == pytest.approx(0.2)
+    assert np.delete(found[:, 0], 20).max() == 0.0
+    assert found[1:-1, 1].max() < 1e-4
+    assert found[:, 2].max() == 0.0

@@ -1,0 +1,168 @@
+"""A laboratory as laboratories are: lenses, print, board and light that are not ideal, put onto measured trajectories.
+
+The errors are sums of plane waves and random numbers (trials.imperfect); the diagnosis describes them by bumps.
+"""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.diagnosis import DiscSystem, diagnose_trajectory
+from disctrack.diagnosis.disc.left_over import LeftOver
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.disc.stretch import at_rest
+from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
+from disctrack.diagnosis.stage import _doubtful
+from disctrack.diagnosis.trials.imperfect import ORDINARY, Laboratory
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.memory import inflation, long_run_variance
+from disctrack.discrepancy.system import Quantity
+from disctrack.synthetic.description import CameraFault, Faults
+from tests.oracles.measured_disc import Unseen, measured
+
+
+def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
+    """As a tracking states it whose covariances cover all that the dots show."""
+    trajectory = measured(
+        effects, faults=faults, unseen=Unseen(laboratory=laboratory), seed=seed, n=n, declared_rate=500.0, theta_deg=9.0
+    )
+    inflated = max(1.0, float(np.median(trajectory.reduced_chi_square)))
+    return replace(
+        trajectory,
+        markers_covariance_px2=inflated * trajectory.markers_covariance_px2,
+        pose_covariance=inflated * trajectory.pose_covariance,
+        reduced_chi_square=trajectory.reduced_chi_square / inflated,
+    ), inflated
+
+
+def systematic_of(trajectory):
+    trajectory, noise = with_noise_of_frames(trajectory)
+    return find_systematic(DiscSystem(trajectory, declared_model(trajectory).model), noise)
+
+
+def test_the_noise_is_what_changes_from_frame_to_frame():
+    trajectory, inflated = recording()
+    assert inflated > 5
+    # 300 frames of 18 numbers: 2 %, and 4 % for third differences that share their frames
+    assert noise_over_stated(trajectory) * inflated == pytest.approx(1.0, rel=0.08)
+    ideal = measured(seed=2, n=200)
+    assert with_noise_of_frames(ideal)[0] is ideal
+
+
+def test_a_camera_that_turned_does_not_make_the_motion_look_like_rest():
+    """0.07 deg, 2.5 px: covariances that cover it are larger than what the disc moves in a frame."""
+    turned = Faults(right=CameraFault(rotation_deg=(0.04, 0.05, 0.02)))
+    trajectory, inflated = recording(laboratory=Laboratory(), faults=turned, n=120)
+    assert inflated > 1e4
+    measured_rows = np.flatnonzero(trajectory.measured)
+    assert at_rest(trajectory, measured_rows).all()
+    assert not at_rest(with_noise_of_frames(trajectory)[0], measured_rows).any()
+
+
+def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
+    found = systematic_of(recording()[0])
+    assert found.left == pytest.approx(1.0, abs=0.1)  # 200 frames of 18 numbers: 2 %, and what bumps miss
+    assert 0.008 < found.lens_px < 0.05  # 0.02 px over the whole image; the dots see a part of it
+    assert found.beside == ()
+    alone = systematic_of(recording(laboratory=Laboratory(), faults=Faults(right_delay_s=2e-4))[0])
+    assert (alone.present, alone.beside) == (False, ("time_offset",))
+    both = systematic_of(recording(faults=Faults(right_delay_s=2e-4))[0])
+    assert both.lens_px > 0.008
+    assert both.beside == ("time_offset",)
+    assert not systematic_of(measured(seed=3, n=200)).present
+
+
+def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
+    trajectory, _ = recording(seed=5)
+    result = diagnose_trajectory(trajectory, separate=False)
+    assert result.diagnosis.verdict != "unexplained"
+    assert all(f.candidate.kind == "measurement" for f in result.diagnosis.found)
+    assert result.sentence.startswith("Nothing")
+    assert "systematic errors of 0.0" in result.sentence
+
+
+@pytest.mark.slow
+def test_what_is_planted_in_an_imperfect_laboratory_is_named_and_sized():
+    trajectory, _ = recording({"kz.k_z": 3e-5}, seed=6)
+    result = diagnose_trajectory(trajectory, separate=False)
+    assert [f.candidate.name for f in result.diagnosis.found if f.candidate.kind == "motion"] == ["kz"]
+    after = result.diagnosis.after
+    assert abs(after.values["kz.k_z"] - 3e-5) < 3 * after.sigma("kz.k_z")
+    assert after.sigma("kz.k_z") < 1e-7
+
+
+def test_memory_enlarges_the_variance_of_a_sum_as_it_should(rng):
+    """First-order autoregression with 0.8: a sum has (1 + 0.8) / (1 - 0.8) = 9 times the variance."""
+    n, ratios = 4000, []
+    for _ in range(20):
+        x = np.zeros(n)
+        noise = rng.standard_normal(n)
+        for i in range(1, n):
+            x[i] = 0.8 * x[i - 1] + noise[i]
+        ratios.append(long_run_variance(x)[0] / np.mean(x**2))
+    assert_allclose(np.mean(ratios), 9.0, rtol=0.2)  # Bartlett's weights lose a tenth
+    white = rng.standard_normal(n)
+    assert_allclose(long_run_variance(white)[0] / np.mean(white**2), 1.0, rtol=0.15)
+
+
+class Line:
+    """Rows of 24 numbers that are a multiple of a smooth course, and noise."""
+
+    candidates, base = (), (Quantity("a", "1", 0.1),)
+
+    def __init__(self, noise):
+        n, w = noise.shape
+        self.time, self.noise, self.weights = np.arange(n, dtype=float), noise, np.full(n, float(w))
+        self.course = 0.01 * np.sin(0.02 * np.arange(n))[:, None] * np.cos(np.arange(w))
+
+    def linearise(self, values, names):
+        return self.noise - values["a"] * self.course, self.course[..., None][..., : len(names)]
+
+
+def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
+    """Images of a dot two pixels apart share pixels of uneven gain: a correlation that one series hides."""
+
+    def pulls(share):
+        found = []
+        for _ in range(200):
+            white = rng.standard_normal((251, 24))
+            line = Line((white[1:] + share * white[:-1]) / np.sqrt(1 + share**2))
+            fitted = fit(line, line.base, {})
+            factor = inflation(line, fitted)[0]
+            found.append((fitted.values["a"] / fitted.sigma("a"), fitted.values["a"] / fitted.sigma("a") / factor))
+        return np.std(found, axis=0)
+
+    white, stated = pulls(0.21)  # correlation 0.2: a smooth sum has 1 + 2 * 0.2 of the variance
+    # of 200 pulls the scatter is known to 5 %
+    assert_allclose([white, stated], [np.sqrt(1.4), 1.0], rtol=0.18)
+    assert white > 1.1
+    assert_allclose(pulls(0.0), 1.0, rtol=0.18)
+
+
+def test_what_is_left_is_the_motions_only_where_the_poses_hold_it():
+    assert LeftOver(1.1, 1.0, 1e-40, 0.5, 36).of_the_motion
+    assert not LeftOver(1.1, 1.1, 1e-40, 1e-40, 36).of_the_motion
+    assert not LeftOver(1.1, 1.0, 0.5, 0.5, 36).of_the_motion
+    assert LeftOver(1.3, 1.2, 1e-9, 1e-9, 36).of_the_measurement
+    assert not LeftOver(9.0, 1.2, 1e-9, 1e-9, 36).of_the_measurement
+
+
+@pytest.mark.parametrize(
+    ("pose", "other", "p_pose", "p_other", "systematic", "kinds"),
+    [
+        (1.00, 1.00, 0.4, 0.6, Systematic(), ()),
+        (1.09, 0.99, 0.02, 1.0, Systematic(), ("motion", "measurement")),  # a groove that a tilt stands in for
+        (1.00, 1.03, 0.3, 4e-10, Systematic(), ("measurement",)),  # a misprint beside a shaken table
+        (1.22, 1.27, 0.4, 3e-4, Systematic(lens_px=0.008), ()),  # lenses with fields: nothing of the motion
+        (1.18, 1.18, 2e-3, 5e-3, Systematic(lens_px=0.008), ()),  # likewise, and seen in the poses
+        (1.80, 1.18, 2e-3, 5e-3, Systematic(lens_px=0.008), ("motion", "measurement")),
+    ],
+)
+def test_what_the_measurement_does_to_all_numbers_raises_no_doubt_about_the_motion(
+    pose, other, p_pose, p_other, systematic, kinds
+):
+    left = LeftOver(pose, other, p_pose, p_other, 36)
+    assert _doubtful(left, SimpleNamespace(systematic=systematic)) == kinds

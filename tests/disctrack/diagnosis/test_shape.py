@@ -1,0 +1,86 @@
+"""The exponent or scale of a law that was found is measured where the recording determines it, and only there."""
+
+import numpy as np
+import pytest
+
+from disctrack.diagnosis import DiscSystem, diagnose, diagnose_trajectory
+from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.trials.hidden_effects import hidden_effect
+from disctrack.diagnosis.trials.rates import draw, together, trajectory_of
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.shape import profiled, refine_shapes
+from tests.oracles.measured_disc import measured
+
+
+def test_an_exponent_is_measured_along_its_profile():
+    trajectory = measured({"rolling_power.k": 4e-4, "rolling_power.p": 1.0}, base={}, seed=72, n=250, theta_deg=5.0)
+    model = declared_model(trajectory, "none").model
+    system = DiscSystem(trajectory, model)
+    (power,) = [c for c in system.candidates if c.name == "rolling_power"]
+    nominal = fit(system, (*system.base, *power.quantities), system.start())
+    free = profiled(system, nominal, power.shape[0], 0.1)
+    assert free.converged
+    assert abs(free.values["rolling_power.p"] - 1.0) < 4 * free.sigma("rolling_power.p")
+    assert free.sigma("rolling_power.p") < 0.05
+    assert free.reduced_chi_square < 1.1 < nominal.reduced_chi_square
+
+
+def test_an_exponent_that_cannot_be_seen_is_said_to_be_assumed():
+    """At 14 deg and over 0.2 s the rate hardly changes: any exponent gives the same moment."""
+    trajectory = measured({"rolling_power.k": 2e-4}, seed=74, n=200)
+    model = declared_model(trajectory).model
+    system = DiscSystem(trajectory, model, motion_candidates(model, ["rolling_power"]))
+    answer, notes = refine_shapes(system, diagnose(system, system.start()))
+    assert [f.candidate.name for f in answer.found] == ["rolling_power"]
+    assert "rolling_power.p" not in answer.after.names
+    (note,) = notes
+    assert "does not determine p" in note
+
+
+@pytest.mark.slow
+def test_a_law_beyond_the_declared_one_is_found_by_its_exponent():
+    """With p = 2.8 beside the k_m of p = 2 the law at its nominal p = 1.5 would have to be negative."""
+    hidden = {"rolling_power.k": 1.5e-4, "rolling_power.p": 2.8}
+    result = diagnose_trajectory(measured(hidden, seed=71, n=400, theta_deg=8.0))
+    (found,) = result.diagnosis.found
+    assert found.candidate.name == "rolling_power"
+    fit_ = result.after_fit
+    assert abs(fit_.values["rolling_power.p"] - 2.8) < 4 * fit_.sigma("rolling_power.p")
+    assert result.after.reduced_chi_square < 1.1
+    assert "p = " in result.sentence
+
+
+@pytest.mark.slow
+def test_the_pivoting_rate_at_which_creep_begins_is_measured():
+    hidden = {"pivoting_contensou.k": 6e-5, "pivoting_contensou.omega_s": 4.0}
+    result = diagnose_trajectory(measured(hidden, seed=74, n=400))
+    (found,) = result.diagnosis.found
+    assert found.candidate.name == "pivoting_contensou"
+    fit_ = result.after_fit
+    assert abs(fit_.values["pivoting_contensou.omega_s"] - 4.0) < 4 * fit_.sigma("pivoting_contensou.omega_s")
+    assert "pivoting_contensou.a" not in fit_.names  # without slip its radius does nothing
+
+
+@pytest.mark.slow
+def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
+    """The flat's place has to be looked for, and only an effect that stands in for it is met by the search."""
+    rng = np.random.default_rng([2014, 32])
+    planted = together([hidden_effect("rim_flat").plant(1e-5, rng), hidden_effect("distortion").plant(0.05, rng)])
+    trajectory = trajectory_of(draw(2014, planted, 500.0), planted)
+    model = declared_model(trajectory).model
+    every = {c.name: c for c in DiscSystem(trajectory, model).candidates}
+
+    def found(*names):
+        system = DiscSystem(trajectory, model, tuple(every[name] for name in names))
+        diagnosis = diagnose(system, system.start())
+        assert {f.candidate.name for f in diagnosis.found} == {"right_distortion", "inertia_product"}
+        return refine_shapes(system, diagnosis)[0]
+
+    answer = found("right_distortion", "inertia_product", "rim_flat")
+    assert [f.candidate.name for f in answer.found] == ["right_distortion", "rim_flat"]
+    for name, true in (("rim_flat.depth", 1e-5), ("rim_flat.width", 0.15), ("right_distortion.k1", -0.05)):
+        assert abs(answer.after.values[name] - true) < 3 * answer.after.sigma(name)
+    without = found("right_distortion", "inertia_product")  # noise is left there, too
+    assert [f.candidate.name for f in without.found] == ["right_distortion", "inertia_product"]
+    assert answer.after.cost < without.after.cost - 30.0

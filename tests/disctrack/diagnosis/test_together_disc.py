@@ -1,0 +1,139 @@
+"""Recordings of the disc diagnosed together, and what a further one would bring."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disctrack.cli import main
+from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis.disc.plan import Planner, Proposal
+from disctrack.diagnosis.together.loop import diagnose_together
+from disctrack.diagnosis.together.recordings import Recorded
+from disctrack.diagnosis.trials.recordings import K_M, measured
+from disctrack.synthetic.description import Scene
+from disctrack.trajectory.file import Provenance, write_trajectory
+from tests.oracles import newton_euler
+
+RIG = 5
+RATE = 400.0
+VISCOSITY = 1.81e-5  # [Pa s] of the air, for which Moffatt's layer has f = 1
+F = 0.3
+
+
+def independent(seed, f=0.0, axial=1.0):
+    """A recording of a disc in world vectors and quaternions; `axial` times its moment about the axis."""
+    declared = Scene().declared_disc
+    rng = np.random.default_rng([seed, 5])
+    J1, J3 = declared.moment_diametral, declared.moment_axial
+    body = newton_euler.Disc(
+        declared.radius, declared.half_thickness, declared.mass, J_body=np.diag([J1, J1, axial * J3]),
+        laws=(newton_euler.precession_friction(K_M), newton_euler.moffatt(f * VISCOSITY)),
+    )  # fmt: skip
+    theta = np.radians(rng.uniform(4, 9))
+    omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
+    start = (0.032, 0.02, rng.uniform(-3, 3), theta, rng.uniform(-3, 3), 0.0, omega2, rng.uniform(0, 2))
+    state = newton_euler.state_from_angles(body, *start)
+
+    def motion(times):
+        answer = newton_euler.follow(body, state, np.r_[0.0, times], rtol=1e-10, atol=1e-11, method="LSODA")
+        return newton_euler.coordinates(body, answer.y)[1:]
+
+    trajectory = measured(seed=seed, n=130, declared_rate=RATE, motion=motion, rig_seed=RIG)
+    return Recorded(f"run {seed}", trajectory)
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    return [independent(seed, F) for seed in range(4)]
+
+
+@pytest.mark.slow
+def test_air_that_single_recordings_do_not_show_is_found_in_four_and_another_disc_is_named(filmed):
+    alone = diagnose_trajectory(filmed[0].trajectory, separate=False).diagnosis
+    assert "air_moffatt" not in {f.candidate.name for f in alone.found}
+    answer = diagnose_together([*filmed[:2], independent(9, F, axial=1.02), *filmed[2:]])
+    assert [r.name for r in answer.recordings if r.reason] == ["run 9"]
+    (found,) = answer.diagnosis.found
+    named = {found.candidate.name: answer.diagnosis.after} | {
+        r.candidate.name: r.fit for r in found.cannot_be_told_from
+    }
+    fit = named["air_moffatt"]
+    assert abs(fit.values["air_moffatt.f"] - F) < 3 * fit.sigma("air_moffatt.f")
+    (bound,) = [b for b in answer.bounds if b.candidate.name == "air_moffatt"]
+    assert bound.by_number[1][0] > F / 3
+    assert bound.by_number[4][0] < 0.5 * bound.by_number[1][0]
+
+
+@pytest.mark.slow
+def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says_so(tmp_path, capsys):
+    paths = []
+    for seed in range(4):
+        paths.append(tmp_path / f"{seed}.h5")
+        theta = 5.0 + seed
+        trajectory = measured(seed=50 + seed, n=100, theta_deg=theta, declared_rate=RATE, rig_seed=RIG)
+        write_trajectory(paths[-1], trajectory, Provenance("one name", {"frames": str(seed)}, {}))
+    words = ["diagnose", *map(str, paths), "-o", str(tmp_path / "out"), "-j", "2"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "nothing is missing" in said
+    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert document["verdict"] == "nothing missing"
+    assert [r["left_out"] for r in document["recordings"]] == [""] * 4
+    assert [r["name"] for r in document["recordings"]] == [f"{i}.h5" for i in range(4)]  # of one name: by their files
+    value, sigma = (document["after"]["parameters"]["km.k_m"][k] for k in ("value", "sigma"))
+    assert abs(value - K_M) < 3 * sigma
+    alone = [r["alone"]["parameters"]["km.k_m"]["sigma"] for r in document["recordings"]]
+    assert sigma < 0.8 * min(alone)
+    page = (tmp_path / "out" / "diagnosis.html").read_text()
+    assert "What many recordings bring" in page
+    for bound in document["bounds"]:  # of a vector every number
+        assert all(f">{p['name']}" in page for p in bound["parameters"])
+    assert main(words) == 0  # the complete result is used again
+    assert main(["diagnose", str(paths[0]), str(paths[0])]) == 1
+    assert "more than once" in capsys.readouterr().err
+
+
+def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagnosed(tmp_path, capsys):
+    for seed in range(2):
+        trajectory = measured(seed=50 + seed, n=60, theta_deg=5.0 + seed, declared_rate=RATE, rig_seed=RIG)
+        write_trajectory(tmp_path / f"{seed}.h5", trajectory, Provenance(f"run {seed}", {"frames": str(seed)}, {}))
+    (tmp_path / "empty.h5").write_bytes(b"")
+    (tmp_path / "cut.h5").write_bytes((tmp_path / "0.h5").read_bytes()[:9000])
+    names = ["0.h5", "empty.h5", "1.h5", "cut.h5"]
+    words = ["diagnose", *(str(tmp_path / name) for name in names), "-o", str(tmp_path / "out"), "-j", "1"]
+    for _ in range(2):  # the second time the result is used again
+        assert main(words) == 3
+        told = capsys.readouterr()
+        assert "2 recordings together (2 left out): nothing is missing" in told.out
+        assert "empty.h5 was left out" in told.out
+        assert "cut.h5 was left out" in told.out
+        assert "2 recording(s) could not be used" in told.err
+    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert [name.rpartition("/")[2] for name in document["unusable"]] == ["empty.h5", "cut.h5"]
+    assert "empty.h5" in (tmp_path / "out" / "diagnosis.html").read_text()
+    assert main([*words[:3], "-o", str(tmp_path / "other")]) == 1  # one alone is not many
+    assert "empty.h5" in capsys.readouterr().err
+    assert main([*words[:2], str(tmp_path / "mistyped.h5")]) == 1
+    assert "mistyped.h5" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mass", [1.0, 0.35])
+def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
+    """With another disc, too, whose k_m is its own."""
+    first = measured(seed=1, n=120, theta_deg=6.0, omega3=1.0, declared_rate=RATE, rig_seed=RIG)
+    result = diagnose_trajectory(first, separate=False)
+    system, fit = result.system, result.diagnosis.after
+    candidate = next(c for c in system.candidates if c.name == "air_bildsten")
+    planner = Planner(system, fit, [candidate])
+    rows, duration = planner.with_(Proposal(12.0, 2.0, 0.3, mass=mass))
+    disc = replace(first.disc, mass=mass * first.disc.mass)
+    made = measured(seed=2, n=round(duration * RATE) + 1, theta_deg=12.0, nutation_deg=0.6, omega3=2.0,
+                    declared_rate=RATE, rig_seed=RIG, disc=disc)  # fmt: skip
+    both = diagnose_together([Recorded("first", first), Recorded("second", made)])
+    (bound,) = [b for b in both.bounds if b.candidate.name == "air_bildsten"]
+    assert planner.sigma(planner.now, candidate) == pytest.approx(float(bound.by_number[1][0]), rel=0.05)
+    assert planner.sigma(rows, candidate) == pytest.approx(float(bound.by_number[2][0]), rel=0.1)
+    assert both.diagnosis.verdict == "nothing missing"

@@ -1,0 +1,160 @@
+"""A force that no term names, learned as a function of one variable: its course, its rivals, and that it is not claimed
+where known terms do. Motions come from SciPy's `solve_ivp`."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+from disctrack.discrepancy.equations import Equations, Run, diagnose, terms
+from disctrack.discrepancy.equations.declared import checked
+from disctrack.discrepancy.equations.formulas import formulas
+from disctrack.discrepancy.equations.law import HARMONICS, NAME, Along, _amplitudes, _knowing, _set
+from disctrack.discrepancy.equations.system import EquationSystem
+
+OSCILLATOR = Equations({"x": "v", "v": "-omega**2*x - 2*beta*v"}, {"omega": 11.5, "beta": 0.12}, units={"x": "m"})
+DECLARED = {"x": 11.5**2, "v": 0.24, "t": 0.0}  # what the declared equations pull back with, by variable
+TRUE = {"x": 144.0, "v": 0.3, "t": 0.0}
+TIME = np.arange(900) * 0.01
+SIGMA = 2e-3
+
+
+def spring_of_a_table(x):
+    return np.interp(x, [-1.2, -0.6, -0.3, 0, 0.25, 0.5, 0.8, 1.2], [30, 22, 6, 0, -3, -14, -16, -30])
+
+
+LAWS = {
+    "a drag that saturates": ("v", lambda v: -6 * np.tanh(v / 2)),
+    "a spring of a table": ("x", spring_of_a_table),
+    "a hollow": ("x", lambda x: -25 * x * np.exp(-((x / 0.35) ** 2))),
+    "a wavy spring": ("x", lambda x: -9 * np.sin(6 * x)),
+    "a drag that drops": ("v", lambda v: -0.12 * v * np.abs(v) * (1 - 0.6 / (1 + np.exp((6 - np.abs(v)) / 0.6)))),
+    "a drag in one direction": ("v", lambda v: -np.where(v > 0, 1.5 * v, 0.1 * v)),
+    "an odd friction": ("v", lambda v: -np.tanh(v / 1e-3) * (1.2 + np.exp(-((v / 3) ** 2)) * np.sin(np.abs(v)))),
+    "a push by time": ("t", lambda t: 8 * np.exp(-0.5 * (t - 4) ** 2) - t / 3),
+}
+KNOWN = {
+    "friction and drag": (lambda x, v: -0.6 * np.tanh(v / 1e-3) - 0.05 * v * abs(v), {"coulomb_v", "quadratic_v"}),
+    "a spring of two terms": (lambda x, v: -20 * x**3 - 8 * x**2, {"cubic_spring_x", "asymmetric_spring_x"}),
+    "nothing": (lambda x, v: 0.0, set()),
+}
+
+
+def recorded(force, seed):
+    """The oscillator with omega = 12, beta = 0.15 and a force(x, v, t), seen with noise."""
+    swing = solve_ivp(
+        lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1] + force(y[0], y[1], t)],
+        (0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11, method="LSODA",
+    )  # fmt: skip
+    noise = SIGMA * np.random.default_rng(seed).standard_normal(len(TIME))
+    return Run(TIME, {"x": swing.y[0] + noise}, sigma=SIGMA)
+
+
+QUICK = ("a drag that saturates", "a spring of a table", "an odd friction", "a push by time")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in LAWS])
+def test_a_law_of_one_variable_is_learned(name):
+    """Within 3 sigma of the true force nearly everywhere, on a course that it does not follow by being open."""
+    variable, force = LAWS[name]
+    answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force({"x": x, "v": v, "t": t}[variable]), seed=11))
+    law = answer.law
+    assert answer.verdict == "found"
+    assert answer.found == (NAME,)
+    assert (law.along.equation, law.along.variable) == ("v", variable)
+    truth = force(law.variable) + (DECLARED[variable] - TRUE[variable]) * law.variable
+    pulls = (law.force - truth) / law.sigma
+    assert np.mean(np.abs(pulls) < 3) >= 0.85
+    assert np.sqrt(np.mean(pulls**2)) < 2.0
+    assert np.sqrt(np.mean(law.sigma**2)) < 0.15 * np.ptp(truth)
+    # known terms are told with their odds, and what is left is noise
+    assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_known_terms_stay_named_where_they_act(name):
+    force, names = KNOWN[name]
+    answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force(x, v), seed=12))
+    assert set(answer.found) == names
+    if not names:
+        assert answer.law is None
+        return
+    # one variable is enough for them: the law is told beside, with less evidence
+    assert not answer.law.is_shorter
+    assert any("one law describes the data in place of" in note for note in answer.notes)
+    assert_allclose(answer.law.force, answer.law.theirs, atol=5 * answer.law.sigma.max(), rtol=0)
+
+
+def test_a_law_beside_a_known_term():
+    """A wavy spring and a sensor whose zero drifts: neither alone is noise."""
+    run = recorded(lambda x, v, t: -9 * np.sin(6 * x), seed=13)
+    shown = Equations(OSCILLATOR.rates, OSCILLATOR.parameters, observed={"X": "x"})
+    data = np.asarray(run.data["x"]) + 0.01 * TIME
+    answer = diagnose(shown, Run(TIME, {"X": data}, sigma=SIGMA), [terms.sensor_drift("X"), terms.coulomb("v")])
+    assert set(answer.found) == {NAME, "drift_X"}
+    assert abs(answer.values["drift_X.b"] - 0.01) < 3.5 * answer.sigmas["drift_X.b"]
+
+
+def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
+    """A cart whose friction saturates carries a pendulum; M and the law are those that the motion was made with."""
+    time = np.arange(0, 8, 0.01)
+    push = 0.8 * np.sin(2.1 * time) + 0.5 * np.sin(5.3 * time)
+
+    def rates(t, y):
+        _, th, vx, w = y
+        masses = np.array([[1.2, 0.08 * np.cos(th)], [0.08 * np.cos(th), 0.032]])
+        forces = np.interp(t, time, push) + 0.08 * np.sin(th) * w**2 - 0.9 * np.tanh(vx / 0.15), -0.7848 * np.sin(th)
+        return [vx, w, *np.linalg.solve(masses, forces)]
+
+    x, th = solve_ivp(rates, (0, time[-1]), [0, 0.6, 0, 0], t_eval=time, rtol=1e-8, atol=1e-10).y[:2]
+    cart = Equations(
+        {"x": "vx", "th": "w", "vx": "F + m*l*sin(th)*w**2 - b*vx", "w": "-m*g*l*sin(th)"}, {"M": 1.05, "b": 0.4},
+        constants={"m": 0.2, "l": 0.4, "g": 9.81}, inputs=["F"],
+        mass={("vx", "vx"): "M + m", ("vx", "w"): "m*l*cos(th)", ("w", "w"): "m*l**2"},
+    )  # fmt: skip
+    data = {"x": x + 1e-3 * rng.standard_normal(800), "th": th + 2e-3 * rng.standard_normal(800)}
+    run = Run(time, data, inputs={"F": push}, hold="linear")
+    answer = diagnose(cart, run, [terms.coulomb("vx"), terms.quadratic("vx"), terms.spring("vx", "x")])
+    law = answer.law
+    assert answer.found == (NAME,)
+    assert (law.along.equation, law.along.variable, law.held) == ("vx", "vx", ("b",))
+    truth = -0.9 * np.tanh(law.variable / 0.15) + 0.4 * law.variable
+    assert np.mean(np.abs(law.force - truth) < 3 * law.sigma) > 0.9
+    assert law.sigma.max() < 0.05
+    assert abs(answer.values["M"] - 1) < 3.5 * answer.sigmas["M"]
+
+
+def test_derivatives_of_a_law_are_those_of_its_motion():
+    """By amplitudes and by the state, against differences of predictions."""
+    run = recorded(lambda x, v, t: 0.0, seed=14)
+    plain = EquationSystem(formulas(OSCILLATOR, [], {"x": "x"}), checked(OSCILLATOR, [run]), np.array([1.0, 12.0]), {})
+    start = {"state.x[run1]": 1.0, "state.v[run1]": 0.0, "omega": 12.0, "beta": 0.15}
+    law = Along("v", "v", jumps=True)
+    system, numbers = _set(_knowing(plain, {"x": "x"}), law, start)
+    # a jump this wide is smooth for the steps of the differences
+    system = system.with_(widths=dict.fromkeys(system.widths, 1.0))
+    names = [q.name for q in _amplitudes(system, law)]
+    assert len(names) == HARMONICS + 3
+    values = start | numbers | dict(zip(names, np.random.default_rng(3).normal(0, 0.1, len(names)), strict=True))
+    _, derivative = system.linearise(values, [*names, "state.x[run1]"])
+    for i, name in enumerate([*names, "state.x[run1]"]):
+        step = 1e-3
+        ahead, behind = (system.linearise(values | {name: values[name] + s}, [])[0] for s in (step, -step))
+        difference = (behind - ahead)[..., 0] / (2 * step)
+        assert_allclose(derivative[..., 0, i], difference, atol=1e-3 * np.abs(difference).max(), rtol=0)
+
+
+def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
+    variable, force = LAWS["a drag that saturates"]
+    assert variable == "v"
+    answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force(v), seed=15), [terms.coulomb("v")])
+    assert "a force on v that is a function of v" in str(answer)
+    assert f"{NAME}.a3" not in str(answer)
+    told, page = answer.write(tmp_path)
+    law = json.loads(told.read_text())["law"]
+    assert law["variable"] == "v"
+    assert len(law["at"]) == len(law["force"]) == len(law["sigma"])
+    assert law["known_terms"] == [c.name for c in answer.law.replaces]
+    assert "a force on v that is a function of v, learned from what is left" in page.read_text()

@@ -1,0 +1,394 @@
+"""The engine on a system that is no disc: a damped oscillator with a known answer."""
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import stats
+
+from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
+from disctrack.discrepancy.fit import compress, fit, solve_bounded, triangle
+from disctrack.discrepancy.held_out import held_out, training_rows
+from disctrack.discrepancy.score import Linearisation, angle, score_all
+from disctrack.discrepancy.search import _Search
+from disctrack.discrepancy.system import GivenUp, TrialGivenUp
+from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
+
+SIGMA = 0.01
+
+
+class Oscillator:
+    """x'' = -w0^2 x - 2 d x' + f: started at (a, b); what it may lack: damping, a drift, a hum at 3 Hz, its twin."""
+
+    def __init__(self, observed, time):
+        self.time, self.observed = time, observed
+        self.weights = np.where(np.isfinite(observed), 1.0, 0.0)
+        self.base = (Quantity("a", "m", 0.1), Quantity("b", "m", 0.1), Quantity("w0", "rad/s", 0.1, null=7.0))
+        one = lambda name, **more: (Quantity(name, "1", 0.1, **more),)  # noqa: E731
+        self.candidates = (
+            Candidate("damping", "damping", "motion", "linear damping", "", one("d", lower=0.0)),
+            Candidate("drift", "drift", "measurement", "drift", "", one("drift")),
+            Candidate("hum", "hum", "measurement", "hum", "", (*one("hum_c"), *one("hum_s"))),
+            Candidate("twin", "twin", "measurement", "minus the drift", "", one("twin")),
+            Candidate("nothing", "nothing", "motion", "moves nothing", "", one("nothing")),
+        )
+
+    def predicted(self, values: Mapping[str, float]):
+        get = lambda n: values.get(n, 0.0)  # noqa: E731
+        t = self.time
+        envelope = np.exp(-get("d") * t)
+        x = envelope * (get("a") * np.cos(get("w0") * t) + get("b") * np.sin(get("w0") * t))
+        hum = get("hum_c") * np.cos(6 * np.pi * t) + get("hum_s") * np.sin(6 * np.pi * t)
+        return x + (get("drift") - get("twin")) * t + hum
+
+    def linearise(self, values, names):
+        known = self.weights > 0
+        r = np.where(known, np.where(known, self.observed, 0.0) - self.predicted(values), 0.0) / SIGMA
+        columns = []
+        for name in names:
+            up, down = ({**values, name: values.get(name, 0.0) + s * 1e-6} for s in (1, -1))
+            columns.append((self.predicted(up) - self.predicted(down)) / 2e-6 / SIGMA * known)
+        J = np.stack(columns, axis=-1) if columns else np.zeros((len(r), 0))
+        return r[:, None], J[:, None]
+
+
+def oscillator(rng, hidden=None, n=400):
+    time = np.linspace(0, 4, n)
+    truth = {"a": 1.0, "b": 0.3, "w0": 6.5, **(hidden or {})}
+    clean = Oscillator(np.zeros(n), time).predicted(truth)
+    return Oscillator(clean + SIGMA * rng.standard_normal(n), time)
+
+
+START = {"a": 0.9, "b": 0.4, "w0": 6.4}
+
+
+def test_triangle_keeps_all_inner_products(rng):
+    A = rng.standard_normal((5000, 7)) * 10.0 ** np.arange(-3, 4)
+    R = triangle(A)
+    assert R.shape == (7, 7)
+    assert_allclose(R.T @ R, A.T @ A, rtol=1e-11, atol=1e-10)
+
+
+def test_compressed_problem_has_the_same_solution(rng):
+    A, b = rng.standard_normal((500, 4)), rng.standard_normal(500)
+    right, matrix = compress(b[:, None], A[:, None])
+    assert_allclose(solve_bounded(right, matrix, np.full(4, -np.inf), np.full(4, np.inf)), np.linalg.lstsq(A, b)[0])
+    bounded = solve_bounded(right, matrix, np.zeros(4), np.full(4, np.inf))
+    assert (bounded >= 0).all()
+
+
+def test_fit_scatters_as_its_covariance_says(rng):
+    systems = [oscillator(rng) for _ in range(60)]
+    fits = [fit(s, s.base, START) for s in systems]
+    assert all(f.converged for f in fits)
+    pull = np.array([(f.values["w0"] - 6.5) / f.sigma("w0") for f in fits])
+    assert abs(pull.mean()) < 4 / np.sqrt(60)
+    assert 0.7 < pull.std() < 1.35  # chi-square of 60 at one in a thousand
+
+
+def test_score_of_a_linear_effect_equals_its_refit(rng):
+    system = oscillator(rng, {"drift": 0.004})
+    base = fit(system, system.base, START)
+    (best, *_) = score_all(Linearisation(system, base, system.candidates), system.candidates)
+    assert best.candidate.name in ("drift", "twin")
+    refit = fit(system, (*system.base, *system.candidates[1].quantities), base.values)
+    # the drift is linear, the rest almost: second order in a step of some sigmas
+    assert best.gain == pytest.approx(base.cost - refit.cost, rel=1e-2)
+    assert abs(best.values[0]) == pytest.approx(abs(refit.values["drift"]), rel=1e-2)
+    assert best.sigma[0] == pytest.approx(refit.sigma("drift"), rel=1e-2)
+
+
+def with_tolerance(system, sigma):
+    """The oscillator whose clock may drift by so much, as was declared."""
+    (drift,) = system.candidates[1].quantities
+    system.base = (*system.base, replace(drift, prior_sigma=sigma))
+    return system
+
+
+def test_score_of_an_effect_beyond_its_tolerance_equals_its_refit(rng):
+    system = with_tolerance(oscillator(rng, {"drift": 0.02}), 0.005)
+    base = fit(system, system.base, START)
+    scores = {s.candidate.name: s for s in score_all(Linearisation(system, base, system.candidates), system.candidates)}
+    free = fit(system, (*system.base[:3], *system.candidates[1].quantities), base.values)
+    assert base.cost - free.cost == pytest.approx((0.02 / 0.005) ** 2, rel=0.1)  # known to 0.0003
+    assert scores["drift"].gain == pytest.approx(base.cost - free.cost, rel=1e-2)
+    assert scores["drift"].values[0] == pytest.approx(free.values["drift"], rel=1e-2)
+    # what it is beyond the tolerance is no better known than that
+    assert scores["drift"].sigma[0] == pytest.approx(np.hypot(0.005, free.sigma("drift")), rel=1e-2)
+    assert scores["twin"].gain == pytest.approx(scores["drift"].gain, rel=1e-6)
+
+
+@pytest.mark.parametrize(("tolerance", "verdict"), [(0.01, "nothing missing"), (1e-4, "found")])
+def test_an_effect_within_its_tolerance_is_not_claimed(rng, tolerance, verdict):
+    answer = diagnose(with_tolerance(oscillator(rng, {"drift": 0.01}), tolerance), START)
+    assert answer.verdict == verdict
+    if answer.found:  # freed, it is as well known as if nothing had been declared
+        assert answer.after.sigma("drift") < 1e-3
+        assert answer.after.values["drift"] == pytest.approx(0.01, abs=4e-3)
+
+
+def test_twins_enclose_no_angle_and_strangers_a_right_one(rng):
+    system = oscillator(rng)
+    linear = Linearisation(system, fit(system, system.base, START), system.candidates)
+    drift = linear.columns(["drift"])[:, 0]
+    assert angle(linear, drift, ["twin"]) < 1e-6
+    assert angle(linear, drift, ["hum_c", "hum_s"]) > np.radians(80)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "names"),
+    [({"d": 0.02}, {"damping"}), ({"drift": 0.01}, {"drift", "twin"}), ({"hum_c": 0.005, "hum_s": -0.004}, {"hum"})],
+)
+def test_a_hidden_effect_is_named_with_all_that_cannot_be_told_from_it(rng, hidden, names):
+    answer = diagnose(oscillator(rng, hidden), START)
+    assert answer.verdict == "found"
+    (found,) = answer.found
+    assert {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)} == names
+    reasons = {t.candidate.name: t.reason for t in answer.tried}
+    assert "no trace" in reasons["nothing"]
+
+
+def test_two_hidden_effects_are_both_named(rng):
+    answer = diagnose(oscillator(rng, {"d": 0.02, "hum_c": 0.01}), START)
+    assert {f.candidate.name for f in answer.found} == {"damping", "hum"}
+
+
+def test_noise_alone_raises_an_alarm_at_most_once_in_twenty(rng):
+    alarms = sum(bool(diagnose(oscillator(rng), START).found) for _ in range(60))
+    assert alarms <= 3  # the threshold promises one in a hundred
+
+
+def test_a_shuffled_residual_gives_no_finding(rng):
+    system = oscillator(rng, {"d": 0.02})
+    base = fit(system, system.base, START)
+    residual = system.observed - system.predicted(base.values)
+    shuffled = Oscillator(system.predicted(base.values) + rng.permutation(residual), system.time)
+    answer = diagnose(shuffled, START)
+    assert not answer.found
+
+
+def test_a_negative_damping_is_not_allowed_to_explain_growth(rng):
+    answer = diagnose(oscillator(rng, {"d": -0.02}), START)
+    assert all(f.candidate.name != "damping" for f in answer.found)
+    assert answer.verdict == "unexplained"
+
+
+def test_an_effect_outside_the_catalogue_is_left_unexplained(rng):
+    system = oscillator(rng)
+    system.observed = system.observed + 0.05 * np.sign(np.sin(11.0 * system.time))
+    answer = diagnose(system, START)
+    assert answer.verdict == "unexplained"
+    assert not answer.found
+
+
+def test_held_out_error_of_the_true_model_is_at_its_floor(rng):
+    system = oscillator(rng)
+    answer = held_out(system, system.base, START, training_rows(system))
+    # 140 test samples: the ratio scatters by 6 %
+    assert answer.ratio_to_floor == pytest.approx(1.0, abs=0.25)
+    worse = oscillator(rng, {"d": 0.05})
+    assert held_out(worse, worse.base, START, training_rows(worse)).ratio_to_floor > 2
+
+
+def test_ljung_box_accepts_noise_and_refuses_a_slow_wave(rng):
+    noise = rng.standard_normal((500, 3))
+    assert whiteness(noise, 1000.0, {}).p_value > 1e-3
+    wave = noise + np.sin(2 * np.pi * 27.0 * np.arange(500) / 1000.0)[:, None]
+    answer = whiteness(wave, 1000.0, {"precession": 27.0})
+    assert answer.p_value < 1e-6
+    assert answer.peak_near == ("precession",) * 3
+    assert (answer.peak_p_value < 1e-6).all()
+    # chi-square of 20 degrees: mean 20, standard deviation 6.3, over 300 channels
+    assert ljung_box(rng.standard_normal((400, 300))).mean() == pytest.approx(20, abs=1.5)
+
+
+class Line:
+    """Noise, or a line through the origin: a model that declares no quantity of its own."""
+
+    def __init__(self, observed, time):
+        self.time, self.observed, self.weights = time, observed, np.ones(len(time))
+        self.base = ()
+        one = lambda name: Quantity(name, "1", 0.1)  # noqa: E731
+        self.candidates = (
+            Candidate("slope", "slope", "motion", "slope", "", (one("k"), one("unseen"))),
+            Candidate("bend", "bend", "motion", "bend", "", (one("q"),)),
+        )
+
+    def linearise(self, values, names):
+        columns = {"k": self.time, "unseen": 0 * self.time, "q": self.time**2}
+        left = self.observed - sum((values.get(n, 0.0) * c for n, c in columns.items()), np.zeros(len(self.time)))
+        J = np.stack([columns[n] for n in names], axis=-1) if names else np.zeros((len(left), 0))
+        return left[:, None] / SIGMA, J[:, None] / SIGMA
+
+
+def test_a_model_without_quantities_is_diagnosed_and_rows_are_judged_as_asked(rng):
+    time = np.linspace(0, 1, 90)
+    system = Line(0.05 * time + SIGMA * rng.standard_normal(90), time)
+    rows = np.arange(90) % 3 != 0
+    answer = diagnose(system, {}, Settings(noise=1.0), rows)
+    assert [f.candidate.name for f in answer.found] == ["slope"]
+    assert answer.noise == 1.0
+    assert (answer.held_out_after.test_rows == ~rows).all()
+    assert abs(answer.after.values["k"] - 0.05) < 4 * answer.after.sigma("k")
+    assert not diagnose(Line(SIGMA * rng.standard_normal(90), time), {}, Settings(noise=1.0), rows).found
+
+
+class Struck(Line):
+    """A blow in the part of the time that is fitted, or something that stays after it."""
+
+    def __init__(self, observed, time, *names):
+        super().__init__(observed, time)
+        one = lambda name: Candidate(name, name, "motion", name, "", (Quantity(name, "1", 0.1),))  # noqa: E731
+        self.candidates = tuple(one(name) for name in names)
+
+    def linearise(self, values, names):
+        columns = {"blow": np.exp(-(((self.time - 0.3) / 0.1) ** 2)), "stays": np.exp(-((self.time / 0.6) ** 4))}
+        columns["stays"][self.time > 0.65] = 1.0
+        left = self.observed - sum((values.get(n, 0.0) * c for n, c in columns.items()), np.zeros(len(self.time)))
+        J = np.stack([columns[n] for n in names], axis=-1) if names else np.zeros((len(left), 0))
+        return left[:, None] / SIGMA, J[:, None] / SIGMA
+
+
+def test_what_acts_in_the_fitted_part_alone_is_claimed_if_it_is_obvious(rng):
+    """A blow of 15 sigma before what is held out, which says nothing of it. What would stay after it is refused."""
+    time = np.linspace(0, 1, 900)
+    observed = 0.014 * np.exp(-(((time - 0.3) / 0.1) ** 2)) + SIGMA * rng.standard_normal(900)
+    rows = time <= 0.65
+    answer = diagnose(Struck(observed, time, "blow"), {}, Settings(noise=1.0), rows)
+    assert [f.candidate.name for f in answer.found] == ["blow"]
+    assert abs(answer.after.values["blow"] - 0.014) < 4 * answer.after.sigma("blow")
+    wrong = diagnose(Struck(observed, time, "stays"), {}, Settings(noise=1.0), rows)
+    (tried,) = wrong.tried
+    assert tried.gain > 20
+    assert tried.held_out_gain < -20
+    assert not wrong.found
+
+
+def test_a_quantity_that_the_data_do_not_see_is_open_and_its_neighbour_is_not(rng):
+    time = np.linspace(0, 1, 50)
+    system = Line(SIGMA * rng.standard_normal(50), time)
+    (slope, _) = sorted(
+        score_all(Linearisation(system, fit(system, (), {}), system.candidates), system.candidates),
+        key=lambda s: -len(s.sigma),
+    )
+    assert slope.sigma[0] == pytest.approx(SIGMA / np.sqrt(np.sum(time**2)), rel=1e-6)
+    assert slope.sigma[1] == np.inf
+
+
+def test_linear_quantities_that_are_taken_out_beforehand_leave_the_same_fit(rng):
+    system = oscillator(rng, {"drift": 0.02, "hum_c": 0.01})
+    nuisances = [Quantity("drift", "1", 0.1, prior_sigma=0.01), Quantity("hum_c", "1", 0.1, prior_sigma=0.03)]
+    fits, scores = [], []
+    for linear in (False, True):
+        system.base = (*system.base[:3], *(replace(q, linear=linear) for q in nuisances))
+        fits.append(fit(system, system.base, START))
+        others = [c for c in system.candidates if c.name in ("damping", "nothing")]
+        scores.append(score_all(Linearisation(system, fits[-1], others), others))
+    plain, taken_out = fits
+    sigmas = np.sqrt(np.diag(plain.covariance))
+    for name, sigma in zip(plain.names, sigmas, strict=True):
+        assert_allclose(taken_out.values[name], plain.values[name], atol=0.05 * sigma)  # both stop 1e-3 of chi^2 short
+    assert_allclose(taken_out.covariance, plain.covariance, rtol=1e-3, atol=1e-3 * np.outer(sigmas, sigmas).max())
+    assert_allclose([taken_out.chi_square, taken_out.penalty], [plain.chi_square, plain.penalty], atol=0.1)
+    for one, other in zip(*scores, strict=True):
+        assert one.candidate.name == other.candidate.name
+        assert_allclose([other.gain, *other.sigma], [one.gain, *one.sigma], rtol=0.02, atol=0.02)
+
+
+def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
+    """Chi-square's is too thin: at 200 samples its 1e-3 is seen four times as often."""
+    statistic = ljung_box(rng.standard_normal((200, 20_000)))
+    for level in (0.05, 0.01, 1e-3):
+        seen = int(sum(no_memory(x, 200) < level for x in statistic if x > 25))
+        assert stats.binomtest(seen, 20_000, level).proportion_ci(1 - 1e-4).high > 0.7 * level
+        assert seen / 20_000 < 1.3 * level + 4 * np.sqrt(level / 20_000)
+    assert np.mean(stats.chi2.sf(statistic, 20) < 1e-3) > 2.5e-3
+
+
+class Impatient(Oscillator):
+    """Will not follow the drift, when it is in a hurry; nor at all, if it `gives_up`."""
+
+    in_a_hurry = gives_up = False
+
+    def hurried(self, share):
+        one = copy(self)
+        one.in_a_hurry = True
+        return one
+
+    def linearise(self, values, names):
+        if values.get("drift"):
+            if self.gives_up:
+                raise GivenUp
+            if self.in_a_hurry:
+                raise TrialGivenUp
+        return super().linearise(values, names)
+
+
+def test_a_hypothesis_that_takes_too_long_is_left_and_the_others_are_tried(rng):
+    system = oscillator(rng, {"drift": 0.02, "hum_c": 0.05})
+    assert sorted(f.candidate.name for f in diagnose(system, START).found) == ["drift", "hum"]
+    impatient = Impatient(system.observed, system.time)
+    answer = diagnose(impatient, START)  # the twin of the drift does what the drift did
+    assert sorted(f.candidate.name for f in answer.found) == ["hum", "twin"]
+    assert not any(r.candidate.name == "drift" for f in answer.found for r in f.cannot_be_told_from)
+    impatient.gives_up = True  # all patience at an end is another matter
+    with pytest.raises(GivenUp):
+        diagnose(impatient, START)
+
+
+def test_a_fit_that_leaves_much_is_found_to_a_share_of_its_own_scatter(rng):
+    """What no fit reaches makes all sigmas wider: to go on within them gains nothing, and takes as long."""
+    system = oscillator(rng, {"hum_c": 3.0})
+    near, exact = (fit(system, system.base, START, n) for n in (40, 40))
+    assert near.converged
+    assert near.reduced_chi_square > 1000
+    for _ in range(5):  # Gauss-Newton from there on, to rounding
+        residual, derivative = system.linearise(exact.values, exact.names)
+        step = np.linalg.lstsq(derivative[:, 0], residual[:, 0])[0]
+        exact = replace(exact, values={k: exact.values[k] + d for k, d in zip(exact.names, step, strict=True)})
+    scatter = np.sqrt(near.reduced_chi_square) * np.array([near.sigma(n) for n in near.names])
+    off = np.array([near.values[n] - exact.values[n] for n in near.names])
+    assert np.abs(off / scatter).max() < np.sqrt(1e-3)
+
+
+class Kinked:
+    """Promises that a step of 1 removes all, but a step beyond 0.5 makes it worse, and a shorter one gains nearly 0."""
+
+    time, weights, candidates = np.zeros(1), np.ones(1), ()
+    base = (Quantity("x", "1", 0.1),)
+
+    def __init__(self):
+        self.at = 0.0
+
+    def linearise(self, values, names):
+        far = values["x"] - self.at > 0.5
+        self.at = values["x"] if names and not far else self.at
+        residual = 20.0 if far else 10.0 - 1e-4 * values["x"]
+        return np.full((1, 1), residual), np.full((1, 1, len(names)), 10.0)
+
+
+def test_a_fit_that_crawls_is_ended_only_where_it_must_not_crawl():
+    patient, not_so = (fit(Kinked(), Kinked.base, {"x": 0.0}, 30, may_crawl=may) for may in (True, False))
+    assert not patient.converged
+    assert not not_so.converged
+    assert patient.n_iterations == 30
+    assert not_so.n_iterations == 3
+
+
+@pytest.mark.parametrize(("ahead", "worth"), [((40.0, 15.0), True), ((40.0, 60.0), False), ((4000.0, 60.0), True)])
+def test_what_rests_while_it_is_kept_back_does_not_speak_against_a_name(ahead, worth):
+    """Chi-square of 1000 fitted and 100 kept samples before and after: little is at stake where nothing moves."""
+    search = object.__new__(_Search)
+    search.noise, search.settings = 1.0, Settings()
+    trials = [
+        SimpleNamespace(
+            fit=SimpleNamespace(chi_square=c, degrees_of_freedom=1000, reduced_chi_square=c / 1000, n_data=1000),
+            held_out=SimpleNamespace(chi_square=100 + h, expected=100.0, n_data=100),
+        )
+        for c, h in zip((11_000.0, 1_400.0), ahead, strict=True)
+    ]
+    assert search._worth_naming(*trials) is worth

@@ -1,0 +1,180 @@
+"""Dark and flat images: the sensor's pattern, laid over images by another code, is removed to the noise."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from disctrack.calibrate.views import find_views
+from disctrack.errors import RecordingError
+from disctrack.first_look import check
+from disctrack.recording.declaration import read_recording
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.flat_field import flat_fields
+from disctrack.track.stage import open_pairs
+from tests.oracles import imperfect_laboratory as laboratory
+
+SIZE, FRAMES, FLATS = 64, 64, 40
+DEAD = (20, 33)
+TOML = """
+[cameras]
+frame_rate_hz = 1000.0
+left = "left/*.png"
+right = "right/*.png"
+{flats}
+[disc]
+radius_mm = 37.5
+thickness_mm = 6.0
+mass_g = 209.69
+[markers]
+diameter_mm = 7.0
+centres_mm = [[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167], [-26.0, 0.0], [-13.0, -22.5167], [6.5, -11.2583]]
+[calibration]
+left = "views/left*.png"
+right = "views/right*.png"
+inner_corners = [9, 6]
+square_mm = 6.0
+[table]
+view = 0
+board_thickness_mm = 3.0
+[gravity]
+g_m_s2 = 9.81
+"""
+ALL = "\n".join(f'{side}_{kind} = "{kind}/{side}"' for side in ("left", "right") for kind in ("flat", "dark"))
+
+
+def scene():
+    """Grey values of a smooth scene between ink and paper."""
+    y, x = np.mgrid[:SIZE, :SIZE]
+    return 110 + 70 * np.sin(0.11 * x) * np.cos(0.07 * y)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording whose left sensor has gains of 3 %, columns of one grey value, and a dead pixel."""
+    folder, rng = tmp_path_factory.mktemp("flat"), np.random.default_rng(5)
+    faults = replace(laboratory.IDEAL, gains=0.03, columns=1.0)
+    plan = laboratory.Plan(size=SIZE, imperfections=faults)
+    camera = laboratory.Camera(rng, plan, 0.0, np.zeros(3))
+    camera.offset = camera.offset + 6.0  # black level
+    camera.gain[DEAD] = 0.02
+    level = np.ones((SIZE, SIZE))
+    for side in ("left", "right"):
+        for kind, radiance, n in (("flat", 140 * level, FLATS), ("dark", 0 * level, FLATS), ("", scene(), FRAMES)):
+            (folder / kind / side).mkdir(parents=True)
+            for i in range(n):
+                cv2.imwrite(str(folder / kind / side / f"{i:03d}.png"), camera.expose(radiance, rng))
+    (folder / "views").mkdir()
+    for side in ("left", "right"):
+        cv2.imwrite(str(folder / "views" / f"{side}0.png"), camera.expose(scene(), rng))
+        cv2.imwrite(str(folder / "views" / f"{side}1.png"), np.zeros((SIZE // 2, SIZE, 3), np.uint8))
+    return folder
+
+
+def declared(folder, flats):
+    (folder / "recording.toml").write_text(TOML.format(flats=flats))
+    return read_recording(folder)
+
+
+def departure(reader):
+    """Of the mean of all frames from the scene, up to one factor and one level, without the dead pixel [grey]."""
+    mean = np.mean([reader.read(i) / (257.0 if reader.bit_depth == 16 else 1.0) for i in range(FRAMES)], axis=0)
+    good = np.ones(mean.shape, bool)
+    good[DEAD] = False
+    terms = np.column_stack([np.ones(good.sum()), scene()[good]])
+    left = np.full(mean.shape, np.nan)
+    left[good] = mean[good] - terms @ np.linalg.lstsq(terms, mean[good], rcond=None)[0]
+    return left, mean
+
+
+def test_the_pattern_is_removed_to_the_noise_and_a_dead_pixel_is_filled(folder):
+    plain, corrected = (open_pairs(declared(folder, flats)).left for flats in ("", ALL))
+    before, after = (departure(reader)[0] for reader in (plain, corrected))
+    # sigma of a pixel is 1.8 grey values; the mean of 64, and a gain from 40 flats and 40 darks at 0.8 of their light
+    noise = np.sqrt(0.64 + scene() / 50)
+    floor = np.sqrt(
+        np.mean(noise**2) / FRAMES + np.mean((scene() / 140) ** 2) * (0.64 + 140 / 50) / FLATS + 0.64 / FLATS
+    )
+    assert np.sqrt(np.nanmean(before**2)) > 8 * floor
+    assert np.sqrt(np.nanmean(after**2)) < 1.15 * floor
+    assert abs(departure(plain)[1][DEAD] - scene()[DEAD]) > 50
+    assert abs(departure(corrected)[1][DEAD] - scene()[DEAD]) < 5
+    assert any("1 dead pixel" in note for note in corrected.notes)
+
+
+def test_results_depend_on_the_flats_and_views_of_the_same_size_are_corrected(folder):
+    plain, corrected = (declared(folder, flats) for flats in ("", ALL))
+    assert open_pairs(plain).inputs() != open_pairs(corrected).inputs()
+    views = [
+        find_views("views/left*.png", "views/right*.png", folder, fields)
+        for fields in ((None, None), flat_fields(folder, corrected.sensors))
+    ]
+    assert views[0].sha256() != views[1].sha256()
+    one, other = (v.fields[0] for v in views)
+    assert one is None
+    image = cv2.imread(str(views[0].left[0]), cv2.IMREAD_UNCHANGED)
+    assert other.fits(image)
+    assert not other.fits(np.zeros((SIZE // 2, SIZE, 3), np.uint8))
+    assert flat_fields(folder, plain.sensors) == (None, None)
+    raw = open_frames("left/*.png", folder, "left")
+    assert type(open_pairs(plain).left) is type(raw)  # nothing stands between where nothing is declared
+
+
+def test_check_looks_at_views_as_a_run_does(folder, monkeypatch):
+    looked_at = []
+
+    def calibrate(views, *_):
+        looked_at.append(views.fields)
+        raise RecordingError("enough")
+
+    monkeypatch.setattr(check, "calibrate_views", calibrate)
+    for flats in ("", ALL):
+        declared(folder, flats)
+        check.run_check(folder)
+    assert looked_at[0] == (None, None)
+    assert [field.sha256 for field in looked_at[1]] == [
+        f.sha256 for f in flat_fields(folder, declared(folder, ALL).sensors)
+    ]
+
+
+def test_clipped_pixels_stay_clipped(folder):
+    field = flat_fields(folder, declared(folder, ALL).sensors)[0]
+    image = np.full((SIZE, SIZE), 255, np.uint8)
+    assert np.all(field.corrected(image) == 65535)
+    dark = field.corrected(np.zeros((SIZE, SIZE), np.uint8))
+    assert dark.max() == 0
+
+
+def write(folder, name, image, n=1):
+    (folder / name).mkdir(exist_ok=True)
+    for i in range(n):
+        cv2.imwrite(str(folder / name / f"{i}.png"), image)
+
+
+@pytest.mark.parametrize(
+    ("flat", "dark", "said"),
+    [
+        (None, None, "no image matched for the left camera's flat"),
+        (np.full((SIZE, SIZE), 255, np.uint8), None, "saturated"),
+        (np.full((SIZE, SIZE), 20, np.uint8), np.full((SIZE, SIZE), 130, np.uint8), "exchanged"),
+        (np.full((SIZE, SIZE), 12, np.uint8), None, "too dark"),
+        (np.full((SIZE, SIZE + 8), 120, np.uint8), None, "left frames are 64 x 64 px of 8 bit"),
+        (np.full((SIZE, SIZE), 30000, np.uint16), None, "of 16 bit"),
+        (np.full((SIZE, SIZE), 120, np.uint8), np.full((SIZE, SIZE + 8), 5, np.uint8), "Take both"),
+    ],
+)
+def test_flats_that_cannot_serve_stop_the_run_with_what_to_do(folder, tmp_path, flat, dark, said):
+    lines = [f'left_flat = "{tmp_path}/f"']
+    if flat is not None:
+        write(tmp_path, "f", flat)
+    if dark is not None:
+        write(tmp_path, "d", dark)
+        lines.append(f'left_dark = "{tmp_path}/d"')
+    with pytest.raises(RecordingError, match=said):
+        open_pairs(declared(folder, "\n".join(lines)))
+
+
+def test_one_noisy_flat_is_used_and_said(folder):
+    reader = open_pairs(declared(folder, 'left_flat = "flat/left/000.png"')).left
+    assert any("mean of 1 image" in note for note in reader.notes)

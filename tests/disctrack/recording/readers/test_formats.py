@@ -1,0 +1,432 @@
+"""Every format gives back the grey values that an independent library wrote, in any order, and names what is lost."""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from disctrack.errors import RecordingError
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.blocks import iter_pair_blocks
+
+N, HEIGHT, WIDTH = 30, 18, 22
+
+
+def frames_of(bits: int, seed: int = 0, n: int = N) -> np.ndarray:
+    frames = np.random.default_rng(seed).integers(0, 2**bits, (n, HEIGHT, WIDTH))
+    return frames.astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def write_tiff(path: Path, frames: np.ndarray, **options) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(path, frames, **{"photometric": "minisblack", **options})
+
+
+def write_pages_by_opencv(path: Path, frames: np.ndarray, compression: int) -> None:
+    assert cv2.imwritemulti(str(path), list(frames), [cv2.IMWRITE_TIFF_COMPRESSION, compression])
+
+
+def write_hdf5(path: Path, frames: np.ndarray, attributes: dict | None = None, **options) -> None:
+    with h5py.File(path, "w") as file:
+        stack = file.create_dataset("camera/frames", data=frames, **options)
+        stack.attrs.update(attributes or {})
+
+
+def write_video(path: Path, frames: np.ndarray, pixels: str, codec: str, **options) -> None:
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pixels
+        for frame in frames:
+            container.mux(stream.encode(_picture(frame, pixels)))
+        container.mux(stream.encode())
+
+
+def _picture(frame: np.ndarray, pixels: str):
+    """A picture whose luma is `frame`, byte for byte; no conversion by the library."""
+    import av
+
+    picture = av.VideoFrame(frame.shape[1], frame.shape[0], pixels)
+    neutral = 128 if frame.dtype == np.uint8 else 512
+    for number, plane in enumerate(picture.planes):
+        rows = np.full((plane.height, plane.line_size // frame.itemsize), neutral, frame.dtype)
+        if number == 0:
+            rows[:, : frame.shape[1]] = frame
+        plane.update(rows.tobytes())
+    return picture
+
+
+@dataclass(frozen=True)
+class Format:
+    suffix: str
+    bits: int
+    write: Callable[..., None]
+    options: dict
+
+    def __str__(self) -> str:
+        return f"{self.suffix}-{self.bits}-" + "-".join(str(v) for v in self.options.values())
+
+
+FORMATS = [
+    *(
+        Format("tif", bits, write_tiff, options)
+        for bits in (8, 16)
+        for options in (
+            {},
+            {"bigtiff": True, "byteorder": ">"},
+            {"imagej": True},
+            {"rowsperstrip": 5},
+            {"compression": "zlib", "predictor": True},
+            {"tile": (16, 16), "compression": "zlib"},
+        )
+    ),
+    *(Format("tiff", bits, write_pages_by_opencv, {"compression": c}) for bits in (8, 16) for c in (1, 5, 8, 32773)),
+    Format("h5", 8, write_hdf5, {}),
+    Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}),
+    Format("h5", 8, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip"}),
+    Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "fletcher32": True}),
+    Format("h5", 8, write_hdf5, {"chunks": (7, 10, WIDTH), "compression": "lzf", "fletcher32": True}),
+    *(
+        Format(suffix, bits, write_video, {"pixels": pixels, "codec": codec, **options})
+        for suffix, bits, pixels, codec, options in (
+            ("mkv", 8, "gray", "ffv1", {}),
+            ("mkv", 10, "gray10le", "ffv1", {}),
+            ("mkv", 12, "gray12le", "ffv1", {}),
+            ("avi", 16, "gray16le", "ffv1", {"g": "1"}),
+            ("mp4", 8, "gray", "ffv1", {}),
+            ("avi", 8, "gray", "rawvideo", {}),
+            ("mkv", 8, "gray", "rawvideo", {}),
+            ("mkv", 8, "yuv420p", "ffv1", {}),
+            ("mkv", 10, "yuv420p10le", "ffv1", {}),
+            ("avi", 8, "yuv420p", "rawvideo", {}),
+            ("mp4", 8, "yuv420p", "libx264", {"qp": "0", "g": "10", "bf": "2"}),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize("kind", FORMATS, ids=str)
+def test_frames_come_back_as_they_were_written_in_any_order(tmp_path, kind):
+    frames = frames_of(kind.bits)
+    kind.write(tmp_path / f"left.{kind.suffix}", frames, **kind.options)
+    reader = open_frames(f"left.{kind.suffix}", tmp_path, "left")
+    assert isinstance(reader, FrameReader)
+    assert (len(reader), reader.image_size, reader.bit_depth) == (N, (WIDTH, HEIGHT), kind.bits)
+    for index in (*range(N), 17, 3, N - 1, 0, 20, 21, 5):
+        assert_array_equal(reader.read(index), frames[index])
+    out = np.zeros_like(frames[0])
+    assert reader.read(4, out) is out
+    assert_array_equal(out, frames[4])
+
+
+@pytest.mark.parametrize("kind", FORMATS[:1] + FORMATS[-13:-12] + FORMATS[-11:], ids=str)
+def test_blocks_of_both_cameras_hold_every_pair(tmp_path, kind):
+    both = [frames_of(kind.bits, seed) for seed in (1, 2)]
+    for name, frames in zip(("left", "right"), both, strict=True):
+        kind.write(tmp_path / f"{name}.{kind.suffix}", frames, **kind.options)
+    readers = [open_frames(f"{name}.{kind.suffix}", tmp_path, name) for name in ("left", "right")]
+    for block in iter_pair_blocks(*readers, block=4, threads=2):
+        assert block.unreadable == ()
+        for camera, frames in enumerate(both):
+            assert_array_equal(block.images[:, camera], frames[block.frames])
+
+
+@pytest.mark.parametrize("kind", [FORMATS[0], FORMATS[4], *(k for k in FORMATS if k.suffix in ("h5", "mkv"))], ids=str)
+def test_the_content_hash_tells_a_changed_frame_and_nothing_else(tmp_path, kind):
+    frames = frames_of(kind.bits)
+    changed = frames.copy()
+    changed[7, 3, 4] ^= 1
+    found = []
+    for name, content in (("a", frames), ("b", frames), ("c", changed)):
+        (tmp_path / name).mkdir()
+        kind.write(tmp_path / name / f"left.{kind.suffix}", content, **kind.options)
+        reader = open_frames(f"left.{kind.suffix}", tmp_path / name, "left")
+        if name == "b":  # computed while reading, or apart
+            for index in range(N):
+                reader.read(index)
+        found.append((reader.content_sha256(0, N), reader.content_sha256(0, 5)))
+    if kind.suffix != "mkv":  # a container has an identity of its own
+        assert found[0] == found[1]
+        assert found[0][1] == found[2][1]
+    assert found[0][0] != found[2][0]
+
+
+def test_several_tiff_files_of_one_camera_continue_one_another(tmp_path):
+    frames = frames_of(16)
+    for number, part in enumerate((frames[:13], frames[13:14], frames[14:])):
+        write_tiff(tmp_path / f"left_{number}.tif", part)
+    reader = open_frames("left_*.tif", tmp_path, "left")
+    assert len(reader) == N
+    for index in (0, 12, 13, 14, 29):
+        assert_array_equal(reader.read(index), frames[index])
+
+
+def test_the_frame_rate_and_times_that_imagej_ome_and_hdf5_note_are_found(tmp_path):
+    times = np.arange(N) * 1e-3 + np.where(np.arange(N) > 9, 2e-3, 0)
+    write_tiff(tmp_path / "imagej.tif", frames_of(8), imagej=True, metadata={"finterval": 0.0005})
+    write_tiff(
+        tmp_path / "notes.ome.tif",
+        frames_of(8),
+        metadata={
+            "axes": "TYX",
+            "TimeIncrement": 1.0,
+            "TimeIncrementUnit": "ms",
+            "Plane": {"DeltaT": list(1e3 * times), "DeltaTUnit": ["ms"] * N},
+        },
+    )
+    write_hdf5(tmp_path / "stack.h5", frames_of(8), {"frame_rate": 1000, "timestamps": times})
+    assert open_frames("imagej.tif", tmp_path, "left").frame_rate == pytest.approx(2000)
+    for name in ("notes.ome.tif", "stack.h5:/camera/frames", "stack.h5"):
+        reader = open_frames(name, tmp_path, "left")
+        assert reader.frame_rate == pytest.approx(1000)
+        assert_allclose(reader.timestamps, times, rtol=0, atol=1e-12)  # decimal text of milliseconds
+
+
+@pytest.mark.parametrize(("declared", "found"), [(12, 12), (8, 16), (99, 16), ("many", 16)])
+def test_a_bit_depth_that_cannot_be_is_not_believed(tmp_path, declared, found):
+    write_hdf5(tmp_path / "stack.h5", frames_of(12), {"bit_depth": declared})
+    reader = open_frames("stack.h5", tmp_path, "left")
+    assert reader.bit_depth == found
+    (block,) = iter_pair_blocks(reader, reader, block=N)
+    assert_array_equal(block.images[:, 0], frames_of(12))
+
+
+def test_one_of_several_data_sets_must_be_named(tmp_path):
+    with h5py.File(tmp_path / "both.h5", "w") as file:
+        file["left"], file["right"] = frames_of(8, 1), frames_of(8, 2)
+        file["mask"] = np.ones((HEIGHT, WIDTH), np.uint8)
+    with pytest.raises(RecordingError, match=r"several stacks.*/left, /right"):
+        open_frames("both.h5", tmp_path, "left")
+    with pytest.raises(RecordingError, match=r"both\.h5:/mask is a data set.*There are /left, /right"):
+        open_frames("both.h5:/mask", tmp_path, "left")
+    assert_array_equal(open_frames("both.h5:/right", tmp_path, "right").read(3), frames_of(8, 2)[3])
+
+
+def test_hdf5_frames_that_were_never_written_are_not_taken_for_black(tmp_path):
+    frames = frames_of(8)
+    with h5py.File(tmp_path / "stack.h5", "w") as file:
+        late = file.create_dataset("late", (N, HEIGHT, WIDTH), np.uint8, chunks=(3, HEIGHT, WIDTH))
+        late[:9], late[12:27] = frames[:9], frames[12:27]
+        huge = file.create_dataset("huge", (10**15, HEIGHT, WIDTH), np.uint8, chunks=(1, HEIGHT, WIDTH))
+        huge[:2] = frames[:2]
+        file.create_dataset("empty", (N, HEIGHT, WIDTH), np.uint8)
+    reader = open_frames("stack.h5:/late", tmp_path, "left")
+    for index in range(N):
+        if index in (9, 10, 11, 27, 28, 29):
+            with pytest.raises(RecordingError, match=f"frame {index}.*never written"):
+                reader.read(index)
+        else:
+            assert_array_equal(reader.read(index), frames[index])
+    with pytest.raises(RecordingError, match="announces 1000000000000000 frames, but at most 2 "):
+        open_frames("stack.h5:/huge", tmp_path, "left")
+    with pytest.raises(RecordingError, match="without frames"):
+        open_frames("stack.h5:/empty", tmp_path, "left")
+
+
+@pytest.mark.parametrize("options", [{}, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}])
+@pytest.mark.parametrize("dtype", ["<u2", ">u2"])
+def test_hdf5_of_any_byte_order_behind_a_user_block(tmp_path, options, dtype):
+    frames = frames_of(16)
+    with h5py.File(tmp_path / "left.h5", "w", userblock_size=1024) as file:
+        file.create_dataset("frames", data=frames.astype(dtype), **options)
+    reader = open_frames("left.h5", tmp_path, "left")
+    for index in (0, 7, N - 1):
+        assert_array_equal(reader.read(index), frames[index])
+
+
+def test_hdf5_frames_that_lie_in_other_files_are_those_or_refused(tmp_path):
+    layout = h5py.VirtualLayout((4, 6, 8), np.uint8)
+    frames = np.arange(4 * 6 * 8, dtype=np.uint8).reshape(4, 6, 8)
+    for i, frame in enumerate(frames):
+        with h5py.File(tmp_path / f"part{i}.hdf", "w") as file:
+            file["frame"] = frame
+        layout[i] = h5py.VirtualSource(f"part{i}.hdf", "frame", shape=(6, 8))
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        file.create_virtual_dataset("frames", layout)
+    with h5py.File(tmp_path / "external.h5", "w") as file:
+        place = [(str(tmp_path / "pixels.bin"), 16, h5py.h5f.UNLIMITED)]
+        file.create_dataset("frames", frames.shape, np.uint8, external=place)[...] = frames
+    for name in ("virtual", "external"):
+        reader = open_frames(f"{name}.h5", tmp_path, "left")
+        assert_array_equal([reader.read(i) for i in range(4)], frames)
+    (tmp_path / "part2.hdf").unlink()
+    with pytest.raises(RecordingError, match=r"takes frames from part2\.hdf, which is not there"):
+        open_frames("virtual.h5", tmp_path, "left")
+    content = (tmp_path / "pixels.bin").read_bytes()
+    (tmp_path / "pixels.bin").write_bytes(content[:-1])
+    with pytest.raises(RecordingError, match="holds 191 of their 192 bytes"):
+        open_frames("external.h5", tmp_path, "left")
+    (tmp_path / "pixels.bin").unlink()
+    with pytest.raises(RecordingError, match=r"pixels\.bin, which is not there"):
+        open_frames("external.h5", tmp_path, "left")
+
+
+def test_hdf5_frames_of_which_a_part_was_never_written_are_lost(tmp_path):
+    frames = np.random.default_rng(3).integers(0, 4096, (4, 9, 14)).astype(np.uint16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        stack = file.create_dataset("frames", frames.shape, np.uint16, chunks=(1, 5, 6), compression="gzip")
+        stack[[0, 1, 3]] = frames[[0, 1, 3]]
+        stack[2, :5] = frames[2, :5]
+    reader = open_frames("a.h5", tmp_path, "left")
+    for i in (0, 1, 3):
+        assert_array_equal(reader.read(i), frames[i])
+    with pytest.raises(RecordingError, match=r"frame 2\): was never written"):
+        reader.read(2)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_hdf5_pixels_that_do_not_fill_their_bytes_are_those_that_the_library_reads(tmp_path, packed):
+    frames = np.random.default_rng(3).integers(0, 4096, (4, 9, 14)).astype(np.uint16)
+    kind, options = h5py.h5t.STD_U16LE.copy(), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    kind.set_precision(12)
+    kind.set_offset(4)
+    if packed:
+        options.set_chunk((1, 9, 14))
+        options.set_shuffle()
+        options.set_deflate(4)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        stack = h5py.h5d.create(file.id, b"frames", kind, h5py.h5s.create_simple(frames.shape), options)
+        stack.write(h5py.h5s.ALL, h5py.h5s.ALL, frames)
+    reader = open_frames("a.h5", tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(4)], frames)
+
+
+def bitmaps_in_avi(frames, palette, top_down):
+    """An AVI file of frames (n, height, width) uint8 as uncompressed bitmaps, by Microsoft's description (1992)."""
+    n, height, width = frames.shape
+    rows = -(-width // 4) * 4
+    padded = np.pad(frames, ((0, 0), (0, 0), (0, rows - width)))
+    pictures = [picture.tobytes() for picture in (padded if top_down else padded[:, ::-1])]
+
+    def chunk(kind, content):
+        return kind + struct.pack("<I", len(content)) + content + bytes(len(content) % 2)
+
+    def listed(kind, *content):
+        return chunk(b"LIST", kind + b"".join(content))
+
+    size = rows * height
+    info = struct.pack("<IiiHHIIiiII", 40, width, -height if top_down else height, 1, 8, 0, size, 0, 0, 0, 0) + palette
+    stream = b"vidsDIB " + struct.pack("<IHHIIIIIIIIhhhh", 0, 0, 0, 0, 1, 25, 0, n, size, 0, 0, 0, 0, width, height)
+    head = struct.pack("<IIIIIIIIIIIIII", 40000, 0, 0, 0, n, 0, 1, size, width, height, 0, 0, 0, 0)
+    streams = listed(b"strl", chunk(b"strh", stream), chunk(b"strf", info))
+    movie = listed(b"movi", *(chunk(b"00db", picture) for picture in pictures))
+    return chunk(b"RIFF", b"AVI " + listed(b"hdrl", chunk(b"avih", head), streams) + movie)
+
+
+@pytest.mark.parametrize("top_down", [False, True])
+@pytest.mark.parametrize("width", [68, 69])
+def test_bitmaps_in_avi_stand_upright_whatever_their_palette(tmp_path, width, top_down):
+    frames = np.random.default_rng(5).integers(0, 256, (4, 11, width)).astype(np.uint8)
+    level = np.arange(256, dtype=np.uint8)[:, None]
+    grey = np.concatenate([level, level, level, 0 * level], axis=1)
+    for palette, expected in ((grey, frames), (grey[::-1], ~frames), (grey[:0], frames)):
+        (tmp_path / "a.avi").write_bytes(bitmaps_in_avi(frames, palette.tobytes(), top_down))
+        reader = open_frames("a.avi", tmp_path, "left")
+        assert_array_equal([reader.read(i) for i in range(4)], expected)
+    colours = np.concatenate([level, 255 - level, level, 0 * level], axis=1)
+    (tmp_path / "a.avi").write_bytes(bitmaps_in_avi(frames, colours.tobytes(), top_down))
+    with pytest.raises(RecordingError, match="a colour image"):
+        open_frames("a.avi", tmp_path, "left")
+
+
+def test_luma_of_limited_range_is_not_stretched(tmp_path):
+    frames = (16 + frames_of(8) % 220).astype(np.uint8)  # 16 to 235
+    write_video(tmp_path / "left.mkv", frames, "yuv420p", "ffv1")
+    reader = open_frames("left.mkv", tmp_path, "left")
+    read = np.array([reader.read(i) for i in range(N)])
+    assert (read.min(), read.max()) == (16, 235)
+    assert_array_equal(read, frames)
+    assert any("not stretched" in note for note in reader.notes)
+
+
+@pytest.mark.parametrize(("pixels", "first"), [("yuyv422", 0), ("uyvy422", 1)])
+def test_luma_between_chroma_is_taken_alone(tmp_path, pixels, first):
+    """As cameras with a standard interface write raw video: two bytes for each pixel, one of them luma."""
+    av = pytest.importorskip("av")
+    frames = frames_of(8)
+    with av.open(str(tmp_path / "left.avi"), "w") as container:
+        stream = container.add_stream("rawvideo", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
+        for frame in frames:
+            picture = av.VideoFrame(WIDTH, HEIGHT, pixels)
+            rows = np.full((HEIGHT, picture.planes[0].line_size), 128, np.uint8)
+            rows[:, first : 2 * WIDTH : 2] = frame
+            picture.planes[0].update(rows.tobytes())
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    reader = open_frames("left.avi", tmp_path, "left")
+    for index in (0, 5, 2):
+        assert_array_equal(reader.read(index), frames[index])
+
+
+def test_frames_that_a_recorder_dropped_are_named(tmp_path):
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "left.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
+        for time, frame in zip([*range(12), *range(14, 32)], frames_of(8), strict=True):
+            picture = _picture(frame, "gray")
+            picture.pts = time
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    (doubt,) = open_frames("left.mkv", tmp_path, "left").doubts
+    assert "after frame 11: 2 frame(s)" in doubt
+
+
+@pytest.mark.parametrize("place", [0.02, 0.3, 0.5, 0.9])
+def test_a_damaged_packet_costs_its_frames_up_to_the_next_key_frame_and_no_other(tmp_path, place):
+    av = pytest.importorskip("av")
+    frames = frames_of(8)
+    write_video(tmp_path / "left.mkv", frames, "gray", "ffv1", g="5", level="3", slicecrc="1")
+    with av.open(str(tmp_path / "left.mkv")) as container:
+        packet = [packet for packet in container.demux(video=0) if packet.size][12]
+    content = bytearray((tmp_path / "left.mkv").read_bytes())
+    content[packet.pos + int(place * packet.size)] ^= 0x55
+    (tmp_path / "left.mkv").write_bytes(content)
+    reader = open_frames("left.mkv", tmp_path, "left")
+    for index in range(N):
+        if 12 <= index < 15:
+            with pytest.raises(RecordingError, match=f"left camera, frame {index}"):
+                reader.read(index)
+        else:
+            assert_array_equal(reader.read(index), frames[index])
+
+
+@pytest.mark.parametrize("kind", [k for k in FORMATS if k.write is not write_hdf5][::3], ids=str)
+def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
+    frames = frames_of(kind.bits)
+    path = tmp_path / f"left.{kind.suffix}"
+    kind.write(path, frames, **kind.options)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(0.6 * len(content))])
+    try:
+        reader = open_frames(path.name, tmp_path, "left")
+    except RecordingError:
+        assert kind.suffix == "mp4" or "compress" in kind.options  # the table of all frames stands at the end
+        return
+    lost = []
+    for index in range(len(reader)):
+        try:
+            assert_array_equal(reader.read(index), frames[index])
+        except RecordingError:
+            lost.append(index)
+    assert lost == list(range(len(reader) - len(lost), len(reader)))  # the end, and nothing else
+    assert len(reader) - len(lost) < N
+    assert len(reader) < N or lost
+    if kind.suffix == "tif":
+        assert lost or any("pages are whole" in note for note in reader.notes)
+
+
+def test_hdf5_cut_short_is_refused(tmp_path):
+    write_hdf5(tmp_path / "left.h5", frames_of(8))
+    content = (tmp_path / "left.h5").read_bytes()
+    (tmp_path / "left.h5").write_bytes(content[: len(content) // 2])
+    with pytest.raises(RecordingError, match=r"left\.h5"):
+        open_frames("left.h5", tmp_path, "left")

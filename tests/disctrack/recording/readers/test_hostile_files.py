@@ -1,0 +1,246 @@
+"""Damaged, hostile and vanishing files: an error that names file and frame, never a crash or all the memory."""
+
+import contextlib
+import os
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from disctrack.errors import DiscTrackError, RecordingError
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.blocks import iter_pair_blocks
+from disctrack.recording.readers.decoding import decode
+
+N, HEIGHT, WIDTH = 6, 18, 22
+FRAMES = np.random.default_rng(8).integers(0, 256, (N, HEIGHT, WIDTH), dtype=np.uint8)
+MOST_MEMORY = 300 << 20  # bytes; the frames themselves are 2 kB
+
+
+def write_images(folder: Path, suffix: str) -> str:
+    for i, frame in enumerate(FRAMES):
+        cv2.imwrite(str(folder / f"{i:03d}.{suffix}"), frame)
+    return f"*.{suffix}"
+
+
+def write_tiff(folder: Path, suffix: str, **options) -> str:
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(folder / "stack.tif", FRAMES, **{"photometric": "minisblack", **options})
+    return "stack.tif"
+
+
+def write_hdf5(folder: Path, suffix: str, **options) -> str:
+    with h5py.File(folder / "stack.h5", "w") as file:
+        file.create_dataset("frames", data=FRAMES, **options).attrs["frame_rate"] = 1000.0
+    return "stack.h5:/frames"
+
+
+def write_video(folder: Path, suffix: str, codec: str = "ffv1") -> str:
+    av = pytest.importorskip("av")
+    with av.open(str(folder / f"video.{suffix}"), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
+        for frame in FRAMES:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        container.mux(stream.encode())
+    return f"video.{suffix}"
+
+
+WRITERS = {
+    "png": lambda folder: write_images(folder, "png"),
+    "bmp": lambda folder: write_images(folder, "bmp"),
+    "tif": lambda folder: write_images(folder, "tif"),
+    "tiff plain": lambda folder: write_tiff(folder, "tif"),
+    "tiff imagej": lambda folder: write_tiff(folder, "tif", imagej=True),
+    "tiff deflate": lambda folder: write_tiff(folder, "tif", compression="zlib"),
+    "tiff tiles": lambda folder: write_tiff(folder, "tif", compression="zlib", tile=(16, 16)),
+    "bigtiff": lambda folder: write_tiff(folder, "tif", bigtiff=True),
+    "hdf5": lambda folder: write_hdf5(folder, "h5"),
+    "hdf5 gzip": lambda folder: write_hdf5(folder, "h5", chunks=(2, HEIGHT, WIDTH), compression="gzip"),
+    "mkv": lambda folder: write_video(folder, "mkv"),
+    "avi": lambda folder: write_video(folder, "avi", "rawvideo"),
+    "mp4": lambda folder: write_video(folder, "mp4"),
+}
+
+
+def read_all(pattern: str, folder: Path) -> int:
+    """Number of frames that came back; what does not must raise an error of ours."""
+    try:
+        reader = open_frames(pattern, folder, "left")
+    except DiscTrackError:
+        return 0
+    assert len(reader) < 1000
+    good = 0
+    for index in range(len(reader)):
+        with contextlib.suppress(DiscTrackError):
+            image = reader.read(index)
+            assert image.shape == reader.image_size[::-1]
+            good += 1
+    with contextlib.suppress(DiscTrackError):
+        reader.content_sha256(0, len(reader))
+    return good
+
+
+def damaged(content: bytes, rng: np.random.Generator) -> bytes:
+    """One to eight bytes changed, mostly in the header; sometimes to extremes, sometimes the rest cut off."""
+    data = bytearray(content)
+    reach = len(data) if rng.random() < 0.4 else min(len(data), 400)
+    for place in rng.integers(0, reach, rng.integers(1, 9)):
+        data[place] = rng.choice([0, 255, 127, 128, int(rng.integers(256))])
+    return bytes(data[: rng.integers(1, len(data))] if rng.random() < 0.1 else data)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_bytes_never_raise_anything_else_nor_take_the_memory(tmp_path, name, capfd):
+    pattern = WRITERS[name](tmp_path)
+    file = sorted(tmp_path.iterdir())[0]
+    content, rng = file.read_bytes(), np.random.default_rng(17)
+    assert read_all(pattern, tmp_path) == N
+    read = 0
+    for _ in range(60):
+        file.write_bytes(damaged(content, rng))
+        tracemalloc.start()
+        read += read_all(pattern, tmp_path)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < MOST_MEMORY
+    assert read < 60 * N  # the damage was felt
+
+
+def _tiff(width: int, height: int, offset: int = 8, next_page: int = 8) -> bytes:
+    """A page whose directory points to itself, so that it seems to have very many."""
+    tags = [(256, width), (257, height), (258, 8), (259, 1), (262, 1), (273, offset), (277, 1), (279, width * height)]
+    body = b"".join(struct.pack("<HHII", tag, 4, 1, value & 0xFFFFFFFF) for tag, value in tags)
+    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + body + struct.pack("<I", next_page)
+
+
+@pytest.mark.parametrize("following", [8, 1 << 31])
+def test_a_chain_of_pages_that_breaks_or_turns_back_ends_there_and_says_so(tmp_path, following):
+    from disctrack.recording.readers.tiff import open_stack
+
+    (tmp_path / "a.tif").write_bytes(_tiff(10, 10, next_page=following) + bytes(100))
+    reader = open_stack([tmp_path / "a.tif"], "left")
+    assert len(reader) == 1
+    assert "only 1 pages are whole" in reader.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (_tiff(10, 10, offset=60, next_page=0), r"left camera, frame 0\): the file ends"),
+        (_tiff(1 << 30, 1 << 30), "claims images of 1073741824 x 1073741824"),
+        (b"II*\0" + struct.pack("<IH", 8, 65535), "damaged|announced"),
+        (b"II+\0\x08\0\0\0" + struct.pack("<QQ", 16, 1 << 62), "damaged|announced"),
+    ],
+)
+def test_tiff_headers_that_announce_what_cannot_be_are_refused(tmp_path, content, reason):
+    from disctrack.recording.readers.tiff import open_stack
+
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(RecordingError, match=reason):
+        open_stack([tmp_path / "a.tif"], "left").read(0)
+
+
+def _claiming(suffix: str, width: int, height: int) -> bytes:
+    """A good image of 22 x 18 px whose header claims another size."""
+    data = bytearray(cv2.imencode(f".{suffix}", FRAMES[0])[1].tobytes())
+    if suffix == "bmp":
+        struct.pack_into("<ii", data, 18, width, height)
+    elif suffix == "jpg":
+        struct.pack_into(">HH", data, data.index(b"\xff\xc0") + 5, height, width)
+    elif suffix == "png":
+        struct.pack_into(">II", data, 16, width, height)
+        struct.pack_into(">I", data, 29, zlib.crc32(data[12:29]))
+    else:
+        (start,) = struct.unpack_from("<I", data, 4)
+        for i in range(struct.unpack_from("<H", data, start)[0]):
+            (tag,) = struct.unpack_from("<H", data, start + 2 + 12 * i)
+            if tag in (256, 257):
+                struct.pack_into("<HII", data, start + 4 + 12 * i, 4, 1, width if tag == 256 else height)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tiff", "jpg"])
+def test_an_image_cannot_claim_more_than_its_bytes_can_hold(suffix):
+    assert decode(_claiming(suffix, WIDTH, HEIGHT), "file").shape == (HEIGHT, WIDTH)
+    with pytest.raises(RecordingError, match="claims 30000 x 4000"):
+        decode(_claiming(suffix, 30000, 4000), "file")
+
+
+def test_hdf5_chunks_that_no_memory_holds_are_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (4000, 1000, 1000), np.uint8, chunks=(1000, 1000, 1000), compression="gzip")
+    with pytest.raises(RecordingError, match=r"one chunk .* holds more than 512 MB"):
+        open_frames("a.h5", tmp_path, "left")
+
+
+def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path):
+    pytest.importorskip("av")
+    write_video(tmp_path, "mkv")
+    (tmp_path / "list.mkv").write_text("#EXTM3U\n#EXTINF:1,\nvideo.mkv\n#EXT-X-ENDLIST\n")
+    with pytest.raises(RecordingError, match="not a readable video"):
+        open_frames("list.mkv", tmp_path, "left")
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_that_is_cut_while_it_is_read_costs_frames_and_names_them(tmp_path, name):
+    pattern = WRITERS[name](tmp_path)
+    reader = open_frames(pattern, tmp_path, "left")
+    assert np.array_equal(reader.read(0), FRAMES[0])
+    files = sorted(tmp_path.iterdir())
+    os.truncate(files[-1], files[-1].stat().st_size // 2 if len(files) > 1 else 200)
+    reader.read(0) if len(files) > 1 else None
+    failed = []
+    for index in range(1, N):
+        try:
+            assert np.array_equal(reader.read(index), FRAMES[index])
+        except RecordingError as error:
+            failed.append((index, str(error)))
+    if not name.startswith(
+        ("mkv", "mp4", "avi", "hdf5 gzip")
+    ):  # a short file may lie in the library's buffer as a whole
+        assert failed
+    assert all(f"frame {index}" in text and str(tmp_path) in text for index, text in failed)
+
+
+@pytest.mark.parametrize("name", ["png", "bmp", "tif"])
+def test_files_deleted_while_they_are_read_are_named(tmp_path, name):
+    pattern = WRITERS[name](tmp_path)
+    reader = open_frames(pattern, tmp_path, "left")
+    sorted(tmp_path.iterdir())[4].unlink()
+    with pytest.raises(RecordingError, match=r"004\..* \(left camera, frame 4\): cannot be read: No such file"):
+        reader.read(4)
+
+
+@pytest.mark.parametrize("name", [n for n in WRITERS if n not in ("png", "bmp", "tif")])
+def test_a_single_file_that_is_deleted_while_it_is_read_loses_nothing(tmp_path, name):
+    """It stays open, and its content exists until it is closed."""
+    pattern = WRITERS[name](tmp_path)
+    reader = open_frames(pattern, tmp_path, "left")
+    next(tmp_path.iterdir()).unlink()
+    for index in (1, 3, 5):
+        assert np.array_equal(reader.read(index), FRAMES[index])
+    if name in ("mkv", "avi", "mp4"):  # going back opens a video anew
+        with pytest.raises(RecordingError, match=rf"video\.{name} \(left camera, frame 0\).*No such file"):
+            reader.read(0)
+    assert len(reader.content_sha256(0, N)) == 64  # what was measured can still be stored
+
+
+@pytest.mark.parametrize("name", ["tiff plain", "tiff deflate", "hdf5"])
+def test_a_network_that_goes_away_is_an_error_of_the_frame(tmp_path, name, monkeypatch):
+    pattern = WRITERS[name](tmp_path)
+    reader = open_frames(pattern, tmp_path, "left")
+
+    def gone(*_: object) -> int:
+        raise OSError(116, "Stale file handle")
+
+    monkeypatch.setattr(os, "preadv", gone)
+    with pytest.raises(RecordingError, match=r"stack\..*left camera, frame 3.*Stale file handle"):
+        reader.read(3)
+    blocks = list(iter_pair_blocks(reader, reader, block=4, threads=2))
+    assert [len(block.unreadable) for block in blocks] == [8, 4]

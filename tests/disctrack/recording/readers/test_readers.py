@@ -1,0 +1,422 @@
+"""Frames reach the measurement in order, without loss, in bounded memory; what cannot be read is named, not hidden."""
+
+import gc
+import threading
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from disctrack.errors import RecordingError
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.blocks import iter_pair_blocks
+from disctrack.recording.readers.decoding import as_grey, decode
+from disctrack.recording.readers.file_numbers import check_same_numbers
+from disctrack.recording.readers.files import match_files
+
+
+def write_sequence(folder: Path, images, suffix="png", names=None) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / f"{names[i] if names else f'{i:06d}'}.{suffix}" for i in range(len(images))]
+    for file, image in zip(files, images, strict=True):
+        assert cv2.imwrite(str(file), image)
+    return files
+
+
+@pytest.fixture
+def frames(rng):
+    return rng.integers(0, 256, (11, 2, 24, 32), dtype=np.uint8)
+
+
+@pytest.fixture
+def pair(tmp_path, frames):
+    for camera, name in enumerate(("left", "right")):
+        write_sequence(tmp_path / name, frames[:, camera])
+    return tmp_path
+
+
+def open_pair(folder: Path) -> tuple[FrameReader, FrameReader]:
+    return open_frames("left/*", folder, "left"), open_frames("right/*", folder, "right")
+
+
+def collect(readers, **how):
+    blocks = [(b.frames, b.images.copy(), b.unreadable) for b in iter_pair_blocks(*readers, **how)]
+    return (
+        np.concatenate([b[0] for b in blocks]),
+        np.concatenate([b[1] for b in blocks]),
+        [image for b in blocks for image in b[2]],
+    )
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "tiff", "bmp"])
+def test_lossless_files_return_the_pixels_that_were_written(tmp_path, frames, suffix):
+    write_sequence(tmp_path / "left", frames[:, 0], suffix)
+    reader = open_frames(f"left/*.{suffix}", tmp_path, "left")
+    assert isinstance(reader, FrameReader)
+    assert (len(reader), reader.image_size, reader.bit_depth) == (11, (32, 24), 8)
+    for i in range(len(reader)):
+        assert_array_equal(reader.read(i), frames[i, 0])
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_sixteen_bits_are_used_as_they_are_and_said(tmp_path, rng, suffix):
+    images = rng.integers(0, 65536, (3, 24, 32), dtype=np.uint16)
+    write_sequence(tmp_path / "left", images, suffix)
+    reader = open_frames("left/*", tmp_path, "left")
+    assert reader.bit_depth == 16
+    assert_array_equal(reader.read(2), images[2])
+    assert any("16 bits" in note for note in reader.notes)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_grey_stored_as_colour_is_read_without_loss_and_said(tmp_path, frames, channels):
+    code = {3: cv2.COLOR_GRAY2BGR, 4: cv2.COLOR_GRAY2BGRA}[channels]
+    write_sequence(tmp_path / "left", [cv2.cvtColor(image, code) for image in frames[:, 0]])
+    reader = open_frames("left/*", tmp_path, "left")
+    assert_array_equal(reader.read(5), frames[5, 0])
+    assert any("channels of equal value" in note for note in reader.notes)
+
+
+def test_a_colour_image_is_refused(tmp_path, rng):
+    write_sequence(tmp_path / "left", rng.integers(0, 256, (2, 24, 32, 3), dtype=np.uint8))
+    with pytest.raises(RecordingError, match=r"none of the 2 left frames can be read.*a colour image"):
+        open_frames("left/*", tmp_path, "left")
+
+
+def test_float_pixels_are_refused(tmp_path, rng):
+    write_sequence(tmp_path / "left", rng.random((2, 24, 32)).astype(np.float32), "tiff")
+    with pytest.raises(RecordingError, match="float32"):
+        open_frames("left/*", tmp_path, "left")
+
+
+def test_files_are_taken_in_the_order_of_their_numbers(tmp_path, frames):
+    write_sequence(tmp_path / "left", frames[:, 0], names=[f"shot_{i}" for i in range(11)])
+    reader = open_frames("left/shot_*.png", tmp_path, "left")
+    assert_array_equal(reader.read(10), frames[10, 0])
+    assert_array_equal(reader.read(2), frames[2, 0])
+
+
+def test_brackets_in_the_folder_name_are_no_pattern(tmp_path, frames):
+    write_sequence(tmp_path / "run [1]" / "left", frames[:, 0])
+    assert len(open_frames("left/*.png", tmp_path / "run [1]", "left")) == 11
+
+
+def test_a_pattern_without_a_match_tells_what_lies_there(tmp_path, frames):
+    write_sequence(tmp_path / "left", frames[:, 0])
+    with pytest.raises(RecordingError, match=r"no image matched for the left camera.*000000\.png"):
+        match_files("left/*.jpg", tmp_path, "left")
+    with pytest.raises(RecordingError, match="There is no folder"):
+        match_files("lfet/*.png", tmp_path, "left")
+
+
+def test_a_missing_number_keeps_its_place_in_time(tmp_path, frames):
+    files = write_sequence(tmp_path / "left", frames[:, 0])
+    files[4].unlink()
+    reader = open_frames("left/*.png", tmp_path, "left")
+    assert len(reader) == 11
+    assert_array_equal(reader.read(5), frames[5, 0])
+    with pytest.raises(RecordingError, match="frame 4"):
+        reader.read(4)
+    assert any("missing" in note for note in reader.notes)
+
+
+@pytest.mark.parametrize("gone", [range(2, 9), [1, 2, 3, 5, 8], [9]])
+def test_a_gap_in_the_numbers_is_as_many_lost_frames_whatever_its_size(tmp_path, frames, gone):
+    files = write_sequence(tmp_path / "left", frames[:, 0])
+    for i in gone:
+        files[i].unlink()
+    reader = open_frames("left/*.png", tmp_path, "left")
+    assert len(reader) == 11
+    assert_array_equal(reader.read(10), frames[10, 0])
+    assert any(f"{len(gone)} file(s) missing" in note for note in reader.notes)
+
+
+def test_numbers_in_steps_are_consecutive_frames_and_in_doubt(tmp_path, frames):
+    files = write_sequence(tmp_path / "left", frames[:, 0], names=[f"{10 * i:05d}" for i in range(11)])
+    files[4].unlink()
+    reader = open_frames("left/*.png", tmp_path, "left")
+    assert len(reader) == 11
+    assert_array_equal(reader.read(5), frames[5, 0])
+    assert any("steps of 10" in doubt for doubt in reader.doubts)
+
+
+@pytest.mark.parametrize("stray", ["Copy of 000005", "000005 (1)", "000005_1", "background", "frame_000011"])
+def test_a_file_that_is_not_named_like_the_others_is_named_not_measured(tmp_path, frames, stray):
+    write_sequence(tmp_path / "left", frames[:, 0])
+    write_sequence(tmp_path / "left", frames[:1, 0], names=[stray])
+    with pytest.raises(RecordingError) as caught:
+        open_frames("left/*.png", tmp_path, "left")
+    assert f"{stray}.png: not named like the other 11 left frames" in str(caught.value)
+    pattern = str(caught.value).split('as "')[1].split('"')[0]  # the pattern that is proposed works
+    assert len(open_frames(pattern, tmp_path, "left")) == 11
+
+
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (["7", "07", "8"], "two left frames of number 7"),
+        (["a", "b", "c"], "hold no number"),
+        ([f"cam_{t}" for t in (1000013, 1001021, 1001998, 1003004, 1004017)], "no common step.*time stamps"),
+        ([f"2026-11-22_10-15-59.{t}" for t in (310, 411, 509, 613)], "no common step"),
+        ([f"take{take}_{i}" for take in (1, 2) for i in range(3)], "two left frames of number 0"),
+        (["0", "1", "20261122"], "no common step"),
+    ],
+)
+def test_names_that_are_no_clock_stop_the_run(tmp_path, frames, names, reason):
+    write_sequence(tmp_path / "left", frames[: len(names), 0], names=names)
+    with pytest.raises(RecordingError, match=reason):
+        open_frames("left/*.png", tmp_path, "left")
+
+
+def test_a_counter_beside_a_time_stamp_is_found_or_told_by_the_pattern(tmp_path, frames):
+    stamps = np.cumsum([7, 998, 1003, 1000, 2001, 997])
+    names = [f"cam2_{stamp}_{i}" for stamp, i in zip(stamps, (0, 1, 2, 3, 5, 6), strict=True)]
+    write_sequence(tmp_path / "left", frames[:6, 0], names=names)
+    assert len(open_frames("left/*.png", tmp_path, "left")) == 7
+    assert len(open_frames("left/cam2_*_{number}.png", tmp_path, "left")) == 7
+    with pytest.raises(RecordingError, match="two left frames of number 2"):
+        open_frames("left/cam{number}_*.png", tmp_path, "left")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "verdict"),
+    [
+        (range(11), None),
+        (range(100, 111), "taken as pairs"),
+        (range(1, 12), "equal numbers"),
+        (range(0, 22, 2), "equal"),
+    ],
+)
+def test_equal_numbers_are_the_same_instant(tmp_path, frames, theirs, verdict):
+    write_sequence(tmp_path / "left", frames[:, 0])
+    write_sequence(tmp_path / "right", frames[:, 1], names=[f"{i:06d}" for i in theirs])
+    left, right = (open_frames(f"{camera}/*.png", tmp_path, camera) for camera in ("left", "right"))
+    if verdict is not None and verdict.startswith("equal"):
+        with pytest.raises(RecordingError, match=verdict):
+            check_same_numbers(left, right)
+    else:
+        assert [verdict in doubt for doubt in check_same_numbers(left, right)] == ([True] if verdict else [])
+
+
+@pytest.mark.parametrize("block", [1, 3, 4, 11, 50])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_hold_every_pair_once_and_in_order(pair, frames, block, threads):
+    numbers, images, unreadable = collect(open_pair(pair), block=block, threads=threads)
+    assert_array_equal(numbers, np.arange(11))
+    assert_array_equal(images, frames)
+    assert unreadable == []
+
+
+def test_a_range_of_frames_is_read_alone(pair, frames):
+    numbers, images, _ = collect(open_pair(pair), start=3, stop=8, block=2)
+    assert_array_equal(numbers, np.arange(3, 8))
+    assert_array_equal(images, frames[3:8])
+
+
+def test_an_empty_range_gives_no_block(pair):
+    assert list(iter_pair_blocks(*open_pair(pair), start=5, stop=5)) == []
+
+
+def test_a_caller_that_stops_early_leaves_no_thread_behind(pair):
+    blocks = iter_pair_blocks(*open_pair(pair), block=2)
+    next(blocks)
+    blocks.close()
+    gc.collect()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("read")]
+
+
+def _truncate(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def _flip(content: bytes) -> bytes:
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 0x55]) + content[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (_truncate, "truncated"),
+        (_flip, "checksum"),
+        (lambda c: b"", "empty"),
+        (lambda c: b"not an image", "not a readable"),
+    ],
+)
+def test_a_damaged_image_is_named_and_the_others_are_delivered(pair, frames, capfd, damage, reason):
+    file = pair / "right" / "000006.png"
+    file.write_bytes(damage(file.read_bytes()))
+    _, images, unreadable = collect(open_pair(pair), block=4)
+    (bad,) = unreadable
+    assert (bad.frame, bad.camera) == (6, 1)
+    assert "000006.png" in bad.reason
+    assert "right camera" in bad.reason
+    assert reason in bad.reason
+    expected = frames.copy()
+    expected[6, 1] = 0
+    assert_array_equal(images, expected)
+    assert "libpng" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "bmp", "tiff"])
+def test_a_truncated_file_of_another_format_is_not_half_an_image(tmp_path, frames, suffix):
+    smooth = [cv2.GaussianBlur(image, (0, 0), 2) for image in frames[:, 0]]
+    files = write_sequence(tmp_path / "left", smooth, suffix)
+    files[3].write_bytes(_truncate(files[3].read_bytes()))
+    reader = open_frames("left/*", tmp_path, "left")
+    with pytest.raises(RecordingError, match="frame 3"):
+        reader.read(3)
+
+
+def test_a_frame_of_another_size_or_depth_is_refused(tmp_path, frames):
+    files = write_sequence(tmp_path / "left", frames[:, 0])
+    cv2.imwrite(str(files[7]), frames[7, 0, :20])
+    cv2.imwrite(str(files[8]), frames[8, 0].astype(np.uint16))
+    reader = open_frames("left/*", tmp_path, "left")
+    for index, found in ((7, "32 x 20"), (8, "16 bit")):
+        with pytest.raises(RecordingError, match=f"frame {index}.*{found}"):
+            reader.read(index)
+
+
+def test_a_file_that_vanishes_in_mid_run_is_one_lost_frame(pair):
+    readers = open_pair(pair)
+    (pair / "left" / "000009.png").unlink()
+    _, _, unreadable = collect(readers, block=4)
+    assert [(image.frame, image.camera) for image in unreadable] == [(9, 0)]
+
+
+def test_a_damaged_first_frame_does_not_hide_the_rest(pair):
+    file = pair / "left" / "000000.png"
+    file.write_bytes(_truncate(file.read_bytes()))
+    _, images, unreadable = collect(open_pair(pair))
+    assert len(images) == 11
+    assert [image.frame for image in unreadable] == [0]
+
+
+def test_cameras_of_different_length_or_size_are_refused(pair, frames):
+    (pair / "right" / "000010.png").unlink()
+    with pytest.raises(RecordingError, match=r"left has 11 frames.*right has 10"):
+        next(iter_pair_blocks(*open_pair(pair)))
+    write_sequence(pair / "right", frames[:, 1, :20])
+    with pytest.raises(RecordingError, match=r"32 x 24 px.*32 x 20 px"):
+        next(iter_pair_blocks(*open_pair(pair)))
+
+
+def test_the_content_hash_tells_a_changed_frame_and_only_that(pair):
+    left, _ = open_pair(pair)
+    before = left.content_sha256(0, 11)
+    for i in range(11):
+        left.read(i)
+    assert left.content_sha256(0, 11) == before  # computed while reading, or apart
+    file = pair / "left" / "000003.png"
+    cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_UNCHANGED) ^ 1)
+    changed, _ = open_pair(pair)
+    assert changed.content_sha256(0, 11) != before
+    assert changed.content_sha256(4, 11) == left.content_sha256(4, 11)
+
+
+_fuzz = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@_fuzz
+@given(content=st.binary(max_size=300), head=st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"BM", b"\xff\xd8\xff\xe0"]))
+def test_any_bytes_are_an_image_or_refused(content, head):
+    try:
+        image = as_grey(decode(head + content, "file"), "file")
+    except RecordingError:
+        return
+    assert image.ndim == 2
+
+
+def test_a_header_that_claims_a_huge_image_is_refused_before_decoding():
+    header = (1 << 30).to_bytes(4, "big") * 2 + b"\x08\0\0\0\0"
+    chunk = b"IHDR" + header
+    content = b"\x89PNG\r\n\x1a\n" + len(header).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    with pytest.raises(RecordingError, match="claims 1073741824 x 1073741824"):
+        decode(content, "file")
+
+
+@pytest.mark.parametrize("codec", ["ffv1", "rawvideo"])
+def test_a_lossless_video_returns_the_pixels_that_were_written(tmp_path, frames, codec):
+    av = pytest.importorskip("av")
+    for camera, name in enumerate(("left", "right")):
+        with av.open(str(tmp_path / f"{name}.avi"), "w") as container:
+            stream = container.add_stream(codec, rate=25)
+            stream.width, stream.height, stream.pix_fmt = 32, 24, "gray" if codec == "ffv1" else "yuv420p"
+            for image in frames[:, camera]:
+                picture = av.VideoFrame(32, 24, stream.pix_fmt)
+                for plane in picture.planes:
+                    rows = np.full((plane.height, plane.line_size), 128, np.uint8)
+                    if plane.width == 32:
+                        rows[:, :32] = image
+                    plane.update(rows.tobytes())
+                container.mux(stream.encode(picture))
+            container.mux(stream.encode())
+    readers = open_frames("left.avi", tmp_path, "left"), open_frames("right.avi", tmp_path, "right")
+    _, images, unreadable = collect(readers, block=4)
+    assert unreadable == []
+    assert_array_equal(images, frames)
+    assert_array_equal(readers[0].read(2), frames[2, 0])  # going back
+
+
+def test_a_truncated_video_loses_only_its_end(tmp_path, frames):
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "left.avi"), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 32, 24, "gray"
+        for image in frames[:, 0]:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
+        container.mux(stream.encode())
+    content = (tmp_path / "left.avi").read_bytes()
+    (tmp_path / "left.avi").write_bytes(content[: len(content) * 2 // 3])
+    reader = open_frames("left.avi", tmp_path, "left")
+    assert_array_equal(reader.read(1), frames[1, 0])
+    (tmp_path / "none.avi").write_bytes(b"not a video")
+    with pytest.raises(RecordingError, match="not a readable video"):
+        open_frames("none.avi", tmp_path, "left")
+
+
+@_fuzz
+@given(
+    shape=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    sixteen=st.booleans(),
+    kinds=st.lists(st.integers(0, 4), min_size=9, max_size=9),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_every_png_row_filter_is_undone_as_libpng_does(shape, sixteen, kinds, seed):
+    height, width = shape
+    stride = width * (2 if sixteen else 1)
+    rows = np.random.default_rng(seed).integers(0, 256, (height, stride + 1), dtype=np.uint8)
+    rows[:, 0] = kinds[:height]
+    content = _png(width, height, 16 if sixteen else 8, zlib.compress(rows.tobytes()))
+    out = np.zeros(shape, np.uint16 if sixteen else np.uint8)
+    assert decode(content, "file", out) is out
+    assert_array_equal(out, cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+def _png(width: int, height: int, depth: int, compressed: bytes) -> bytes:
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
+
+    header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([depth, 0, 0, 0, 0])
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", compressed) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("rows", [3, 5])
+def test_png_pixels_too_few_or_too_many_for_the_header_are_refused(rows):
+    content = _png(8, 4, 8, zlib.compress(bytes(9 * rows)))
+    with pytest.raises(RecordingError, match="damaged"):
+        decode(content, "file")
+
+
+def test_a_wrong_checksum_of_the_pixels_is_noticed():
+    compressed = bytearray(zlib.compress(bytes(9 * 4)))
+    compressed[-1] ^= 1
+    with pytest.raises(RecordingError, match="damaged"):
+        decode(_png(8, 4, 8, bytes(compressed)), "file")

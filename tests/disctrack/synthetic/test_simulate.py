@@ -1,0 +1,186 @@
+"""disctrack simulate: from a scene to a file that explains itself, and messages where it cannot be."""
+
+import tomllib
+
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from disctrack.cli import main
+from disctrack.errors import OutputError, SceneError
+from disctrack.files.toml_tree import toml_value
+from disctrack.rolling import CATALOGUE, ModelError, Regime, effects_from_tables
+from disctrack.synthetic.description import load_scene
+from disctrack.synthetic.motion import motion_of
+from disctrack.synthetic.simulation import run_simulate
+
+SCENE = """
+name = "roll"
+[cameras]
+n_frames = 51
+frame_rate_hz = 500.0
+[motion]
+kind = "rolling"
+[motion.rolling]
+theta_deg = 8
+[motion.rolling.effects.km]
+[motion.rolling.effects.kz]
+k_z = 6e-5
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def test_motion_file_holds_the_motion_with_units(scene, tmp_path):
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert "kz.k_z = 6e-05 m" in run.summary
+    with h5py.File(run.path) as file:
+        assert file.attrs["complete"] == 1
+        assert file.attrs["end_reason"] == "the requested time was reached"
+        assert_allclose(file["time"][()], np.arange(51) / 500)
+        for i, name in enumerate(("x", "y", "z", "psi", "theta", "phi")):
+            assert_allclose(file[name][()], run.motion.q[:, i])
+        assert_allclose(file["energy/total"][()], run.motion.energy)
+        assert_allclose(file["contact/F_z"][()], run.motion.contact_force[:, 2])
+        assert file["model/kz"].attrs["k_z"] == 6e-5
+
+        def has_units(name, item):
+            if isinstance(item, h5py.Dataset):
+                assert item.attrs["units"], name
+                assert item.attrs["long_name"], name
+
+        file.visititems(has_units)
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_motion_file_opens_in_xarray(scene, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    run = run_simulate(scene, tmp_path / "motion.h5", duration=0.02, rate=2000)
+    with xarray.open_dataset(run.path, engine="h5netcdf") as data:
+        assert dict(data.sizes)["time"] == 41
+        assert data.theta.attrs["units"] == "rad"
+
+
+def test_a_motion_that_ends_gives_a_shorter_file_with_the_reason(scene, tmp_path):
+    scene.write_text(SCENE.replace("theta_deg = 8", "theta_deg = 0.8"))
+    run = run_simulate(scene, tmp_path / "motion.h5", duration=1.0)
+    with h5py.File(run.path) as file:
+        assert len(file["time"]) < 501
+        assert file.attrs["end"] == "NUTATION"
+
+
+def test_a_struck_disc_is_a_scene_too(scene, tmp_path):
+    struck = "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05, friction = 0.1 }"
+    text = SCENE.replace("theta_deg = 8", struck) + "[motion.rolling.effects.slip]\nmu = 0.1\n"
+    scene.write_text(text)
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert run.motion.q[0, 4] == np.pi / 2
+    scene.write_text(text.replace("impulse_N_s", "impulse"))
+    with pytest.raises(SceneError, match="expected impulse_N_s, lateral_mm, vertical_mm"):
+        run_simulate(scene, tmp_path / "other.h5")
+
+
+def test_a_disc_that_never_touches_the_table_is_summed_up_too(scene, tmp_path):
+    scene.write_text(SCENE.replace("theta_deg = 8", "state = { z = 1.0, v_x = 0.0, v_y = 0.0, v_z = 0.0 }"))
+    run = run_simulate(scene, tmp_path / "motion.h5", duration=0.02)
+    assert (run.motion.regime == Regime.FLYING).all()
+    assert "never held by the table" in run.summary
+    assert "nan" not in run.summary
+
+
+def test_a_scene_whose_motion_ends_where_it_starts_is_not_filmed(scene, tmp_path):
+    struck = "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05 }"  # without the effect slip
+    scene.write_text(SCENE.replace("theta_deg = 8", struck))
+    with pytest.raises(SceneError, match="over before anything is filmed: after losing contact"):
+        motion_of(load_scene(scene))
+    np.savetxt(tmp_path / "table.csv", [[0, 0, 0, 0, 0, 0.5, 0], [1, 0, 0, np.nan, 0, 0.5, 0]], delimiter=",")
+    scene.write_text('[motion]\nkind = "table"\ntable = "table.csv"\n')
+    with pytest.raises(SceneError, match="row 1 holds no finite number"):
+        motion_of(load_scene(scene))
+
+
+def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
+    (tmp_path / "there.h5").write_text("")
+    with pytest.raises(OutputError, match="exists"):
+        run_simulate(scene, tmp_path / "there.h5")
+    with pytest.raises(SceneError, match=r"2 s at 1e\+300 Hz are 2e\+300 instants; expected at most 1e\+07"):
+        run_simulate(scene, tmp_path / "motion.h5", duration=2.0, rate=1e300)
+    scene.write_text('[motion]\nkind = "static"\n')
+    with pytest.raises(SceneError, match='needs kind = "rolling"'):
+        run_simulate(scene, tmp_path / "motion.h5")
+
+
+def test_an_effect_by_formula_is_simulated_and_saved(scene, tmp_path):
+    law = '[motion.rolling.formulas.brake]\nload_z = "-c * omega_z"\n[motion.rolling.effects.brake]\nc = 1e-4\n'
+    scene.write_text(SCENE + law)
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    plain = scene.with_name("plain.toml")
+    plain.write_text(SCENE)
+    without = run_simulate(plain, tmp_path / "plain.h5")
+    assert np.abs(run.motion.q - without.motion.q).max() > 1e-6
+    (brake,) = (effect for effect in run.motion.model.effects if effect.name == "brake")
+    assert effects_from_tables({"brake": brake.values}, {"brake": brake.formulas}) == (brake,)
+    scene.write_text(SCENE + law.replace("omega_z", "thetadot"))  # another law of that name, in the same process
+    assert np.abs(run_simulate(scene, tmp_path / "other.h5").motion.q - run.motion.q).max() > 1e-6
+    scene.write_text(SCENE + law.partition("[motion.rolling.effects")[0])
+    with pytest.raises(ModelError, match="brake"):
+        run_simulate(scene, tmp_path / "no_numbers.h5")
+
+
+def test_a_number_that_a_scene_does_not_give_is_zero_and_what_it_leaves_out_is_said(scene, tmp_path):
+    scene.write_text(
+        SCENE.partition("[motion.rolling.effects")[0] + "[motion.rolling.effects.table_tilt]\ntilt_x = 0.0035\n"
+    )
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert run.motion.model.values == {"table_tilt.tilt_x": 0.0035, "table_tilt.tilt_y": 0.0}
+    assert "without km, kn, kz, which only a scene that names no effect has" in run.summary
+    assert effects_from_tables({"km": {}}) == (CATALOGUE["km"](),)
+    with pytest.raises(ModelError, match="rolling_power' has a shape but no amount: give k"):
+        effects_from_tables({"rolling_power": {"p": 1.5}})
+
+
+def test_a_scene_without_effects_has_those_of_the_paper_at_their_nominal_sizes(scene, tmp_path):
+    scene.write_text(SCENE.partition("[motion.rolling.effects")[0])
+    run = run_simulate(scene, tmp_path / "motion.h5")
+    assert run.motion.model.effects == tuple(CATALOGUE[name]() for name in ("km", "kn", "kz"))
+    assert "; without" not in run.summary
+
+
+def test_effects_survive_their_toml():
+    effects = tuple(effect() for effect in CATALOGUE.values())
+    text = toml_value({effect.name: effect.values for effect in effects})
+    assert effects_from_tables(tomllib.loads(f"effects = {text}")["effects"]) == effects
+
+
+def test_command_writes_the_motion_and_tells_how_it_went(scene, capsys):
+    assert main(["simulate", str(scene), "--duration", "0.05", "--rate", "1000"]) == 0
+    said = capsys.readouterr().out
+    assert "scene_motion.h5" in said
+    assert "nutation 8" in said
+    with h5py.File(scene.with_name("scene_motion.h5")) as file:
+        assert len(file["time"]) == 51
+
+
+def test_command_answers_mistakes_with_one_line(scene, capsys):
+    assert main(["simulate", str(scene.with_name("nowhere.toml"))]) == 1
+    assert "nowhere.toml" in capsys.readouterr().err
+    scene.write_text(SCENE.replace("k_z = 6e-5", "k_z = -6e-5"))
+    assert main(["simulate", str(scene)]) == 1
+    assert "a passive effect cannot feed the disc with energy" in capsys.readouterr().err
+    scene.write_text(SCENE.replace("effects.kz", "effects.kx"))
+    assert main(["simulate", str(scene)]) == 1
+    said = capsys.readouterr().err
+    assert "there is no effect 'kx'" in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_command_lists_the_effects(capsys):
+    assert main(["simulate", "--list-effects"]) == 0
+    assert "| `km` |" in capsys.readouterr().out

@@ -1,0 +1,162 @@
+"""Scatter of the dots apart from what all frames share: cameras, printed dots, clock."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import minimize
+
+from disctrack.disc import MA_2014
+from disctrack.frames import rotation_from_euler, rotation_from_quaternion, rotation_from_vector, vector_from_rotation
+from disctrack.synthetic.description import CameraFault, Faults
+from disctrack.track.as_printed import declared_places_kept, motions_of_pattern, pattern_place
+from disctrack.track.own_scatter import split_scatter, without_shared_faults
+from disctrack.track.pose import fit_poses
+from tests.oracles.measured_disc import SIGMA_PX, measured
+
+N = 160
+# relative scatter of chi-square with 18 degrees of freedom in N frames: sqrt(2 / 18 / N) = 2.6 %; four of these
+TOLERANCE = 0.105
+
+
+def judged(trajectory):
+    R = rotation_from_quaternion(trajectory.quaternion)
+    return without_shared_faults(
+        trajectory.markers_px,
+        trajectory.markers_covariance_px2,
+        trajectory.rig,
+        trajectory.disc,
+        R,
+        trajectory.q[:, :3],
+    )
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        Faults(),
+        Faults(right_delay_s=2.5e-4),
+        Faults(right=CameraFault(rotation_deg=(0.02, -0.01, 0.015), translation_mm=(0.1, 0.0, -0.1))),
+        Faults(left=CameraFault(focal_scale=1.004, k1_change=0.01)),
+    ],
+    ids=["none", "delay", "moved", "lens"],
+)
+def test_faulty_cameras_do_not_count_as_noise_and_move_no_dot(faults):
+    trajectory = measured(faults=faults, n=N)
+    loud = np.nanmedian(trajectory.reduced_chi_square)
+    found = judged(trajectory)
+    assert abs(found.reduced_chi_square - 1) < TOLERANCE
+    assert loud > 5 or faults == Faults()
+    assert np.abs(found.marker_shift[:, :2]).max() < 5 * found.marker_shift_sigma.max()
+    assert_allclose(found.delay, 1e3 * faults.right_delay_s, atol=0.02)
+
+
+def test_noise_of_the_dots_themselves_remains(rng):
+    trajectory = measured(n=N)
+    doubled = trajectory.markers_px + np.sqrt(3) * 0.006 * rng.standard_normal(trajectory.markers_px.shape)
+    assert_allclose(judged(replace(trajectory, markers_px=doubled)).reduced_chi_square, 4.0, rtol=TOLERANCE)
+
+
+def test_what_repeats_is_not_noise_and_noise_does_not_repeat(rng):
+    """A smooth field in the image is told apart from white noise; both sizes are known here."""
+    trajectory = measured(n=N)
+    field = 0.02 * np.sqrt(2) * np.sin(trajectory.markers_px[..., ::-1] * 2 * np.pi / 300 + [0.3, 1.1])
+    white = SIGMA_PX * rng.standard_normal(trajectory.markers_px.shape)
+
+    def split(markers):
+        R = rotation_from_quaternion(trajectory.quaternion)
+        covariance = trajectory.markers_covariance_px2
+        centres = trajectory.disc.marker_centres_body
+        return split_scatter(
+            fit_poses(markers, covariance, trajectory.rig, centres, R, trajectory.q[:, :3]), covariance, None
+        )
+
+    # second differences of triples that overlap tell half as much as independent frames
+    # second differences of triples that overlap tell half as much as independent frames
+    smooth = split(trajectory.markers_px + field)
+    assert_allclose(smooth.noise, 1.0, atol=2 * TOLERANCE)
+    assert_allclose(smooth.systematic_px, 0.02, rtol=0.35)  # a few places of the image stand for the whole
+    rough = split(trajectory.markers_px + white)
+    assert_allclose(rough.noise, 2.0, rtol=2 * TOLERANCE)
+    assert rough.systematic_px == (0.0, 0.0)
+
+
+def test_misprinted_dot_is_found_where_it_is_and_the_others_stay():
+    misprint = [(0.0, 0.0)] * 6
+    misprint[2] = (0.12, -0.08)
+    found = judged(measured(faults=Faults(misprint_mm=tuple(misprint)), n=N))
+    assert abs(found.reduced_chi_square - 1) < TOLERANCE
+    assert_allclose(1e3 * found.marker_shift[:, :2], misprint, atol=4e3 * found.marker_shift_sigma.max())
+
+
+def test_too_few_frames_give_no_judgement():
+    assert judged(measured(n=15)) is None
+
+
+def test_pattern_is_left_where_most_dots_say(rng):
+    shift = 2e-5 * rng.standard_normal((6, 2))
+    places = MA_2014.marker_centres_body[:, :2]
+
+    def moved(motion):
+        x, y = places.T
+        return shift - motion[:2] * 1e-5 - motion[2] * 1e-3 * np.column_stack([-y, x])
+
+    kept = declared_places_kept(MA_2014, shift)
+    best = minimize(
+        lambda motion: np.linalg.norm(moved(motion), axis=1).sum() * 1e5,
+        np.zeros(3),
+        method="Nelder-Mead",
+        options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 10_000, "maxfev": 10_000},
+    )
+    assert_allclose(kept[:, :2], moved(best.x), atol=2e-9)  # the sum of lengths is flat to 1e-10 there
+    turned = 1e-4 * np.column_stack([-places[:, 1], places[:, 0]]) + [3e-5, -1e-5]
+    assert_allclose(declared_places_kept(MA_2014, turned), 0.0, atol=2e-9)
+
+
+@pytest.mark.parametrize("m", [4, 6, 12])
+def test_the_place_of_a_pattern_is_as_uncertain_as_its_dots_are_misplaced(m, rng):
+    """Dots off at random: by how much the gauge then misses the pattern's place, over the variance stated for it."""
+    angle = 2 * np.pi * np.arange(m) / m
+    radius = 0.02 + 0.006 * (np.arange(m) % 3)
+    centres = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle])
+    disc = replace(MA_2014, marker_centres_body=centres)
+    off = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
+    ratios = []
+    for _ in range(400):
+        shift = 3e-5 * rng.normal(size=(m, 2))
+        kept = declared_places_kept(disc, shift)
+        moved = shift - kept[:, :2]
+        turn = float(np.sum(off[:, 0] * moved[:, 1] - off[:, 1] * moved[:, 0]) / np.sum(off**2))
+        place_variance, turn_variance = pattern_place(disc, kept, np.full((m, 2), 6e-7))
+        ratios.append([*(moved.mean(axis=0) ** 2 / place_variance), turn**2 / turn_variance])
+    trimmed = np.sort(ratios, axis=0)[:-4]  # few dots may agree by chance: of 400 the four worst
+    assert np.all((trimmed.mean(axis=0) > 0.5) & (trimmed.mean(axis=0) < 1.5)), trimmed.mean(axis=0)
+
+
+def test_dots_as_declared_and_one_that_is_not_leave_the_pattern_where_it_is(rng):
+    sigma = np.full((6, 2), 6e-7)
+    assert pattern_place(MA_2014, np.column_stack([0.5 * sigma * rng.normal(size=(6, 2)), np.zeros(6)]), sigma) == (
+        0,
+        0,
+    )
+    one = np.zeros((6, 3))
+    one[2, 0] = 1e-3
+    assert pattern_place(MA_2014, one, sigma) == (0, 0)
+
+
+def test_poses_move_with_the_pattern(rng):
+    """Against poses fitted to dots that were displaced and turned together."""
+    disc, R = MA_2014, rotation_from_euler(0.3, 0.4, 1.1)
+    displaced, turn = np.array([2e-5, -1e-5]), 3e-4
+    c = disc.marker_centres_body
+    middle = c.mean(axis=0)
+    true = middle + (c - middle) @ rotation_from_vector(np.array([0, 0, turn])).T + [*displaced, 0]
+    seen = true @ R.T
+    a, b = c - middle, seen - seen.mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R_found = (U @ Vt).T
+    t_found = seen.mean(axis=0) - R_found @ middle
+    expected = motions_of_pattern(R[None], disc)[0] @ [*displaced, turn]
+    np.testing.assert_allclose(t_found, expected[:3], atol=1e-8)
+    np.testing.assert_allclose(vector_from_rotation(R_found @ R.T), expected[3:], atol=1e-7)

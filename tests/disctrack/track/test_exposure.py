@@ -1,0 +1,217 @@
+"""Exposures as long as the frame interval: what is measured refers to the middle of the exposure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from disctrack import frames, measure_pairs, read_recording, rolling
+from disctrack.errors import RecordingError
+from disctrack.synthetic import render_disc
+from disctrack.track import exposure as smears
+from disctrack.track import template_pull
+from disctrack.track.dots import NoiseModel, locate_on_plane
+from disctrack.track.exposure import shift_by_exposure
+from disctrack.track.pose import marker_pixels
+from disctrack.track.template_pull import Pull
+from disctrack.track.tracking import TrackingSettings
+from disctrack.trajectory import FrameStatus
+
+RATE, EXPOSURE = 1000.0, 1e-3  # Hz, s
+N = 40
+SIMPSON = np.array([1, 4, 2, 4, 2, 4, 2, 4, 1]) / 24
+
+
+def rolled(disc, theta_deg, rate=RATE):
+    """A disc rolling at this nutation [deg]: its poses at nine instants of the exposure of each frame, (N, 9, 6)."""
+    start = rolling.steady_precession(np.radians(theta_deg), disc, 9.81)
+    solution = rolling.simulate(rolling.Model(disc, 9.81), start, times=np.arange(8 * N + 1) / (8 * rate))
+    q = solution.q[8 * np.arange(N)[:, None] + np.arange(9)]
+    q[..., :2] += np.array([0.032, 0.02]) - q[..., :2].mean(axis=(0, 1))
+    return q, solution.qdot[4::8]
+
+
+@pytest.fixture(scope="module")
+def motion(rendered_pairs):
+    """At 10 deg."""
+    return rolled(rendered_pairs.disc, 10)
+
+
+@pytest.fixture(scope="module")
+def measured(rendered_pairs, motion):
+    """The poses at mid exposure; the same images measured with no exposure, theirs, an unknown and a wrong one."""
+    q, qdot = motion
+    cameras = replace(rendered_pairs.scene.cameras, exposure_s=EXPOSURE)
+    scene = replace(rendered_pairs.scene, cameras=cameras)
+    images = render_disc(
+        q[:, 4], rendered_pairs.rig, rendered_pairs.disc, scene, np.random.default_rng(3), qdot=qdot[:N]
+    )
+    told = [(0.0, 0.0), (EXPOSURE, EXPOSURE), None, (0.2e-3, 0.2e-3)]
+    return q[:, 4], [
+        measure_pairs(
+            images, rendered_pairs.rig, rendered_pairs.disc, RATE, settings=TrackingSettings(exposure=exposure)
+        )
+        for exposure in told
+    ]
+
+
+def _seen(centres, affine, dark, blur_px):
+    """Image (64, 64) of a dot, the mean over its outlines: centres (k, 2) [px], affine (k, 2, 2) unit circle -> px."""
+    fine, total = 6, 0.0
+    axis = (np.arange(64 * fine) + 0.5) / fine - 0.5
+    pixels = np.stack(np.meshgrid(axis, axis), axis=-1)
+    for weight, centre, A in zip(SIMPSON, centres, affine, strict=True):
+        u = (pixels - centre) @ np.linalg.inv(A).T
+        distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(A))) * fine
+        total = total + weight * np.clip(distance + 0.5, 0, 1)
+    smooth = gaussian_filter(total, blur_px * fine).reshape(64, fine, 64, fine).mean((1, 3))
+    return np.round(50000 - (50000 - dark) * smooth).astype(np.uint16)
+
+
+def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
+    """Shifts of the template by the smear, by dots drawn along the motion; by the mean of their path; as `found`."""
+    expected, by_path, given = [], [], []
+    turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    edge = 0.5 * disc.marker_diameter * np.column_stack([circle, np.zeros(16)])
+    for frame, dot, cameras in chosen:
+        points = np.concatenate([disc.marker_centres_body[[dot]], disc.marker_centres_body[dot] + edge])
+        outlines = rig.project(points @ np.swapaxes(R[frame], -1, -2) + q[frame, :, None, :3])  # (9, 2, 17, 2)
+        for camera in cameras:
+            centres, edges = outlines[:, camera, 0], outlines[:, camera, 1:]
+            affine = np.swapaxes(edges - centres[:, None], 1, 2) @ circle / 8
+            window = np.round(centres[4]) - 31
+            H = np.eye(3)
+            H[:2, :2], H[:2, 2] = affine[4], centres[4] - window
+            seen = [_seen(centres[k] - window, affine[k], dark, 0.6) for k in (np.arange(9), [4] * 9)]
+            smeared, still = (
+                locate_on_plane(image, H, np.zeros((1, 2)), 1.0, noise=noise, blur_px=blur_px).pixels[0]
+                for image in seen
+            )
+            expected.append(smeared - still)
+            by_path.append(SIMPSON @ centres - centres[4])
+            given.append(found[frame, camera, dot])
+    return np.array(expected), np.array(by_path), np.array(given)
+
+
+@pytest.mark.parametrize(("dark", "noise"), [(10000, NoiseModel(4e5, 0.0)), (5000, NoiseModel(1e4, 8.0))])
+def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
+    """Against dots drawn along the simulated motion (no renderer, no formula), found by their template."""
+    q, rig, disc = motion[0], rendered_pairs.rig, rendered_pairs.disc
+    R = frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
+    known, where = R[:, 4].copy(), q[:, 4, :3].copy()
+    known[20], where[20] = np.nan, np.nan
+    pull = Pull(0.65, (50000.0, 1 - dark / 50000), noise)
+    exposures = np.array([EXPOSURE, EXPOSURE])
+    found = shift_by_exposure(known, where, np.arange(N) / RATE, exposures, rig, disc, (pull, pull))
+    assert not found[20].any()
+
+    dots = ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4))
+    chosen = [(*dot, (0, 1)) for dot in dots]
+    expected, by_path, given = _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, 0.65)
+    size = np.sqrt(np.mean(expected**2))
+    assert size > 0.002  # px
+    assert np.sqrt(np.mean((given - expected) ** 2)) < 0.25 * size
+    assert np.sqrt(np.mean((by_path - expected) ** 2)) > 0.4 * size  # the mean of the path alone is not what is found
+
+
+def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs, monkeypatch):
+    """At 55 deg of nutation, dots up to 75 deg off their normal; negative control: as circles of the same area."""
+    rig, disc, noise = rendered_pairs.rig, rendered_pairs.disc, NoiseModel(4e5, 0.0)
+    rate = 2500.0  # a millisecond would smear them by more than a blur
+    q = rolled(disc, 55, rate)[0]
+    R_cw, t_cw = rig.camera_poses()[0]
+    to_camera = -t_cw @ R_cw - q[N // 2, 4, :3]
+    towards, now = np.arctan2(to_camera[1], to_camera[0]), q[N // 2, 4, 3] - np.pi / 2  # of the camera, of the normal
+    q[..., 3] += towards + np.radians(98) - now
+    R = frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
+    line = q[:, 4, :3] @ R_cw.T + t_cw
+    cosine = -((R_cw @ R[:, 4])[..., 2] * line).sum(-1) / np.linalg.norm(line, axis=-1)
+    oblique = [(int(frame), 0, (0,)) for frame in np.flatnonzero((cosine > 0.27) & (cosine < 0.5))[1:-1:2]]
+    assert len(oblique) >= 4
+    pull = Pull(0.7, (50000.0, 0.8), noise)
+    given = R[:, 4], q[:, 4, :3], np.arange(N) / rate, np.array([1, 1]) / rate, rig, disc, (pull, pull)
+    found = smears.shift_by_exposure(*given)
+    expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, 10000, noise, 0.7)
+    of_ellipses = template_pull._response
+    monkeypatch.setattr(
+        template_pull, "_response", lambda *of: np.repeat(of_ellipses(*of)[:, -1:], len(template_pull.SHAPES), 1)
+    )
+    round_dots = smears.shift_by_exposure(*given)
+    circles = np.array([round_dots[frame, camera, dot] for frame, dot, (camera,) in oblique])
+    size = np.sqrt(np.mean(expected**2))
+    assert size > 0.002  # px
+    # single dots scatter by 7e-4 px, with the place of their edge among the pixels that they are drawn with
+    assert np.sum(expected * ellipses) / np.sum(ellipses**2) == pytest.approx(1.0, abs=0.12)
+    assert np.sqrt(np.mean((ellipses - expected) ** 2)) < 0.35 * size
+    assert np.sqrt(np.mean((circles - expected) ** 2)) > 0.5 * size
+
+
+def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
+    text = (sample_clip / "recording.toml").read_text()
+    declared = tmp_path / "recording.toml"
+    declared.write_text(text.replace("[cameras]", "[cameras]\nexposure_us = 200", 1))
+    assert read_recording(tmp_path).exposure == pytest.approx(200e-6)
+    declared.write_text(text.replace("[cameras]", "[cameras]\nexposure_us = 1200", 1))
+    with pytest.raises(RecordingError, match="exposure_us is 1200, longer than a frame: 1000 us"):
+        read_recording(tmp_path)
+
+
+def test_theta_is_that_of_mid_exposure(measured, rendered_pairs):
+    q, runs = measured
+    expected = -9.81 * EXPOSURE**2 / (6 * rendered_pairs.disc.radius)  # steady precession, exposure.py
+    none, told, smeared, _ = (run.trajectory for run in runs)
+    errors = [trajectory.q[:, 4] - q[:, 4] for trajectory in (none, told, smeared)]
+    sigma = np.sqrt(np.mean(none.pose_covariance[:, 3, 3] + none.pose_covariance[:, 4, 4]) / 2 / N)
+    assert abs(expected) > 8 * sigma
+    assert np.mean(errors[0]) == pytest.approx(expected, abs=4 * sigma)  # the fault is there when it is said to be nil
+    assert np.mean(errors[1]) == pytest.approx(0.0, abs=4 * sigma)
+    assert np.mean(errors[2]) == pytest.approx(0.0, abs=4 * sigma)  # nobody tells
+
+
+def test_the_smear_tells_the_exposure(measured):
+    _, (none, told, smeared, wrong) = measured
+    assert smeared.findings["exposure_s"] == pytest.approx([EXPOSURE, EXPOSURE], rel=0.1)
+    assert "exposure by the smear" in smeared.findings["notes"][0]
+    assert told.findings["exposure_s"] == [EXPOSURE, EXPOSURE]
+    assert not [text for text in told.findings["warnings"] if "smear" in text]
+    for run, said in ((none, "0 and 0 us"), (wrong, "200 and 200 us")):
+        (warning,) = [text for text in run.findings["warnings"] if "smear" in text]
+        assert said in warning
+
+
+def test_a_blur_that_changes_with_obliqueness_is_no_exposure(motion, rendered_pairs):
+    """Of 2e-4 px, as curved edges have; a dot's smear by 200 us is some 1e-3 px of blur."""
+    q, rig, disc = motion[0][:, 4], rendered_pairs.rig, rendered_pairs.disc
+    R = frames.rotation_from_euler(*q[:, 3:].T)
+    pixels, J = marker_pixels(R, q[:, :3], rig, disc.marker_centres_body)
+    time = np.arange(N) / RATE
+    affine = np.asarray(J[..., :3] @ R[:, None, None, :, :2])
+    smear = 200e-6**2 * smears._smear(np.gradient(pixels, time, axis=0), affine)
+    singular = np.linalg.svd(affine, compute_uv=False)
+    oblique = singular[..., 1] / singular[..., 0]
+    blur = np.sqrt(0.7**2 + smear) + 2e-4 * (oblique - oblique.mean()) / oblique.std()
+    found = smears.exposure_by_smear(R, q[:, :3], time, blur.astype(np.float32), rig, disc)
+    assert np.sqrt(found.value) == pytest.approx(200e-6, rel=0.02)
+
+
+def test_no_smear_where_nothing_was_smeared(rendered_pairs, motion):
+    """Negative control: the same motion frozen at mid exposure, and as an exposure too short to be seen."""
+    q, qdot = motion
+    for exposure, moving in ((EXPOSURE, None), (20e-6, qdot[:N])):
+        scene = replace(rendered_pairs.scene, cameras=replace(rendered_pairs.scene.cameras, exposure_s=exposure))
+        images = render_disc(
+            q[:, 4], rendered_pairs.rig, rendered_pairs.disc, scene, np.random.default_rng(4), qdot=moving
+        )
+        run = measure_pairs(images, rendered_pairs.rig, rendered_pairs.disc, RATE)
+        assert run.findings["exposure_s"] == [0.0, 0.0]
+        assert run.findings["notes"] == []
+
+
+def test_noise_hardly_grows(measured):
+    without, *corrected = (run.trajectory for run in measured[1][:3])
+    for each in corrected:
+        scatter = [np.std(np.diff(run.markers_px, n=3, axis=0)) for run in (without, each)]
+        assert scatter[1] == pytest.approx(scatter[0], rel=0.05)
+        assert (each.frame_status == FrameStatus.MEASURED).all()

@@ -1,0 +1,131 @@
+"""What must not grow with the length of a recording, and where a long one is cut."""
+
+import tracemalloc
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from disctrack import frames
+from disctrack.recording.readers.blocks import iter_pair_blocks
+from disctrack.track.as_printed import AsBuilt
+from disctrack.track.assembly import Taken, TrackingSettings, _fit_all, assemble
+from disctrack.track.dots import NoiseModel, TemplateLimits
+from disctrack.track.following import Follower, Law, TrackingSetup, empty_tables
+from disctrack.track.pose import marker_pixels
+from disctrack.track.tracking import MOST_STRETCHES, WAITED_FOR, stretch_edges
+from disctrack.trajectory import FrameStatus
+
+
+@pytest.mark.parametrize(
+    ("n", "stretches"), [(1, 1), (999, 1), (1000, 2), (3999, 2), (4000, 4), (16000, 8), (10**6, MOST_STRETCHES)]
+)
+def test_stretches_follow_from_the_length_alone_and_cover_it(rendered_pairs, n, stretches):
+    edges = stretch_edges(range(70, 70 + n), rendered_pairs.disc)
+    assert len(edges) == stretches + 1
+    assert (edges[0], edges[-1]) == (70, 70 + n)
+    first, *others = np.diff(edges)
+    assert not others or np.ptp(others) <= 1
+    # the first also measures the noise, for which the others wait
+    assert not others or abs(others[0] - first - WAITED_FOR) <= 1
+
+
+def test_dots_that_leave_phi_open_are_followed_in_one_stretch(rendered_pairs):
+    four = replace(rendered_pairs.disc, marker_centres_body=rendered_pairs.disc.marker_centres_body[[0, 1, 3, 4]])
+    assert len(stretch_edges(range(5000), four)) == 2
+
+
+class Counted:
+    """A reader whose frame i is full of i."""
+
+    timestamps, notes, random_access, bit_depth, image_size = None, (), True, 8, (4, 3)
+
+    def __len__(self):
+        return 100
+
+    def describe(self, index):
+        return f"frame {index}"
+
+    def read(self, index, out=None):
+        out[...] = index
+        return out
+
+    def content_sha256(self, start, stop):
+        return ""
+
+
+def test_blocks_begin_at_the_breaks_and_hold_every_frame_once():
+    seen = []
+    for block in iter_pair_blocks(Counted(), Counted(), 5, 93, block=16, threads=2, breaks=[0, 40, 41, 80, 99]):
+        assert_array_equal(block.images[:, 0, 0, 0], block.frames)
+        seen.append(block.frames.copy())
+    assert {5, 40, 41, 80} <= {int(block[0]) for block in seen}
+    assert_array_equal(np.concatenate(seen), np.arange(5, 93))
+    # the same blocks for whoever begins at a break
+    late = [b.frames.copy() for b in iter_pair_blocks(Counted(), Counted(), 41, 93, block=16, breaks=[40, 41, 80])]
+    for a, b in zip(late, seen[-len(late) :], strict=True):
+        assert_array_equal(a, b)
+
+
+def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_their_number(rendered_pairs, monkeypatch):
+    monkeypatch.setattr("disctrack.track.assembly.FITTED_AT_ONCE", 512)
+    rig, disc = rendered_pairs.rig, rendered_pairs.disc
+    R, t = frames.rotation_from_euler(*rendered_pairs.q[:, 3:].T), rendered_pairs.q[:, :3]
+    pixels = rendered_pairs.true_pixels
+    m = disc.n_markers
+    built = AsBuilt(rig, disc, np.zeros((m, 3)), np.zeros((m, 2)), np.zeros(30), 1.0, 1.0, 0)
+    beside = []
+    for n in (1536, 4608):
+        k = np.arange(n) % len(R)
+        covariance = np.broadcast_to(1e-4 * np.eye(2), (n, 2, m, 2, 2)).copy()
+        status = np.zeros((n, 2, m), np.uint8)
+        tables = replace(empty_tables(n, m), pixels=pixels[k], covariance_px2=covariance, status=status, R=R[k], t=t[k])
+        tracemalloc.start()
+        fits = _fit_all(tables, built, reject_outliers=True)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert fits.converged.all()
+        beside.append(peak - sum(value.nbytes for value in vars(fits).values()))
+    # three times the frames; before they were fitted in parts it was three times the memory
+    assert beside[1] < 1.2 * beside[0]
+
+
+def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_pairs, rng, monkeypatch):
+    monkeypatch.setattr("disctrack.track.assembly.FITTED_AT_ONCE", 50)
+    rig, disc, m, n = rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.disc.n_markers, 230
+    times = np.arange(n) / 1000.0
+    angles = np.stack([0.1 + 9.0 * times, np.full(n, 0.35), 0.2 - 8.0 * times])
+    R = frames.rotation_from_euler(*angles)
+    t = rendered_pairs.q[0, :3] + 1e-3 * np.stack([np.cos(angles[0]), np.sin(angles[0]), 0.0 * times], axis=1)
+    sigma, printed = 0.004, disc.marker_centres_body + 20e-6 * rng.standard_normal((m, 3)) * [1, 1, 0]
+    pixels = marker_pixels(R, t, rig, printed)[0]
+    pixels += sigma * rng.standard_normal(pixels.shape)
+    pixels[100, 1, 2] += 3.0  # a dot to be struck
+    pixels[160:163, 0] += 0.1  # frames to be refused
+    made = replace(
+        empty_tables(n, m),
+        covariance_px2=np.tile(sigma**2 * np.eye(2), (n, 2, m, 1, 1)),
+        misfit=np.ones((n, 2, m), np.float32),
+        n_pixels=np.full((n, 2, m), 300.0, np.float32),
+        status=np.zeros((n, 2, m), np.uint8),
+        frame_status=np.full(n, FrameStatus.MEASURED, np.uint8),
+    )
+    setup = TrackingSetup(rig, disc, TemplateLimits(), *np.zeros((2, 2, 1, 1)))
+    taken = Taken(range(n), times, 1000.0, 9.81)
+
+    def by(workers, pixels=pixels):
+        follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
+        tables = replace(deepcopy(made), pixels=pixels.copy(), R=R.copy(), t=t.copy())
+        return assemble([follower], tables, TrackingSettings(exposure=(1e-4, 1e-4)), taken, workers)
+
+    one, three = by(1), by(3)
+    assert (one.trajectory.frame_status != FrameStatus.MEASURED).any()
+    assert np.abs(one.as_built.marker_shift).max() > 5e-6
+    for name, value in vars(one.trajectory).items():
+        if isinstance(value, np.ndarray):
+            assert value.tobytes() == getattr(three.trajectory, name).tobytes(), name
+    assert (one.warnings, one.doubts, one.shared_sigma) == (three.warnings, three.doubts, three.shared_sigma)
+    other = by(3, np.nextafter(pixels, np.inf))  # what one unit in the last place does is seen
+    assert other.trajectory.q.tobytes() != one.trajectory.q.tobytes()

@@ -1,0 +1,230 @@
+"""Poses from dots: derivatives, covariance, one camera, few dots, a wrong dot, the flat disc."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
+
+from disctrack import frames
+from disctrack.track.pose import fit_poses, marker_pixels, whitening
+
+SIGMA_PX = 0.01
+
+
+def poses(rng, n, theta_max=0.8):
+    q = np.column_stack(
+        [
+            rng.uniform(0.02, 0.045, n),
+            rng.uniform(0.01, 0.03, n),
+            rng.uniform(0.003, 0.03, n),
+            rng.uniform(-3, 3, n),
+            rng.uniform(0.0, theta_max, n),
+            rng.uniform(-3, 3, n),
+        ]
+    )
+    return q, frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
+
+
+@pytest.fixture(scope="module")
+def rig():
+    from disctrack.synthetic import rig_of
+    from disctrack.synthetic.description import Scene
+
+    return rig_of(Scene())
+
+
+@pytest.fixture(scope="module")
+def centres():
+    from disctrack.disc import MA_2014
+
+    return MA_2014.marker_centres_body
+
+
+def noisy_markers(R, t, rig, centres, rng, sigma=SIGMA_PX):
+    pixels, _ = marker_pixels(R, t, rig, centres)
+    covariance = np.broadcast_to(sigma**2 * np.eye(2), (*pixels.shape, 2)).copy()
+    return pixels + sigma * rng.normal(size=pixels.shape), covariance
+
+
+def near(R, t, rng, angle=5e-3, shift=2e-4):
+    return frames.rotation_from_vector(rng.normal(scale=angle, size=(len(R), 3))) @ R, t + rng.normal(
+        scale=shift, size=t.shape
+    )
+
+
+def pose_error(fits, R, t):
+    turn = frames.vector_from_rotation(fits.R_world_body @ np.swapaxes(R, 1, 2))
+    return np.concatenate([fits.t_world_body - t, turn], axis=1)
+
+
+def test_jacobian_agrees_with_central_differences(rng, rig, centres):
+    _, R, t = poses(rng, 6)
+    pixels, J = marker_pixels(R, t, rig, centres)
+    assert_allclose(pixels, rig.project(centres @ np.swapaxes(R, 1, 2) + t[:, None]), atol=1e-10)
+    assert np.isnan(marker_pixels(R, t + 10 * rig.R_left_world[2] * [-1, -1, -1], rig, centres)[0][:, 0]).all()
+    for k, step in enumerate([1e-6] * 3 + [1e-5] * 3):
+        v = np.zeros(6)
+        v[k] = step
+        ahead, _ = marker_pixels(frames.rotation_from_vector(v[3:]) @ R, t + v[:3], rig, centres)
+        behind, _ = marker_pixels(frames.rotation_from_vector(-v[3:]) @ R, t - v[:3], rig, centres)
+        numeric = (ahead - behind) / (2 * step)
+        assert_allclose(numeric, J[..., k], atol=1e-6 * np.abs(J[..., k]).max())
+
+
+def test_whitening_turns_any_covariance_into_the_identity(rng):
+    A = rng.normal(size=(100, 2, 2))
+    C = A @ np.swapaxes(A, 1, 2) + 1e-3 * np.eye(2)
+    W = whitening(C)
+    assert_allclose(W @ C @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(2), C.shape), atol=1e-9)
+
+
+def test_pose_scatter_equals_the_predicted_covariance(rng, rig, centres):
+    _, R, t = poses(rng, 500)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng), with_sensitivity=False)
+    assert fits.converged.all()
+    error = pose_error(fits, R, t)
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance), error)
+    # 500 x 6 degrees of freedom: the mean of chi-square / 6 scatters by sqrt(2 / 3000) = 0.026
+    assert abs(squared.mean() / 6 - 1) < 0.1
+    assert abs(fits.reduced_chi_square.mean() - 1) < 0.06  # 500 x 18 degrees of freedom, 4 sigma
+
+
+def test_minimum_is_that_of_scipy(rng, rig, centres):
+    _, R, t = poses(rng, 4)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    A = SIGMA_PX * rng.normal(size=covariance.shape)  # each dot has ellipses of its own, one is not seen
+    covariance += A @ np.swapaxes(A, -1, -2)
+    markers[:, 0, 2] = np.nan
+    start = near(R, t, rng)
+    fits = fit_poses(markers, covariance, rig, centres, *start, reject_outliers=False, with_sensitivity=False)
+    for i in range(4):
+
+        def residual(v, i=i):
+            points = centres @ (frames.rotation_from_vector(v[3:]) @ start[0][i]).T + start[1][i] + v[:3]
+            missed = np.linalg.solve(np.linalg.cholesky(covariance[i]), (markers[i] - rig.project(points))[..., None])
+            return missed[np.isfinite(missed)]
+
+        reference = least_squares(residual, np.zeros(6), x_scale=[1e-4] * 3 + [1e-3] * 3, xtol=1e-15, ftol=1e-15)
+        sigma = np.sqrt(np.diag(fits.covariance[i]))
+        assert_allclose(fits.t_world_body[i], start[1][i] + reference.x[:3], atol=2e-3 * sigma[:3].max())
+        turn = frames.vector_from_rotation(
+            fits.R_world_body[i] @ (frames.rotation_from_vector(reference.x[3:]) @ start[0][i]).T
+        )
+        assert np.abs(turn).max() < 2e-3 * sigma[3:].max()
+
+
+def test_a_flat_disc_is_as_well_conditioned_as_any(rng, rig, centres):
+    q, _, _ = poses(rng, 40)
+    q[:, 4] = 0.0
+    R, t = frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng), with_sensitivity=False)
+    assert fits.converged.all()
+    sigma_rotation = np.sqrt(np.diagonal(fits.covariance, axis1=1, axis2=2))[:, 3:]
+    assert sigma_rotation.max() < np.radians(5e-3)
+
+
+def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig, centres):
+    _, R, t = poses(rng, 60)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    both = fit_poses(markers, covariance, rig, centres, R, t)
+    markers[:, 1] = np.nan
+    one = fit_poses(markers, covariance, rig, centres, R, t)
+    assert one.converged.all()
+    assert np.all(np.linalg.det(one.covariance) > np.linalg.det(both.covariance))
+    error = pose_error(one, R, t)
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(one.covariance), error)
+    assert 0.7 < np.median(squared) / 5.35 < 1.3  # median of chi-square with 6 degrees of freedom
+
+
+def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig, centres):
+    _, R, t = poses(rng, 2)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng, 1e-4)
+    markers[0, 1], markers[0, 0, 3:] = np.nan, np.nan
+    markers[1, 1], markers[1, 0, 2:] = np.nan, np.nan
+    fits = fit_poses(markers, covariance, rig, centres, R, t)
+    assert fits.converged.tolist() == [True, False]
+    assert np.isnan(fits.t_world_body[1]).all()
+    assert fits.degrees_of_freedom.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("wrong_px", [0.3, 40.0])
+def test_a_wrong_dot_is_struck_and_named(rng, rig, centres, wrong_px):
+    _, R, t = poses(rng, 50)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    markers[::2, 0, 2, 0] += wrong_px
+    fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng))
+    assert not fits.used[::2, 0, 2].any()
+    assert fits.used.sum() == fits.used.size - 25  # no good dot with it
+    error = pose_error(fits, R, t)
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance), error)
+    assert squared.mean() / 6 < 1.4
+    assert_allclose(np.abs(fits.residuals_px[::2, 0, 2, 0]), wrong_px, atol=0.2)  # still reported
+
+
+def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig, centres):
+    _, R, t = poses(rng, 5)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    fits = fit_poses(markers, covariance, rig, centres, R, t)
+    scale = np.array(
+        [1.0, 1, 1, 1, 1e-3, 1e-2, 1e-4, 1e-4, 0.1] * 2 + [1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3
+    )
+    for k in range(30):
+        delta = np.zeros(30)
+        delta[k] = 0.1 * scale[k]
+        ahead = fit_poses(markers, covariance, rig.perturbed(delta), centres, R, t, with_sensitivity=False)
+        behind = fit_poses(markers, covariance, rig.perturbed(-delta), centres, R, t, with_sensitivity=False)
+        change = np.concatenate(
+            [
+                ahead.t_world_body - behind.t_world_body,
+                frames.vector_from_rotation(ahead.R_world_body @ np.swapaxes(behind.R_world_body, 1, 2)),
+            ],
+            axis=1,
+        )
+        predicted = 2 * fits.sensitivity[:, :, k] * delta[k]
+        # the noise leaves residuals that second derivatives multiply: 0.01 px against a field of 500 px
+        assert_allclose(change, predicted, atol=0.01 * np.abs(predicted).max() + 1e-9)
+
+
+def test_a_frame_without_a_start_is_nan_and_the_others_are_not(rng, rig, centres):
+    _, R, t = poses(rng, 3)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    t_start = t.copy()
+    t_start[1] = np.nan
+    fits = fit_poses(markers, covariance, rig, centres, R, t_start)
+    assert np.isfinite(fits.t_world_body).all(1).tolist() == [True, False, True]
+    nothing = fit_poses(markers, covariance, rig, centres, R, np.full_like(t, np.nan))
+    assert not nothing.converged.any()
+
+
+def test_exchanged_cameras_are_noticed(rng, rig, centres):
+    """Negative control: the residuals of a wrong assignment are nowhere near the noise."""
+    _, R, t = poses(rng, 5)
+    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    fits = fit_poses(markers[:, ::-1], covariance, rig, centres, R, t, reject_outliers=False)
+    reduced = np.where(fits.converged, fits.reduced_chi_square, np.inf)
+    assert np.all(reduced > 1e3)
+
+
+def test_a_pose_does_not_depend_on_which_frames_are_fitted_with_it(rng, rig, centres):
+    """Some with a dot that was struck, by unlike amounts, so that every round of rejection has another company."""
+    _, R, t = poses(rng, 60)
+    pixels, covariance = noisy_markers(R, t, rig, centres, rng)
+    struck = rng.choice(60, 25, replace=False)
+    pixels[struck, rng.integers(0, 2, 25), rng.integers(0, 6, 25)] += rng.uniform(0.1, 40.0, (25, 1))
+    twice = struck[:8]
+    pixels[twice, 1, rng.integers(0, 6, 8)] -= rng.uniform(1.0, 9.0, (8, 1))
+    R_start, t_start = near(R, t, rng)
+
+    def fitted(rows):
+        return fit_poses(pixels[rows], covariance[rows], rig, centres, R_start[rows], t_start[rows])
+
+    together = fitted(np.arange(60))
+    assert (together.used.sum((1, 2)) < 12).sum() >= 20  # the struck ones were felt
+    for rows in (np.arange(10, 34), np.sort(struck), *np.arange(0, 60, 7)[:, None]):
+        alone = fitted(rows)
+        np.testing.assert_array_equal(alone.used, together.used[rows])
+        # round-off of a position of 0.05 m; a median over the company moved poses by 3.7 um
+        assert_allclose(alone.t_world_body, together.t_world_body[rows], rtol=0, atol=1e-12)
+        assert_allclose(alone.R_world_body, together.R_world_body[rows], rtol=0, atol=1e-11)
