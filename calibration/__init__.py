@@ -7,24 +7,24 @@ found.rig, found.rms_px, found.assessment.verdict
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from calibration.board import Board
-from calibration.camera import Camera, StereoRig, triangulate
-from calibration.errors import CalibrationError, DiscTrackError, RigFileError
+from calibration.board.target import Board
+from calibration.cameras.camera import Camera, StereoRig, triangulate
+from calibration.kit.errors import CalibrationError, DiscTrackError, RigFileError
 
 if TYPE_CHECKING:
-    from calibration.chessboard import BoardNotFound, CornerView, find_corners
+    from calibration.board.chessboard import BoardNotFound, CornerView, find_corners
+    from calibration.fit.refinement import refine_stereo
+    from calibration.fit.stereo_model import Observations, StereoModel, Terms
     from calibration.points import calibrate_from_points
-    from calibration.refinement import refine_stereo
     from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners, calibrate_stereo
-    from calibration.stereo_model import Observations, StereoModel, Terms
 
 # Imported when asked for: the physics needs the camera model and the errors, not the image library behind these.
 _ON_DEMAND = {
-    "chessboard": ("BoardNotFound", "CornerView", "find_corners"),
+    "board.chessboard": ("BoardNotFound", "CornerView", "find_corners"),
     "points": ("calibrate_from_points",),
-    "refinement": ("refine_stereo",),
-    "stereo_model": ("Observations", "StereoModel", "Terms"),
-    "tolerances": ("BoardTolerances",),
+    "fit.refinement": ("refine_stereo",),
+    "fit.stereo_model": ("Observations", "StereoModel", "Terms"),
+    "judge.tolerances": ("BoardTolerances",),
     "stereo": ("CalibrationSettings", "StereoCalibration", "calibrate_from_corners", "calibrate_stereo"),
 }
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.board import Board
-from calibration.chessboard import BoardNotFound, CornerView
-from calibration.corner_fit import local_axes
-from calibration.errors import CalibrationError
+from calibration.board.chessboard import BoardNotFound, CornerView
+from calibration.board.corner_fit import local_axes
+from calibration.board.target import Board
+from calibration.kit.errors import CalibrationError
 from calibration.stereo import CAMERA_NAMES, CalibrationSettings, StereoCalibration, calibrate_from_corners
 
 LARGEST_SQUARE = 0.5  # m: beyond, millimetres were given for metres

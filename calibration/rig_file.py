@@ -13,13 +13,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.board import Board, Target, target_of
-from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Allowance, Camera, StereoRig
-from calibration.errors import CalibrationError, RigFileError
-from calibration.splines import LensField
+from calibration.board.target import Board, Target, target_of
+from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Allowance, Camera, StereoRig
+from calibration.cameras.splines import LensField
+from calibration.fit.stereo_model import Observations
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.errors import CalibrationError, RigFileError
 from calibration.stereo import StereoCalibration
-from calibration.stereo_model import Observations
 
 SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1

@@ -7,31 +7,26 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
-from calibration.assessment import (
+from calibration.board.chessboard import BoardNotFound, CornerView, find_corners
+from calibration.board.target import Board, Target
+from calibration.cameras.camera import StereoRig
+from calibration.fit.lens_field import FieldFit
+from calibration.fit.model_choice import TermsTried
+from calibration.fit.refinement import Refinement
+from calibration.fit.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
+from calibration.fit.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
+from calibration.judge.assessment import (
     Assessment,
     assess,
     consistency_factor,
     half_set_differences,
     stereo_covariance,
 )
-from calibration.board import Board, Target
-from calibration.brief import Brief
-from calibration.camera import StereoRig
-from calibration.camera_moved import camera_moved
-from calibration.chessboard import BoardNotFound, CornerView, find_corners
-from calibration.errors import CalibrationError
-from calibration.lens_field import FieldFit
-from calibration.model_choice import TermsTried
-from calibration.motion_size import likely_motion
-from calibration.pairs import PairsJudged, pairs_that_agree
-from calibration.refinement import Refinement
-from calibration.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
-from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
-from calibration.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
-from calibration.stuck_pixels import repaired_views
-from calibration.table_frame import rig_with_covariance
-from calibration.tolerances import (
+from calibration.judge.camera_moved import camera_moved
+from calibration.judge.motion_size import likely_motion
+from calibration.judge.pairs import PairsJudged, pairs_that_agree
+from calibration.judge.table_frame import rig_with_covariance
+from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
     as_made,
@@ -40,7 +35,12 @@ from calibration.tolerances import (
     shape_left_out,
     with_tolerances,
 )
-from calibration.wide_lens import too_wide
+from calibration.judge.wide_lens import too_wide
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Brief
+from calibration.kit.errors import CalibrationError
+from calibration.kit.stuck_pixels import repaired_views
+from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
 
 CAMERA_NAMES = ("left", "right")
 SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.board_motion import BoardMotion
-from calibration.camera_moved import CameraMoved, camera_moved
-from calibration.lens_field import FieldFit, fit_lens_field
-from calibration.model_choice import TermsTried, choose_board
-from calibration.pairs import PairMotion, PairsJudged, judge_pairs, motion_between_exposures, own_places
-from calibration.refinement import Refinement
-from calibration.stereo_model import Observations
+from calibration.fit.board_motion import BoardMotion
+from calibration.fit.lens_field import FieldFit, fit_lens_field
+from calibration.fit.model_choice import TermsTried, choose_board
+from calibration.fit.refinement import Refinement
+from calibration.fit.stereo_model import Observations
+from calibration.judge.camera_moved import CameraMoved, camera_moved
+from calibration.judge.pairs import PairMotion, PairsJudged, judge_pairs, motion_between_exposures, own_places
+from calibration.kit.arrays import Array
 
 REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
 Names = Sequence[tuple[str, str]]

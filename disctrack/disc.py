@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
-from calibration.brief import Brief
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Brief
 from disctrack.errors import ModelError
 
 AIR_DENSITY = 1.2  # [kg/m^3] where no other is declared: at 1013.25 hPa and 20 degC

@@ -1,6 +1,6 @@
 """The errors that disctrack raises on purpose; `cli` alone turns them into a line and an exit code."""
 
-from calibration.errors import CalibrationError, DiscTrackError, RigFileError
+from calibration.kit.errors import CalibrationError, DiscTrackError, RigFileError
 
 __all__ = [
     "AnalysisError",

@@ -3,7 +3,7 @@
 This docstring is the one home of the conventions; every other file obeys it silently.
 
 World frame I = (O, i, j, k): k up, the table is z = 0 (Ma et al. 2014, section 2a). The calibration's table view fixes
-    origin and heading (`calibration.table_frame`).
+    origin and heading (`calibration.judge.table_frame`).
 Body frame: fixed to the disc, origin at its centre O, third axis e3 out of the upper face.
 Nodal frame R_O = (e1, e2, e3): follows precession and nutation, not spin. e1 = (cos psi, sin psi, 0) is horizontal,
     e2 = e3 x e1 points from the contact A towards B; r_OA = -r e2 - h e3, the thickness is 2h.
@@ -27,7 +27,7 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 POSE_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 COORDINATES = ("x", "y", "z", "psi", "theta", "phi")

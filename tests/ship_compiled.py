@@ -22,7 +22,9 @@ from numba.core.callconv import CPUCallConv
 from numba.core.ccallback import CFunc
 from numba.core.compiler_lock import global_compiler_lock
 
-from calibration import _corner_kernel, _normal_kernel, compiled, corner_fit, normal_equations
+from calibration import _corner_kernel, _normal_kernel, compiled
+from calibration.board import corner_fit
+from calibration.fit import normal_equations
 from disctrack.discrepancy.equations import _ode_kernel, _stiff_kernel
 from disctrack.recording.readers import _lzw, _png
 from disctrack.rolling import equations, integrate

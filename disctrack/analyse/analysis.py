@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.brief import Brief, Outline
+from calibration.kit.brief import Brief, Outline
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.declaration import contradictions
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
-from calibration.brief import Outline
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Outline
 from disctrack.analyse.derivatives import MeasuredMotion
 from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
 from disctrack.disc import Disc

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import StereoRig, triangulate
+from calibration.cameras.camera import StereoRig, triangulate
+from calibration.kit.arrays import Array
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.propagation import state_of

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.brief import Outline
-from calibration.camera import N_RIG
+from calibration.cameras.camera import N_RIG
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.brief import Outline
 from disctrack.analyse.smoothing import (
     HALF_WINDOW_LENGTHS,
     SEGMENT,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.whole import write_whole
 from disctrack.pages.html import Markup, page, paragraph

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from calibration.arrays import Array
-from calibration.brief import Outline
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Outline
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
-from calibration.brief import Outline
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Outline
 from disctrack.analyse.derivatives import N_STATE, MeasuredMotion
 from disctrack.frames import nodal_axes_world, rotation_from_vector
 

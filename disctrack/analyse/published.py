@@ -7,7 +7,7 @@ from importlib.resources import files
 import numpy as np
 from scipy.special import stdtr
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 EXPONENTS = ("n_energy", "n_theta", "n_psidot")
 PREDICTED = (2 / 3, 2 / 3, -1 / 3)  # a rolling moment proportional to psidot^2, thin disc, slow precession

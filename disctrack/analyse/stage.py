@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.brief import Brief
+from calibration.kit.brief import Brief
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
 from disctrack.analyse.derivatives import GROUP_NAMES, STATE
 from disctrack.analyse.power_laws import (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import StereoRig
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.disc import Disc
 from disctrack.errors import OutputError

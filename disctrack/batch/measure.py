@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
 from disctrack.analyse.declaration import contradictions_of, told

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Image, Mask
-from calibration.board import CircleGrid, plane_symmetries
-from calibration.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values
-from calibration.corner_fit import CornerView
+from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values
+from calibration.board.corner_fit import CornerView
+from calibration.board.target import CircleGrid, plane_symmetries
+from calibration.kit.arrays import Array, Image, Mask
 from disctrack.track.dots import DotCentres, NoiseModel, TemplateLimits, locate_on_plane
 from disctrack.trajectory import MarkerStatus
 

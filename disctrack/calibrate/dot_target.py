@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Image
-from calibration.board import DotTarget
-from calibration.chessboard import BoardNotFound, grey_values
-from calibration.corner_fit import CornerView
+from calibration.board.chessboard import BoardNotFound, grey_values
+from calibration.board.corner_fit import CornerView
+from calibration.board.target import DotTarget
+from calibration.kit.arrays import Array, Image
 from disctrack.calibrate.circles import Circles, locate_circles, whole_grey_values
 
 MAX_OFF_LATTICE = 0.2  # pitches: a blob further from the lattice is not one of its dots

@@ -9,8 +9,10 @@ from typing import Any
 
 import h5py
 
-from calibration import CalibrationSettings, StereoCalibration, StereoRig, corner_fit, normal_equations
-from calibration.board import Board, Target
+from calibration import CalibrationSettings, StereoCalibration, StereoRig
+from calibration.board import corner_fit
+from calibration.board.target import Board, Target
+from calibration.fit import normal_equations
 from calibration.rig_file import read_rig, write_rig
 from calibration.stereo import Progress
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
-from calibration.chessboard import SEARCH_SIZE, BoardNotFound, CornerView, board_in, find_corners, grey_values
+from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, CornerView, board_in, find_corners, grey_values
+from calibration.board.target import Board, CharucoBoard, CircleGrid, DotTarget, Target
 from calibration.stereo import Progress, located
 from disctrack.calibrate.dot_target import DotView, find_dots, on_common_lattice
 
@@ -41,7 +41,7 @@ def _finder(target: Target) -> Callable[[NDArray, bool], TargetView]:
     if isinstance(target, Board):
         return lambda image, thorough: find_corners(image, target.inner_corners, thorough)
     if isinstance(target, CharucoBoard):
-        from calibration.charuco import find_charuco
+        from calibration.board.charuco import find_charuco
 
         return lambda image, _: find_charuco(image, target)
     if isinstance(target, CircleGrid):

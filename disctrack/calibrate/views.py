@@ -8,10 +8,10 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
-from calibration.board import Target
-from calibration.brief import Outline
+from calibration.board.target import Target
+from calibration.kit.brief import Outline
+from calibration.kit.stuck_pixels import repaired_views
 from calibration.stereo import Progress, check_sizes
-from calibration.stuck_pixels import repaired_views
 from disctrack.calibrate.targets import find_target, other_board
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.frames import CAMERAS

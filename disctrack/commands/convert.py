@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from calibration.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
-from calibration.opencv_yaml import export_opencv, import_opencv
+from calibration.cameras.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
+from calibration.cameras.opencv_yaml import export_opencv, import_opencv
 from calibration.rig_file import read_rig, write_rig
 from disctrack.commands import DONE
 from disctrack.errors import OutputError, RigFileError

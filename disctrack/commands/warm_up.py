@@ -4,8 +4,9 @@ import argparse
 
 import numpy as np
 
-from calibration import corner_fit, normal_equations
+from calibration.board import corner_fit
 from calibration.compiled import when_compiling
+from calibration.fit import normal_equations
 from disctrack.commands import DONE
 from disctrack.progress import compiling
 from disctrack.recording.readers import _lzw as lzw

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import INVISIBLE, Linearisation, Score
 from disctrack.discrepancy.significance import log_tail
 

@@ -7,8 +7,8 @@ import numpy as np
 from scipy import special
 from scipy.optimize import lsq_linear
 
-from calibration.arrays import Array
-from calibration.brief import Outline
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Outline
 from disctrack.discrepancy.nuisances import Projection, is_linear, projection
 from disctrack.discrepancy.own import Head, Own
 from disctrack.discrepancy.system import Quantity, System, Values

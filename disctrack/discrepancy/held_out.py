@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.fit import Fit, fit, triangle
 from disctrack.discrepancy.own import Head, Own
 from disctrack.discrepancy.score import INVISIBLE, cleared, span

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.nuisances import is_linear, projection
 from disctrack.discrepancy.own import Own

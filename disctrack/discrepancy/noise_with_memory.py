@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 
 @dataclass(frozen=True)

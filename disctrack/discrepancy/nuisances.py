@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.system import Quantity, Subset, System, Values
 
 _KNOWN: WeakKeyDictionary[System, dict[tuple[object, ...], Projection]] = WeakKeyDictionary()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.system import Quantity, System, Values, blocks
 
 UNDETERMINED = 1e-12  # singular value over the largest, below which a direction of the own quantities is not determined

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit, compress, prior_rows, solve_bounded
 from disctrack.discrepancy.nuisances import is_linear, projection
 from disctrack.discrepancy.own import Own

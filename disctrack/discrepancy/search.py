@@ -12,8 +12,8 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
-from calibration.arrays import Mask
-from calibration.brief import Outline
+from calibration.kit.arrays import Mask
+from calibration.kit.brief import Outline
 from disctrack.discrepancy.chance import Chance, chance
 from disctrack.discrepancy.fit import Fit, fit, no_fit, prior_residual
 from disctrack.discrepancy.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special, stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 LARGE = 500.0  # chi-square beyond which its tail is taken from the asymptotic series: the probability underflows

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 
 Values = Mapping[str, float]
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import signal, stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 LAGS = 20
 LONG = 1500  # samples from which on the statistic's distribution is the asymptotic one even in its tail

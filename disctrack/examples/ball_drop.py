@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis import Settings
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.discrepancy.equations.system import EquationSystem

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.errors import AnalysisError
 
 HALF_WIDTH = 0.0524  # [m] as declared

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.noise_with_memory import SampleStretch, SmoothNoise, estimate
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.disc import MA_2014, Disc
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
 

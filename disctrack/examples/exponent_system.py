@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.analyse.published import SURFACES, published_table
 from disctrack.diagnosis import Candidate, Quantity
 from disctrack.diagnosis.disc.motion import SLIP, motion_candidates

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.analyse.published import PREDICTED
 from disctrack.diagnosis import Diagnosis, Settings, diagnose
 from disctrack.diagnosis.pages.general import document, table

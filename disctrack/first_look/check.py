@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
-from calibration.grey_levels import saturation_level
+from calibration.kit.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
 from disctrack.calibrate.targets import evenly

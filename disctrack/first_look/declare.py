@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.chessboard import BoardNotFound, find_corners
+from calibration.board.chessboard import BoardNotFound, find_corners
 from calibration.rig_file import read_rig
 from disctrack.calibrate.targets import VIEWS_TRIED, board_size, evenly
 from disctrack.errors import DiscTrackError, OutputError, RecordingError

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from calibration.chessboard import grey_values
+from calibration.board.chessboard import grey_values
 from disctrack.first_look.check import Check
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.decoding import decode

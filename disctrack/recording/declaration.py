@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target
-from calibration.brief import Outline
-from calibration.tolerances import BoardTolerances
+from calibration.board.target import Board, CharucoBoard, CircleGrid, DotTarget, Target
+from calibration.judge.tolerances import BoardTolerances
+from calibration.kit.brief import Outline
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.repeats.runs import INDEX, NUTATION_PER_PRECESSION, AnalysedRun
 
 MATCHED = tuple(INDEX[name] for name in ("theta", "psidot", "energy"))

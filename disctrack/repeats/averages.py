@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 CONSISTENT = 0.05  # probability of a larger chi-square below which the runs are said not to agree
 # Probability, over all runs of a group, that one is pointed at by chance, per quantity: where the others agree within

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.analyse.figures import INSET_DURATION, MIN_INSET_SHARE
 from disctrack.pages.figures import Drawn, dress, panels
 from disctrack.pages.palette import AMBER, BLUE, INK, MUTED, SERIES

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.trajectory.file import read_group, read_provenance, read_setup

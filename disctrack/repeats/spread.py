@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.repeats.alignment import Alignment, Curves
 from disctrack.repeats.averages import CONSISTENT, improbable
 from disctrack.repeats.runs import INDEX, QUANTITIES

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.rolling.effects import Effect
 from disctrack.rolling.records import KINEMATICS, WRENCH, record_dtype

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
-from calibration.brief import Outline
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Outline
 from disctrack.frames import nodal_axes_world, rotation_from_euler
 from disctrack.rolling import equations
 from disctrack.rolling.model import Model

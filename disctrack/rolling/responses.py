@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.rolling import integrate
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import effect_class

@@ -13,7 +13,7 @@ from types import CodeType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.frames import COORDINATES
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.model import DEFAULT_THETA_END, Model

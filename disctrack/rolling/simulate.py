@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.rolling import integrate
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import ModelError

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import Camera, StereoRig, placed_at
+from calibration.cameras.camera import Camera, StereoRig, placed_at
+from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
 from disctrack.synthetic.description import CameraFault, Scene
@@ -23,7 +23,7 @@ class View(NamedTuple):
 def image_of(points_world: Array, view: View) -> Array:
     """Pixels (..., 2) of points (..., 3) [m]: Brown's polynomial as printed, for bounding boxes and truth only.
 
-    Not `calibration.camera`'s, so that a mistake there shows up in the truth.
+    Not `calibration.cameras.camera`'s, so that a mistake there shows up in the truth.
     """
     points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
     x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]

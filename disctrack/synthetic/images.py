@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.arrays import Array, Array32, Mask
-from calibration.camera import Camera, StereoRig
+from calibration.cameras.camera import Camera, StereoRig
+from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.frames import rotation_from_euler
 from disctrack.synthetic import imperfect, optics

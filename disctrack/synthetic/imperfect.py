@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.arrays import Array, Array32
-from calibration.camera import Camera
+from calibration.cameras.camera import Camera
+from calibration.kit.arrays import Array, Array32
 from disctrack.synthetic.description import BoardSettings, ImperfectionSettings
 from disctrack.synthetic.rays import bent_rays
 

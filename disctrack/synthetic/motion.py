@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.rolling import Model, Motion, State, effects_from_tables, simulate, steady_precession, struck_disc
 from disctrack.synthetic.description import RollingMotion, Scene

@@ -1,7 +1,7 @@
 """Which ray reaches which point of the sensor: the renderer's own inverse of Brown's distortion.
 
-Nothing here is shared with `calibration.camera` but the numbers in its containers, so that a mistake there shows up
-as a disagreement between rendered images and projected points.
+Nothing here is shared with `calibration.cameras.camera` but the numbers in its containers, so that a mistake there
+shows up as a disagreement between rendered images and projected points.
 """
 
 from collections.abc import Callable
@@ -9,9 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import Camera
+from calibration.cameras.camera import Camera
 from calibration.compiled import njit
+from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.synthetic.cameras import View
 

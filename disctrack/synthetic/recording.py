@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.arrays import Array, Array32, Image
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Array32, Image
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
 from disctrack.files.toml_tree import toml_value

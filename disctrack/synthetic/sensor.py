@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.arrays import Array32, Image
+from calibration.kit.arrays import Array32, Image
 from disctrack.synthetic.description import SensorSettings
 
 MOST_ELECTRONS = np.float32(1e12)  # in a pixel; the generator takes no more than 1e18

@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from calibration.brief import Outline
+from calibration.kit.brief import Outline
 from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables

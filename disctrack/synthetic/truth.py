@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
 from calibration.rig_file import read_rig_group, write_rig_group
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, RigFileError

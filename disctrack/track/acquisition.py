@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig, normalise, triangulate
-from calibration.grey_levels import level_step
+from calibration.cameras.camera import StereoRig, normalise, triangulate
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_vector
 from disctrack.track.pose import fit_poses, marker_pixels

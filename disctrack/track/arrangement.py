@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc, has_mirror_axis
 from disctrack.frames import CAMERAS
 from disctrack.track.acquisition import acquire

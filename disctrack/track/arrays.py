@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.recording.readers.blocks import PairBlock

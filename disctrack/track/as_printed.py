@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import N_RIG, PAIR_SHIFT, StereoRig
-from calibration.tolerances import SIZE
+from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
+from calibration.judge.tolerances import SIZE
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.track.least_squares import inner_products
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
-from calibration.causes import causes
+from calibration.cameras.camera import StereoRig
+from calibration.cameras.causes import causes
+from calibration.kit.arrays import Array, Mask
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.as_printed import AsBuilt, motions_of_pattern, pattern_place, refine_as_built, share_of_places

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.arrays import Array, Image
-from calibration.camera import Camera, normalised_maps, project
-from calibration.grey_levels import full_scale, level_step
+from calibration.cameras.camera import Camera, normalised_maps, project
+from calibration.kit.arrays import Array, Image
+from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
 from disctrack.track import _kernels as kernels
 from disctrack.trajectory import MarkerStatus

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.track.following import Follower

@@ -26,8 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.arrays import Array, Array32, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
 from disctrack.track.least_squares import inner_products

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.pages.figures import lay_out
 from disctrack.pages.palette import COLOURS, INK, MUTED

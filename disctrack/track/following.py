@@ -15,9 +15,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.arrays import Array, Array32, Image, Mask
-from calibration.camera import StereoRig
-from calibration.grey_levels import saturation_level
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Array32, Image, Mask
+from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
 from disctrack.track import _kernels as kernels
 from disctrack.track.acquisition import acquire

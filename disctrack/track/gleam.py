@@ -17,8 +17,8 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Array32, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.track.pose import marker_pixels
 from disctrack.track.template_pull import Pull, plane_to_image, pulls_by_contrast, turned_to_axes

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 _NOT_SHARED = 4096  # numbers of a piece of a matrix, of whose product with a vector BLAS shares out 9000 and more
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Image, Mask
-from calibration.camera import StereoRig, normalised_maps
+from calibration.cameras.camera import StereoRig, normalised_maps
+from calibration.kit.arrays import Array, Image, Mask
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array32
-from calibration.grey_levels import level_step
+from calibration.kit.arrays import Array32
+from calibration.kit.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import default_threads

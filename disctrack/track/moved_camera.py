@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig
+from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import vector_from_rotation
 from disctrack.track.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera

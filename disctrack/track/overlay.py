@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.grey_levels import full_scale
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.grey_levels import full_scale
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
-from calibration.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
+from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.track.as_printed import (
     DOT_SIGMA,

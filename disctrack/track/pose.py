@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
 from disctrack.track import _pose_kernel as kernel
 
 MIN_DOTS = 3  # six unknowns, two numbers per dot

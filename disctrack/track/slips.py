@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.brief import ranges
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.brief import ranges
 from disctrack.frames import CAMERAS
 from disctrack.track.pose import PoseFits, marker_pixels, whitening
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.brief import Brief
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Brief
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from calibration import StereoCalibration, StereoRig
-from calibration.arrays import Array
-from calibration.brief import SHOWN_RANGES, ranges
-from calibration.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
+from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
+from calibration.kit.arrays import Array
+from calibration.kit.brief import SHOWN_RANGES, ranges
 from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
+from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
+from calibration.kit.arrays import Array
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.least_squares import chance_beyond

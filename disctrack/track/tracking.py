@@ -13,10 +13,10 @@ from threading import Event, Lock
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.arrays import Array
-from calibration.camera import StereoRig, normalised_maps
-from calibration.grey_levels import mosaic_gains
-from calibration.stuck_pixels import repair, stuck_pixels
+from calibration.cameras.camera import StereoRig, normalised_maps
+from calibration.kit.arrays import Array
+from calibration.kit.grey_levels import mosaic_gains
+from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig, triangulate
+from calibration.cameras.camera import StereoRig, triangulate
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.track.acquisition import (
     EPIPOLAR_PX,

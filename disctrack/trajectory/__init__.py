@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.brief import Brief
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.frames import euler_jacobian
 

@@ -20,8 +20,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import RIG_PARAMETERS, Camera, StereoRig
+from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
+from calibration.kit.arrays import Array, Mask
 from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import TrajectoryFileError

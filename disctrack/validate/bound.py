@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.arrays import Array, Array32, Mask
-from calibration.camera import Camera, StereoRig, normalised_maps
+from calibration.cameras.camera import Camera, StereoRig, normalised_maps
+from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_euler, rotation_from_vector
 from disctrack.synthetic import expected_disc

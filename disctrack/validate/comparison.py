@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.frames import rotation_from_euler, rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import Trajectory
 

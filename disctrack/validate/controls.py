@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
-from calibration.camera import N_RIG, WORLD_TURN, StereoRig
+from calibration.cameras.camera import N_RIG, WORLD_TURN, StereoRig
+from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.synthetic import render_disc, rig_after_faults

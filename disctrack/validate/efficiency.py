@@ -5,8 +5,8 @@ from typing import cast
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
 from disctrack.frames import euler_jacobian
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.sensor import digitise

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.recording.declaration import read_recording

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED
 from disctrack.validate.comparison import PoseErrors, joined
 from disctrack.validate.efficiency import Efficiency

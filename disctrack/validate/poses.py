@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_euler

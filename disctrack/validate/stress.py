@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import TrackingError
 from disctrack.synthetic import render_disc

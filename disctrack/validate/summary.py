@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.validate.comparison import (
     QUANTITIES,
     Consistency,

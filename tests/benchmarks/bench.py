@@ -42,7 +42,7 @@ import numba
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.batch.processes import ONE_THREAD
 from disctrack.files.software import software_version

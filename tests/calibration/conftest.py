@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calibration import Board, Camera, Observations, StereoModel
-from calibration.arrays import Array
-from calibration.camera import project, rotation_from_vector
+from calibration.cameras.camera import project, rotation_from_vector
+from calibration.kit.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, CalibrationSettings, CornerView, Terms, calibrate_from_corners, refine_stereo
-from calibration.assessment import stereo_covariance
-from calibration.board_motion import BoardMotion, motions, split
-from calibration.motion_size import likely_motion
-from calibration.normal_equations import Problem
-from calibration.pairs import motion_between_exposures
+from calibration.fit.board_motion import BoardMotion, motions, split
+from calibration.fit.normal_equations import Problem
+from calibration.fit.stereo_model import board_basis, moved, predict_pixels
+from calibration.judge.assessment import stereo_covariance
+from calibration.judge.motion_size import likely_motion
+from calibration.judge.pairs import motion_between_exposures
+from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
-from calibration.stereo_model import board_basis, moved, predict_pixels
-from calibration.tolerances import BoardTolerances
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import moved_boards, point_laboratory
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.camera import (
+from calibration.cameras.camera import (
     N_RIG,
     Camera,
     StereoRig,

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, BoardNotFound, Camera, CornerView, corner_fit, find_corners
+from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
 from calibration._corner_kernel import fit_corners
-from calibration.camera import project, rotation_from_vector
-from calibration.chessboard import grey_values
-from calibration.corner_fit import local_axes
+from calibration.board import corner_fit
+from calibration.board.chessboard import grey_values
+from calibration.board.corner_fit import local_axes
+from calibration.cameras.camera import project, rotation_from_vector
 
 CAMERA = Camera(900.0, 905.0, 158.0, 122.0, (-0.1, 0.1, 3e-4, -2e-4, 0.0), (320, 240))
 FACING = np.diag([1.0, -1.0, -1.0])

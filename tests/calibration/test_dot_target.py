@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration import BoardNotFound, CalibrationSettings
-from calibration.board import DotTarget
+from calibration.board.target import DotTarget
 from disctrack.calibrate.dot_target import find_dots, on_common_lattice
 from disctrack.calibrate.views import calibrate_views, find_views
 

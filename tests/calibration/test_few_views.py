@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, CalibrationSettings, Terms, calibrate_from_corners
-from calibration.normal_equations import Problem
-from calibration.priors import BEND, MISPRINT, STRETCH, board_prior, priors_of
-from calibration.stereo_model import board_basis, moved, predict_pixels
+from calibration.fit.normal_equations import Problem
+from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_prior, priors_of
+from calibration.fit.stereo_model import board_basis, moved, predict_pixels
 from tests.calibration.test_board_motion import EXACT, corner_view, errors, squared
 from tests.oracles import moved_boards
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.chessboard import BoardNotFound, find_corners
-from calibration.grey_levels import full_scale, level_step, mosaic_gains, saturation_level
+from calibration.board.chessboard import BoardNotFound, find_corners
+from calibration.kit.grey_levels import full_scale, level_step, mosaic_gains, saturation_level
 
 
 @pytest.mark.parametrize(("bits", "step"), [(8, 1), (8, 16), (8, 257), (10, 64), (12, 1), (12, 16), (16, 1)])

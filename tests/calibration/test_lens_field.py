@@ -7,10 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
-from calibration import StereoRig, Terms, lens_field, refine_stereo, triangulate
-from calibration.lens_field import fit_lens_field
+from calibration import StereoRig, Terms, refine_stereo, triangulate
+from calibration.cameras.splines import LensField, spline_weights
+from calibration.fit import lens_field
+from calibration.fit.lens_field import fit_lens_field
 from calibration.rig_file import read_rig, write_rig
-from calibration.splines import LensField, spline_weights
 
 SIGMA = 0.004  # [px] of good corners
 TERMS = Terms("k1 k2 p1 p2", "flat")

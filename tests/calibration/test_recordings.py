@@ -16,7 +16,7 @@ from calibration import (
     find_corners,
     triangulate,
 )
-from calibration.assessment import stereo_covariance
+from calibration.judge.assessment import stereo_covariance
 from calibration.rig_file import read_rig_group
 
 

@@ -8,13 +8,13 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 from calibration import CalibrationError, Terms, refine_stereo
-from calibration.assessment import consistency_factor, half_set_differences
-from calibration.camera import N_RIG
-from calibration.model_choice import choose_board
-from calibration.normal_equations import Problem, minimise
-from calibration.start import start_stereo
-from calibration.stereo_model import board_basis, moved, predict
-from calibration.table_frame import rig_with_covariance, table_pose
+from calibration.cameras.camera import N_RIG
+from calibration.fit.model_choice import choose_board
+from calibration.fit.normal_equations import Problem, minimise
+from calibration.fit.start import start_stereo
+from calibration.fit.stereo_model import board_basis, moved, predict
+from calibration.judge.assessment import consistency_factor, half_set_differences
+from calibration.judge.table_frame import rig_with_covariance, table_pose
 
 FULL = Terms("k1 k2 p1 p2")
 

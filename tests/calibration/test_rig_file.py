@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, Camera, Observations, RigFileError, StereoRig
-from calibration.camera import N_RIG, rotation_from_vector
-from calibration.opencv_yaml import export_opencv, import_opencv
+from calibration.cameras.camera import N_RIG, rotation_from_vector
+from calibration.cameras.opencv_yaml import export_opencv, import_opencv
 from calibration.rig_file import CalibrationRecord, RigFile, read_rig, read_rig_file, write_rig
 
 

@@ -19,13 +19,13 @@ from calibration import (
     calibrate_stereo,
     refine_stereo,
 )
-from calibration.camera import rotation_from_vector, triangulate
-from calibration.chessboard import find_corners
-from calibration.pairs import judge_pairs, pairs_that_agree
+from calibration.board.chessboard import find_corners
+from calibration.cameras.camera import rotation_from_vector, triangulate
+from calibration.fit.start import start_stereo
+from calibration.judge.pairs import judge_pairs, pairs_that_agree
+from calibration.judge.table_frame import table_pose
+from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
-from calibration.start import start_stereo
-from calibration.table_frame import table_pose
-from calibration.tolerances import BoardTolerances
 
 BOARD = Board((7, 4), 9e-3)
 THICKNESS = 2e-3
@@ -94,7 +94,7 @@ def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
         R_left_world=R, t_left_world=t,
     )  # fmt: skip
     error = triangulate(true_rig.project(points), found.rig) - points
-    from calibration.assessment import point_uncertainty
+    from calibration.judge.assessment import point_uncertainty
 
     _, sigma = point_uncertainty(found.rig, points)
     assert np.abs(error / sigma).max() < 4.5
@@ -299,7 +299,7 @@ def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_mak
     scene = scene_maker(n_views=8, inner_corners=counts, square=9e-3)
     scene = replace(scene, board=board)
     left, right = corner_views(scene, rng, 0.01, board)
-    from calibration.chessboard import board_orders
+    from calibration.board.chessboard import board_orders
 
     orders = board_orders(counts)
     orders = orders if board.symmetry == len(orders) else orders[::2]

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 
 from calibration import Board, CornerView, calibrate_stereo, find_corners
-from calibration.stuck_pixels import blind_pixels, repair, repaired_views, stuck_pixels
+from calibration.kit.stuck_pixels import blind_pixels, repair, repaired_views, stuck_pixels
 from disctrack.calibrate.views import calibrate_views, find_views
 
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import BoardNotFound, CalibrationError, CornerView, chessboard
-from calibration.board import Board, CharucoBoard, CircleGrid, DotTarget, Target, target_of
-from calibration.camera import Camera
-from calibration.charuco import find_charuco
+from calibration import BoardNotFound, CalibrationError, CornerView
+from calibration.board import chessboard
+from calibration.board.charuco import find_charuco
+from calibration.board.target import Board, CharucoBoard, CircleGrid, DotTarget, Target, target_of
+from calibration.cameras.camera import Camera
 from disctrack.calibrate import targets
 from disctrack.calibrate.circles import find_circles
 from disctrack.calibrate.stage import calibrate_recording

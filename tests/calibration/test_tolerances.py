@@ -7,12 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board
-from calibration.camera import N_RIG
-from calibration.refinement import refine_stereo
-from calibration.rig_file import read_rig, write_rig
-from calibration.stereo_model import Terms
-from calibration.table_frame import rig_with_covariance
-from calibration.tolerances import (
+from calibration.cameras.camera import N_RIG
+from calibration.fit.refinement import refine_stereo
+from calibration.fit.stereo_model import Terms
+from calibration.judge.table_frame import rig_with_covariance
+from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
     as_made,
@@ -20,6 +19,7 @@ from calibration.tolerances import (
     on_the_table,
     with_tolerances,
 )
+from calibration.rig_file import read_rig, write_rig
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.synthetic import render_disc, rig_of

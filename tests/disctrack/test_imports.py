@@ -80,6 +80,7 @@ STAIRS = (
     ("cli",),
     ("__main__",),
 )
+ROOMS_OF_CALIBRATION = ("kit", "board", "cameras", "fit", "judge")  # each asks for those before it
 ROOMS_OF_DIAGNOSIS = {"disc": (), "pages": ("disc",), "trials": ("disc",)}
 
 
@@ -151,6 +152,15 @@ def test_every_room_has_a_place_on_the_stairs():
 def test_calibration_never_imports_disctrack():
     for file in (ROOT / "calibration").rglob("*.py"):
         assert not any(name.split(".")[0] == "disctrack" for name in imported(file)), file
+
+
+def test_rooms_of_the_calibration_ask_only_for_those_before_them():
+    modules = {file.stem for file in (ROOT / "calibration").glob("*.py")}
+    for own, room in enumerate(ROOMS_OF_CALIBRATION):
+        for file in (ROOT / "calibration" / room).rglob("*.py"):
+            asked = {f"{name}.__init__".split(".")[1] for name in imported(file) if name.startswith("calibration")}
+            known = {name for name in modules if name.startswith("_")} | {"compiled"}
+            assert asked <= {*ROOMS_OF_CALIBRATION[: own + 1], *known}, file
 
 
 def test_no_file_asks_for_one_that_asks_for_it():

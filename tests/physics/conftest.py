@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from calibration.camera import N_RIG, Camera, StereoRig
+from calibration.cameras.camera import N_RIG, Camera, StereoRig
 from disctrack.disc import MA_2014
 from disctrack.frames import (
     continuous_quaternions,

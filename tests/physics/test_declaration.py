@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.camera import Camera, StereoRig
+from calibration.cameras.camera import Camera, StereoRig
 from disctrack.analyse.declaration import balance, contradictions, handedness, told, turned_board, unseen_dots
 from disctrack.frames import (
     continuous_quaternions,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from calibration.chessboard import BoardNotFound, find_corners
+from calibration.board.chessboard import BoardNotFound, find_corners
 from disctrack.calibrate.targets import board_size
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import disctrack
-from calibration.camera import Camera, StereoRig
+from calibration.cameras.camera import Camera, StereoRig
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import FrameStatus, MarkerStatus

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from calibration.brief import Brief
+from calibration.kit.brief import Brief
 from disctrack.diagnosis.disc.errors import Errors
 from disctrack.diagnosis.disc.form_misfit import LawCourse
 from disctrack.diagnosis.disc.learned_law import LearnedLaw

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import Camera, StereoRig, project_with_jacobians
+from calibration.cameras.camera import Camera, StereoRig, project_with_jacobians
+from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.frames import CAMERAS, rotation_from_vector

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.learned_law import WIDTH, LearnedLaw, _Blocks, probe
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.system import THETA_END, DiscSystem

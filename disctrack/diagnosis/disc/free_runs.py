@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.analyse.contact import K
 from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.energy import analyse_energy

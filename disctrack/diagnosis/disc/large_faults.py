@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calibration.arrays import Array
-from calibration.camera import StereoRig, placed_at
+from calibration.cameras.camera import StereoRig, placed_at
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.faults import MeasurementSetup, faults_of, setup_of
 from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
 from disctrack.diagnosis.disc.system import DiscSystem

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 
 Parts = Mapping[str, str]  # component of the wrench -> formula

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.errors import simulated
 from disctrack.diagnosis.disc.law_library import Family, families
 from disctrack.diagnosis.disc.left_over import left_over

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.camera import StereoRig, placed_at, rotation_from_vector
+from calibration.cameras.camera import StereoRig, placed_at, rotation_from_vector
 from disctrack.diagnosis.disc.faults import scene_faults, setup_of, values_in_scene
 from disctrack.diagnosis.disc.scene_rig import scene_with_rig
 from disctrack.diagnosis.disc.system import DiscSystem

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.motion import state_of
 from disctrack.diagnosis.disc.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.diagnosis.disc.system import DiscSystem

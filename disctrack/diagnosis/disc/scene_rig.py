@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array
 from disctrack.synthetic.description import RigSettings, Scene
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import find_peaks
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Values
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
 from disctrack.diagnosis.disc.stretch import FIRST_WINDOW
 from disctrack.disc import Disc

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_euler, vector_from_rotation
 from disctrack.trajectory import Trajectory

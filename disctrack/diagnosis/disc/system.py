@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.disc.faults import Sight, faults_of, measurement_candidates, predict, setup_of
 from disctrack.diagnosis.disc.motion import (
     SLIP,

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from scipy.signal import periodogram
 from scipy.stats import chi2
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
 from disctrack.diagnosis.disc.errors import frequencies, simulated
 from disctrack.diagnosis.disc.form_misfit import LawCourse

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 LEVEL = 0.01  # probability below which a hypothesis is refused, and with which chance alone brings a dependence forth
 SAME = 1e-6  # smallest part of a covariate's logarithms that the others, and the constants, leave: less is no other

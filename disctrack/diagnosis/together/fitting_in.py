@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.together.joint import JointSystem
 from disctrack.discrepancy.fit import Fit, prior_rows, triangle
 from disctrack.discrepancy.system import Candidate

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.together.reduction import Reduced
 from disctrack.diagnosis.together.sharing import Sharing
 from disctrack.discrepancy.system import Candidate, Quantity, Values

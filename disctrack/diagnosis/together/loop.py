@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc.model_file import PAPER
 from disctrack.diagnosis.disc.plan import Plan, Question
 from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.analyse.declaration import contradictions, density
 from disctrack.diagnosis.disc.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc.large_faults import find_large

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import prior_rows, triangle
 from disctrack.discrepancy.nuisances import Projection, is_linear, projection
 from disctrack.discrepancy.system import Quantity, System, Values

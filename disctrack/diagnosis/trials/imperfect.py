@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 WAVES = 14
 WAVELENGTHS = (0.4, 1.5)  # of the image's width

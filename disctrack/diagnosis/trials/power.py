@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import brentq
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis import DiscSystem, Settings
 from disctrack.diagnosis.disc.model_file import PAPER, declared_model
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibration.arrays import Array
-from calibration.camera import N_RIG, StereoRig
+from calibration.cameras.camera import N_RIG, StereoRig
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.trials.imperfect import Laboratory, shifted_dots
 from disctrack.disc import Disc
 from disctrack.frames import (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.pages.general import document, table
 from disctrack.diagnosis.pages.words import effect_text
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked

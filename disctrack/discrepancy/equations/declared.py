@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, unknown_name
 from disctrack.discrepancy.noise_with_memory import SmoothNoise
 from disctrack.errors import AnalysisError

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 
 
 def with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tuple[Array, Array]:

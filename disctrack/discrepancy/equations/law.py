@@ -16,7 +16,7 @@ import numpy as np
 import sympy
 from scipy import linalg
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
 from disctrack.discrepancy.equations.expressions import Formula, parsed
 from disctrack.discrepancy.equations.formulas import Formulas, formulas

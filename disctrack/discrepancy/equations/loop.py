@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import qr
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.expressions import Formula

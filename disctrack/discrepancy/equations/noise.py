@@ -6,7 +6,7 @@ from math import comb
 
 import numpy as np
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.system import System, Values, Wrapped
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import signal
 from scipy.optimize import least_squares
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas

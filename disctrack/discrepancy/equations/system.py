@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations import _stiff_kernel
 from disctrack.discrepancy.equations.declared import Parameter, Samples, Term

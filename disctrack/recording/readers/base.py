@@ -6,7 +6,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from calibration.arrays import Array, Image
+from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})

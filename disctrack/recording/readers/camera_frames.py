@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array, Image
+from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._unpack_kernels import look_up, unpack_10, unpack_12
 from disctrack.recording.readers.camera_header import CameraHeader

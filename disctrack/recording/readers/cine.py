@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.camera_frames import (
     PIXELS_PER_GROUP,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Image
+from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._png import PngHeader, decode_plain_grey
 from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size

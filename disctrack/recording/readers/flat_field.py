@@ -17,8 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.arrays import Array32, Image, Mask
-from calibration.stuck_pixels import repair
+from calibration.kit.arrays import Array32, Image, Mask
+from calibration.kit.stuck_pixels import repair
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames

@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from calibration.arrays import Array, Image
+from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._inflate import inflated
 from disctrack.recording.readers.base import FrameReader, Frames

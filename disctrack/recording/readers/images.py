@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Image
-from calibration.grey_levels import full_scale, level_step
+from calibration.kit.arrays import Image
+from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, Frames, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode

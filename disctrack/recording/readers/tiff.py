@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from calibration.arrays import Array, Image
+from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, Frames, first_readable
 from disctrack.recording.readers.decoding import as_grey, page_of_tiff

@@ -6,7 +6,7 @@ Doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.camera_header import header_of, start_offset

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Image
+from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._ffv1 import checksums_hold
 from disctrack.recording.readers.base import Frames, first_readable

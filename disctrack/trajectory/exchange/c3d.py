@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.arrays import Array
+from calibration.kit.arrays import Array
 from disctrack.errors import OutputError
 from disctrack.files.whole import refuse_existing, whole_file
 from disctrack.frames import rotation_from_quaternion

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.camera import rotation_from_vector
+from calibration.cameras.camera import rotation_from_vector
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
 from disctrack.diagnosis.disc.faults import measurement_candidates, predict
 from disctrack.diagnosis.disc.model_file import declared_model, model_toml

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.camera import normalised_maps
+from calibration.cameras.camera import normalised_maps
 from disctrack import frames
 from disctrack.synthetic import expected_disc, render_disc, rig_of
 from disctrack.synthetic.description import Scene
@@ -56,7 +56,7 @@ def test_status_codes_of_the_kernels_are_those_of_the_trajectory():
 def test_compiled_projection_is_the_twin_of_the_camera_model(rendered_pairs, rng):
     camera = rendered_pairs.rig.left
     points = rng.uniform([-0.05, -0.05, 0.3], [0.05, 0.05, 0.6], (50, 3))
-    from calibration.camera import project_with_jacobians
+    from calibration.cameras.camera import project_with_jacobians
 
     pixels, d_point, _ = project_with_jacobians(points, camera)
     for point, pixel, jacobian in zip(points, pixels, d_point, strict=True):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from calibration.camera import Camera, StereoRig, rotation_from_vector
+from calibration.cameras.camera import Camera, StereoRig, rotation_from_vector
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, quaternion_from_rotation, rotation_from_euler

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.camera import Allowance
-from calibration.tolerances import SIZE
+from calibration.cameras.camera import Allowance
+from calibration.judge.tolerances import SIZE
 from disctrack.frames import rotation_from_quaternion
 from disctrack.track.as_printed import refine_as_built
 from tests.oracles.measured_disc import measured

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.camera import Camera, StereoRig
+from calibration.cameras.camera import Camera, StereoRig
 from disctrack.disc import MA_2014
 from disctrack.track.as_printed import share_of_places
 from disctrack.trajectory import FrameStatus

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.camera import N_RIG
+from calibration.cameras.camera import N_RIG
 from disctrack.diagnosis.stage import diagnose_trajectory
 from disctrack.diagnosis.trials.recordings import Unseen
 from disctrack.frames import (

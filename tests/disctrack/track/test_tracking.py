@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.stuck_pixels import stuck_pixels
+from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.synthetic import render_disc

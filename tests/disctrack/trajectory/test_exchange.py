@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from calibration.camera import N_RIG, StereoRig, project
-from calibration.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
-from calibration.opencv_yaml import export_opencv, import_opencv
+from calibration.cameras.camera import N_RIG, StereoRig, project
+from calibration.cameras.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
+from calibration.cameras.opencv_yaml import export_opencv, import_opencv
 from disctrack.cli import main
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, RigFileError

@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.camera import N_RIG, Allowance, Camera, StereoRig
-from calibration.splines import LensField
+from calibration.cameras.camera import N_RIG, Allowance, Camera, StereoRig
+from calibration.cameras.splines import LensField
 from disctrack.disc import MA_2014
 from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.camera import StereoRig
+from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic import render_disc, rig_of

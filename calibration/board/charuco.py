@@ -1,0 +1,84 @@
+"""Inner corners of a ChArUco board in one image: OpenCV reads the markers, `corner_fit` locates the corners.
+
+The board may be partly out of view or covered, or printed as a negative: every marker says where it belongs.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values, in_file_units
+from calibration.board.corner_fit import CornerView, fit_view
+from calibration.board.target import CharucoBoard
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.errors import CalibrationError
+from calibration.kit.grey_levels import level_step
+
+LEAST_CORNERS = 8  # of one view: fewer do not start its pose
+
+
+def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFound:
+    """Locate the inner corners of a ChArUco board; those that are not in view are not accepted, without a reason.
+
+    image : (h, w) or (h, w, 3) as OpenCV reads it; see `chessboard.grey_values`
+    """
+    grey, notes = grey_values(image)
+    step = level_step(grey)
+    values = grey // step if step > 1 else grey
+    corners, ids = _detected(as_8_bit(values), board)
+    if len(ids) < LEAST_CORNERS:  # prints with light and dark exchanged are about, too: their markers say so
+        negative = np.asarray(values.max() - values, values.dtype)
+        found, numbers = _detected(as_8_bit(negative), board)
+        if len(numbers) > len(ids):
+            values, corners, ids = negative, found, numbers
+    columns, rows = board.inner_corners
+    if len(ids) < LEAST_CORNERS:
+        return BoardNotFound(
+            f"{len(ids)} corners of {board} found, at least {LEAST_CORNERS} are needed: is it sharp and lit, and are "
+            "squares, dictionary, square_mm and marker_mm those of the print?"
+        )
+    rough, seen = _whole_grid(corners, ids, board)
+    plain = 0.5 * (1.0 - board.marker / board.square)
+    view = fit_view(np.ascontiguousarray(values, np.float64), rough, (columns, rows), seen, plain)
+    if view.accepted.sum() < LEAST_CORNERS:
+        return BoardNotFound(
+            f"only {view.accepted.sum()} of the {seen.sum()} corners of {board} in view lie on a regular grid: is the "
+            "board bent, and is marker_mm the side of the markers?"
+        )
+    return in_file_units(view, step, notes)
+
+
+def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, NDArray[np.intp]]:
+    """Rough corners (k, 2) [px] and their numbers in the order of `CharucoBoard.points`."""
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if number is None or not board.dictionary.startswith("DICT_"):
+        known = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_") and "_50" in name)
+        raise CalibrationError(f"dictionary {board.dictionary!r} is not one of OpenCV's: {known}, ...")
+    scale = min(1.0, SEARCH_SIZE / max(grey.shape))
+    if scale < 1.0:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    best: tuple[Array, NDArray[np.intp]] = (np.zeros((0, 2)), np.zeros(0, np.intp))
+    # before OpenCV 4.6 boards with an even number of rows began with a light square: such prints are about
+    for legacy in (False, True) if board.squares[1] % 2 == 0 else (False,):
+        pattern = cv2.aruco.CharucoBoard(
+            board.squares, board.square, board.marker, cv2.aruco.getPredefinedDictionary(number)
+        )
+        pattern.setLegacyPattern(legacy)
+        found, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(grey)
+        if ids is not None and found is not None and len(ids) > len(best[1]):
+            best = np.asarray(found, float).reshape(-1, 2), np.asarray(ids, np.intp).ravel()
+    return (best[0] + 0.5) / scale - 0.5, best[1]
+
+
+def _whole_grid(corners: Array, ids: NDArray[np.intp], board: CharucoBoard) -> tuple[Array, Mask]:
+    """Places (n, 2) [px] of all corners, those not seen by the homography of the others; which were seen (n,)."""
+    columns, rows = board.inner_corners
+    j, i = np.divmod(np.arange(columns * rows), columns)
+    grid = np.stack([i, j], axis=-1).astype(float)
+    H, _ = cv2.findHomography(grid[ids], corners)
+    image = np.column_stack([grid, np.ones(len(grid))]) @ np.asarray(H, float).T
+    rough: Array = image[:, :2] / image[:, 2:]
+    rough[ids] = corners
+    seen = np.zeros(len(grid), bool)
+    seen[ids] = True
+    return rough, seen

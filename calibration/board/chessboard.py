@@ -1,0 +1,248 @@
+"""Inner corners of a chessboard in one image, in an order that the squares' colours make unambiguous.
+
+OpenCV finds the board roughly; `corner_fit` locates the corners.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.corner_fit import CornerView, fit_view, local_axes
+from calibration.board.target import board_orders
+from calibration.kit.arrays import Array
+from calibration.kit.grey_levels import level_step
+
+SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
+MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
+LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
+MOST_UNEVEN = 1.6  # a square to the next one: perspective and lenses stay below 1.3, a line passed over gives 2
+MOST_FURTHER = 3  # lines of corners beyond those declared that are counted: straight on, whatever the perspective
+MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
+
+
+@dataclass(frozen=True)
+class BoardNotFound:
+    """A view without the board, and why."""
+
+    reason: str
+
+
+def grey_values(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
+    """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED gives it, and a note where information was left out.
+
+    Grey images, 8 or 16 bit, are taken as they are. Three equal channels are one grey image. Colour becomes luminance
+    (0.114 B + 0.587 G + 0.299 R) in float; transparency is dropped.
+    """
+    image = np.asarray(image)
+    if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise ValueError(f"images of type {image.dtype} are not grey values; expected 8 or 16 bit")
+    if image.ndim == 2:
+        return image, ()
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise ValueError(f"an image is (height, width) or (height, width, 3 or 4), got {image.shape}")
+    if image.shape[2] == 1:
+        return image[..., 0], ()
+    if (image[..., :1] == image[..., :3]).all():
+        return image[..., 0], ()
+    return image[..., :3] @ np.array([0.114, 0.587, 0.299]), ("colour image read as luminance",)
+
+
+def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
+    """Locate the inner corners of a chessboard.
+
+    image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `grey_values`
+    inner_corners : counts along the board's i and j; see `Board` for the order of the corners
+    thorough : search with OpenCV's slow finder where its quick one sees nothing
+    """
+    grey, notes = grey_values(image)
+    step = level_step(grey)
+    if step > 1:  # an image whose values are multiples of a step is that image, whatever the step
+        grey = grey // step
+    start = _rough_corners(as_8_bit(grey), inner_corners, thorough)
+    if start is None:
+        columns, rows = inner_corners
+        return BoardNotFound(
+            f"no board of {columns} x {rows} inner corners: it must be wholly in view with a light rim round it, "
+            "and the counts must be those of the INNER corners"
+        )
+    view = _view_at(start, np.ascontiguousarray(grey, dtype=np.float64), inner_corners)
+    return view if isinstance(view, BoardNotFound) else in_file_units(view, step, notes)
+
+
+def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
+    """Inner corners (long side, short side) of the whole chessboard in an image of grey values, of whatever size.
+
+    thorough : OpenCV's exhaustive search, 0.3 s for 1280 x 720; without it parts of a board are often all it sees
+    """
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | (cv2.CALIB_CB_EXHAUSTIVE if thorough else 0)
+    stretched = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+    found, corners, squares = cv2.findChessboardCornersSBWithMeta(stretched, (3, 3), flags)
+    if not found or squares is None or squares.size < LEAST_CORNERS:
+        return None
+    rows, columns = squares.shape[:2]
+    points = np.asarray(corners, np.float64).reshape(rows, columns, 2)
+    if rows > columns:
+        rows, columns, points = columns, rows, points.transpose(1, 0, 2)
+    if not _even(points):
+        return None
+    view = _view_at(points.reshape(-1, 2), np.ascontiguousarray(grey, dtype=np.float64), (columns, rows))
+    return None if isinstance(view, BoardNotFound) else (columns, rows)
+
+
+def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> CornerView | BoardNotFound:
+    """The view whose corners lie within about a pixel of `start` (n, 2), in any of the board's orders."""
+    rough = _orient(start, values, inner_corners)
+    if isinstance(rough, BoardNotFound):
+        return rough
+    view = fit_view(values, rough, inner_corners)
+    if view.accepted.mean() < MIN_ACCEPTED:
+        return BoardNotFound(
+            f"only {view.accepted.sum()} of {len(view.accepted)} corners lie on a regular grid: the board is covered "
+            f"or bent, or {inner_corners[0]} x {inner_corners[1]} is not the number of its inner corners"
+        )
+    beyond = _larger_board(values, view, inner_corners)
+    return BoardNotFound(beyond) if beyond else view
+
+
+def in_file_units(view: CornerView, step: int, notes: tuple[str, ...]) -> CornerView:
+    """A view of an image that was divided by the step of its grey values, in the grey values of the file."""
+    noise = (view.noise[0] * step**2, view.noise[1] * step)
+    return replace(view, notes=notes, contrast=view.contrast * step, noise=noise)
+
+
+def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
+    """Grey values stretched to 8 bit, for the rough search only."""
+    if grey.dtype == np.uint8:
+        return grey
+    if grey.dtype == np.uint16 and grey.max() < 256:
+        return grey.astype(np.uint8)
+    low, high = np.percentile(grey, [0.5, 99.5])
+    return np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.uint8)
+
+
+def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thorough: bool) -> Array | None:
+    """Corners (n, 2) [px] to about a pixel in any of the board's orders, or None."""
+    scale = min(1.0, SEARCH_SIZE / max(grey.shape))
+    if scale < 1.0:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    grid = _all_lines(cv2.findChessboardCorners(grey, inner_corners, None, flags), inner_corners)
+    if grid is None and thorough:
+        thoroughly = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
+        grid = _all_lines(thoroughly, inner_corners)
+    if grid is None and thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
+        finer = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+        grid = _all_lines(cv2.findChessboardCorners(finer, inner_corners, None, flags), inner_corners)
+        if grid is not None:
+            scale *= 2.0
+        else:
+            fine = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+            grid = _all_lines(cv2.findChessboardCornersSB(grey, inner_corners, None, fine), inner_corners)
+    return None if grid is None else (grid.reshape(-1, 2) + 0.5) / scale - 0.5
+
+
+def _all_lines(answer: tuple[bool, NDArray | None], inner_corners: tuple[int, int]) -> Array | None:
+    """A finder's corners (rows, columns, 2) [px]; None where it found none, or passed over a line of them."""
+    found, corners = answer
+    columns, rows = inner_corners
+    if not found or corners is None or len(corners) != columns * rows:
+        return None
+    grid = np.asarray(corners, np.float64).reshape(rows, columns, 2)
+    return grid if _even(grid) else None
+
+
+def _even(grid: NDArray) -> bool:
+    """Whether no line of corners (rows, columns, 2) was passed over: finders take a part of a board for all of it."""
+    for along in (grid, grid.swapaxes(0, 1)):
+        step = np.median(np.linalg.norm(np.diff(along, axis=0), axis=-1), axis=1)
+        if len(step) > 1 and (np.abs(np.diff(np.log(np.maximum(step, 1e-9)))) > np.log(MOST_UNEVEN)).any():
+            return False
+    return True
+
+
+def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Array | BoardNotFound:
+    """Order the corners as `Board` says: seen from the printed side, and corner 0 beside a dark corner square."""
+    columns, rows = inner_corners
+    grid = corners.reshape(rows, columns, 2)
+    i_px, j_px = grid[:, 1:].mean((0, 1)) - grid[:, :-1].mean((0, 1)), grid[1:].mean((0, 1)) - grid[:-1].mean((0, 1))
+    if i_px[0] * j_px[1] - i_px[1] * j_px[0] > 0:  # y points down in the image: i x j must come out of the print
+        grid = grid[::-1] if columns != rows else grid.transpose(1, 0, 2)
+    corners = grid.reshape(-1, 2)
+    orders = board_orders(inner_corners)
+    signs = [_first_square_is_dark(corners[order], grey, inner_corners) for order in orders]
+    if max(abs(sign) for sign in signs) < MIN_ALTERNATION:
+        return BoardNotFound(
+            f"the squares between the corners found are not light and dark in turn: {columns} x {rows} is not the "
+            "number of the board's inner corners, or it is no chessboard"
+        )
+    dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
+    if len(dark) == 1:
+        return dark[0]
+    # the colouring leaves several orders: i to the right in this image; the stereo pair makes the two cameras agree.
+    # With such counts all corner squares may be light: the print begins with one
+    return max(
+        dark or [corners[order] for order in orders],
+        key=lambda c: float((c[columns - 1] - c[0]) @ np.array([1.0, -1e-3])),
+    )
+
+
+def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> float:
+    """Above 0 if the square outside corner 0 is dark, below if it is light; 1 where all neighbouring squares agree.
+
+    Neighbours are compared with each other, so that a shadow across the board does not count.
+    """
+    columns, rows = inner_corners
+    grid = corners.reshape(rows, columns, 2)
+    centres = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
+    x, y = np.rint(centres).astype(int).transpose(2, 0, 1)
+    values = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)].astype(float)
+    j, i = np.mgrid[: rows - 1, : columns - 1]
+    turned = values * np.where(
+        (i + j) % 2, 1.0, -1.0
+    )  # the square inside corner 0 has the colour of the one outside it
+    steps = [np.sign(turned[:, 1:] + turned[:, :-1]).ravel(), np.sign(turned[1:] + turned[:-1]).ravel()]
+    return float(np.concatenate(steps).mean())
+
+
+def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:
+    """A message if full lines of further corners lie beyond a side: the board is larger than was declared."""
+    columns, rows = inner_corners
+    grid = view.points.reshape(rows, columns, 2)
+    axes = local_axes(view.points, view.accepted, inner_corners).reshape(rows, columns, 2, 2)
+    least = 0.5 * float(np.median(view.contrast[view.accepted]))
+    further = [0, 0]
+    for along, across in ((0, 1), (1, 0)):
+        for last, before in ((0, 1), (-1, -2)):
+            line, step = np.take(grid, last, across), np.take(grid, last, across) - np.take(grid, before, across)
+            line_axes = np.take(axes, last, across)
+            lines = 0
+            while lines < MOST_FURTHER and _crosses(grey, line + (lines + 1) * step, line_axes, least):
+                lines += 1
+            further[along] += lines
+    if not any(further):
+        return None
+    all_columns, all_rows = columns + further[0], rows + further[1]
+    return (
+        f"the board goes on beyond the {columns} x {rows} inner corners that were declared: {all_columns} x {all_rows} "
+        f"are in view. If that is all of them, declare inner_corners = [{all_columns}, {all_rows}]; a part of a board "
+        "cannot be told from its neighbour, one square further on"
+    )
+
+
+def _crosses(grey: Array, line: Array, axes: Array, least: float) -> bool:
+    """Whether two light and two dark squares meet at most points (n, 2) of a line; axes (n, 2, 2) of a square."""
+    at = line[:, None] + 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
+    inside = np.isfinite(at).all((1, 2)) & (at >= 0).all((1, 2))
+    inside &= (at[..., 0] < grey.shape[1] - 1).all(1) & (at[..., 1] < grey.shape[0] - 1).all(1)
+    if inside.sum() < 3 or inside.mean() < 0.5:
+        return False
+    x, y = np.rint(at[inside]).astype(int).transpose(2, 0, 1)
+    v = grey[y, x]
+    saddle = np.minimum(v[:, 0], v[:, 1]) - np.maximum(v[:, 2], v[:, 3])
+    opposite = np.minimum(v[:, 2], v[:, 3]) - np.maximum(v[:, 0], v[:, 1])
+    return bool(np.mean(np.maximum(saddle, opposite) > least) > 0.7)
+
+
+__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values"]

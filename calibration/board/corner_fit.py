@@ -1,0 +1,347 @@
+"""The corners of one view, fitted to the grey values of their own two edges (`_corner_kernel`) and tested.
+
+Windows reach almost to the neighbouring edges whatever the size and slant of the squares. The noise of the image is
+measured inside the squares, so that every corner has a variance and a chi-square of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration._corner_kernel import N_CORNER, fit_corners
+from calibration.board.robust_corners import LEAST_SIGMA, WINDOW, saddle_points, smooth_grid
+from calibration.kit.arrays import Array, Mask
+
+MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
+MIN_WINDOW = 0.3
+FIRST_REACH = 85.0  # px, of the first fit's window: what it is to tell, blur and noise and places, it tells as well
+EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
+MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of two crossing edges
+BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
+MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered or in glare
+ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
+CORNERS_FOR_DEGREE = (6, 15, 30, 45)  # of a polynomial: 2.5 to 3 corners for each of its coefficients
+MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
+
+
+def prepare() -> None:
+    """Compile the fit of corners, or load it: some seconds once per installation, then nothing."""
+    fit_corners(np.zeros((8, 8)), np.zeros((0, 14)), np.zeros((0, N_CORNER)), np.zeros((0, 4)), np.zeros(2), 1, 1e-2)
+
+
+@dataclass(frozen=True)
+class CornerView:
+    """Inner corners of one view, in the order of `Board.points`."""
+
+    image_size: tuple[int, int]  # width, height [px]
+    points: Array  # (n, 2) [px]
+    covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
+    accepted: Mask  # (n,)
+    reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds, or was not in view
+    chi_square: Array  # (n,) reduced, of the pixels on the edges; NaN where a saddle point stands in for their fit
+    contrast: Array  # (n,) light minus dark [grey]
+    blur: Array  # (n,) sigma of the edges [px]
+    spacing: float  # median distance of neighbouring corners [px]
+    noise: tuple[float, float]  # variance of a pixel = noise[0] + noise[1] * grey
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sigma_px(self) -> float:
+        """Root mean square of the accepted corners' standard deviation per axis [px]."""
+        traces = np.trace(self.covariance[self.accepted], axis1=-2, axis2=-1)
+        return float(np.sqrt(np.mean(traces) / 2)) if len(traces) else float("nan")
+
+    def reordered(self, order: NDArray[np.intp]) -> CornerView:
+        """The same view with corner order[i] in place i: for boards whose colouring allows several orders."""
+        arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted", "chi_square")}
+        arrays |= {name: getattr(self, name)[order] for name in ("contrast", "blur")}
+        return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
+
+
+def fit_view(
+    grey: Array,
+    rough: Array,
+    inner_corners: tuple[int, int],
+    seen: Mask | None = None,
+    plain: float = 1.0,
+) -> CornerView:
+    """Fit every corner twice: first to learn blur, noise, bends of the lines and changes of contrast, then with them.
+
+    rough : (n, 2) [px] of all corners; where one is not `seen` (n,), the place where the others put it
+    plain : how far, in squares, the light squares are plain on either side of an edge: markers leave a margin
+    """
+    noise, blur, known = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 4))
+    seen = np.ones(len(rough), bool) if seen is None else seen
+    points, ok = rough, seen
+    axes = local_axes(points, ok, inner_corners)
+    starts = _starts(grey, points, axes, blur, 0.7 * min(plain, 0.57))
+    for iterations, tolerance, most in ((12, 1e-2, FIRST_REACH), (30, 1e-5, np.inf)):
+        windows = _windows(points, axes, blur, grey.shape, -plain * np.sign(starts[:, 6]), most)
+        fit = _Fit(*fit_corners(grey, windows, starts, known, noise, iterations, tolerance))
+        displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
+        ok = fit.converged & (displaced < MAX_DISPLACEMENT) & seen
+        if not ok.any():
+            break
+        noise, blur = _measured_noise(fit.sums[ok]), float(np.median(fit.found[ok, 4]))
+        points = np.where(ok[:, None], fit.found[:, :2], rough)
+        axes = local_axes(points, ok, inner_corners)
+        bends = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
+        known = np.concatenate([bends, _contrast_gradient(points, ok, fit.found[:, 5:7])], axis=1)
+        starts = np.where(ok[:, None], fit.found, starts)
+    fit = _with_smaller_windows(grey, fit, windows, starts, known, noise)
+    displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
+    return _judged(grey, fit, displaced, noise, axes, rough, inner_corners, seen, plain)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What the kernel returns for the corners of a view."""
+
+    found: Array
+    covariance: Array
+    sums: Array
+    converged: Mask
+
+    @property
+    def chi_square(self) -> Array:
+        """Reduced chi-square over the whole window (n,); inf where there was no fit."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            value = self.sums[:, 0] / np.maximum(self.sums[:, 1] - N_CORNER, 1.0)
+        return np.where(self.converged & np.isfinite(value), value, np.inf)
+
+
+def _with_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array) -> _Fit:
+    """Fit again, nearer to the corner, where something else reaches into the window (a narrow or dirty square)."""
+    for factor in (0.6, 0.35):
+        limit = BAD_WINDOW * max(float(np.median(fit.chi_square)), 1.0)
+        bad = np.flatnonzero(fit.chi_square > limit)
+        if not len(bad):
+            break
+        smaller = windows[bad].copy()
+        smaller[:, 10:12] *= factor
+        again = _Fit(*fit_corners(grey, smaller, starts[bad], known[bad], noise, 30, 1e-5))
+        better = again.chi_square < 0.5 * fit.chi_square[bad]
+        merged = [np.array(getattr(fit, name)) for name in ("found", "covariance", "sums", "converged")]
+        for old, name in zip(merged, ("found", "covariance", "sums", "converged"), strict=True):
+            old[bad[better]] = getattr(again, name)[better]
+        fit = _Fit(*merged)
+    return fit
+
+
+def _grid_homography(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
+    columns, rows = inner_corners
+    j, i = np.mgrid[:rows, :columns]
+    board = np.stack([i.ravel(), j.ravel()], axis=-1).astype(float)
+    if ok.sum() < 8:
+        ok = np.ones(len(points), bool)
+    H, _ = cv2.findHomography(board[ok], points[ok])
+    return np.asarray(H, float)
+
+
+def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
+    """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
+    columns, rows = inner_corners
+    H = _grid_homography(points, ok, inner_corners)
+    j, i = np.mgrid[:rows, :columns]
+    board = np.stack([i.ravel(), j.ravel(), np.ones(i.size)], axis=-1).astype(float)
+    w = board @ H[2]
+    image = (board @ H[:2].T) / w[:, None]
+    return np.stack([(H[:2, axis] - image * H[2, axis]) / w[:, None] for axis in (0, 1)], axis=1)
+
+
+def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array, most: float) -> Array:
+    """Window of every corner as the kernel wants it (n, 14); plain (n,) with the sign of the light quadrants.
+
+    most : [px] half width across an edge, at most
+    """
+    A = np.swapaxes(axes, 1, 2)  # columns are the images of i and j
+    inverse = np.linalg.inv(A)
+    area = np.abs(np.linalg.det(A))
+    lengths = np.linalg.norm(axes, axis=-1)
+    between = area[:, None] / lengths[:, ::-1]  # distance of neighbouring parallel edges, across them [px]
+    half = np.clip(1.0 - (EDGE_MARGIN * blur + 0.7) / between, MIN_WINDOW, MAX_WINDOW)
+    half = np.minimum(half, most / between)
+    reach = np.abs(A * half[:, None, :]).sum(-1)
+    low, high = np.ceil(points - reach), np.floor(points + reach)
+    size = np.array([shape[1], shape[0]])
+    low, high = np.clip(low, 0, size - 1), np.clip(high, -1, size - 1)
+    step = 0.5 * between.min(axis=1)
+    box = [low[:, 0], high[:, 0], low[:, 1], high[:, 1], points, inverse.reshape(-1, 4), half, step]
+    near = (EDGE_MARGIN * blur + 0.7) / between.min(axis=1)  # the marker's edge, blurred, stays outside
+    clear = np.where(np.abs(plain) < 1, np.maximum(np.abs(plain) - near, 0.5 * np.abs(plain)), 1.0)
+    return np.column_stack([*box, clear * np.sign(plain)])
+
+
+def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) -> Array:
+    """Start values (n, 9): levels from the four squares round the corner, so many squares aside of both edges."""
+    offsets = aside * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    at = np.rint(points[:, None] + offsets @ axes).astype(int)
+    x = np.clip(at[..., 0], 0, grey.shape[1] - 1)
+    y = np.clip(at[..., 1], 0, grey.shape[0] - 1)
+    levels = grey[y, x]
+    same, other = levels[:, :2].mean(-1), levels[:, 2:].mean(-1)
+    starts = np.zeros((len(points), N_CORNER))
+    starts[:, :2] = points
+    starts[:, 2:4] = np.arctan2(axes[..., 1], axes[..., 0])
+    starts[:, 4] = blur
+    starts[:, 5] = 0.5 * (same + other)
+    # sign(u) sign(v): where alpha and beta are both positive, u = across i has the sign of the area, v the opposite
+    starts[:, 6] = -0.5 * (same - other)
+    return starts
+
+
+def _displacement(found: Array, axes: Array, inner_corners: tuple[int, int]) -> Array:
+    """Distance of every corner from where its neighbours along the lines put it, in squares; (n,).
+
+    The best of six predictions: between the two neighbours and beyond two on either side, along i and along j; one bad
+    neighbour must not condemn a good corner.
+    """
+    columns, rows = inner_corners
+    grid = found.reshape(rows, columns, 2)
+    predicted = np.full((6, rows, columns, 2), np.nan)
+    predicted[0, :, 1:-1] = 0.5 * (grid[:, 2:] + grid[:, :-2])
+    predicted[1, 1:-1] = 0.5 * (grid[2:] + grid[:-2])
+    predicted[2, :, :-2] = 2 * grid[:, 1:-1] - grid[:, 2:]
+    predicted[3, :, 2:] = 2 * grid[:, 1:-1] - grid[:, :-2]
+    predicted[4, :-2] = 2 * grid[1:-1] - grid[2:]
+    predicted[5, 2:] = 2 * grid[1:-1] - grid[:-2]
+    distance = np.linalg.norm(predicted - grid, axis=-1).reshape(6, -1)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    return np.asarray(distance.min(axis=0) / np.linalg.norm(axes, axis=-1).max(-1), np.float64)
+
+
+def _measured_noise(sums: Array) -> Array:
+    """Noise (a, b), variance = a + b grey, from the residuals inside dark and light squares.
+
+    The median over the corners, so that a square with dirt or writing does not count as noise.
+    """
+    floor = 1.0 / 12.0  # quantisation to whole grey values
+    levels = []
+    for r2, grey, n in ((2, 3, 4), (5, 6, 7)):
+        use = sums[sums[:, n] >= 20]
+        levels.append(np.median(use[:, [r2, grey]] / use[:, n : n + 1], axis=0) if len(use) else None)
+    dark, light = levels
+    if dark is None or light is None or not light[1] > dark[1]:
+        either = dark if dark is not None else light
+        return np.array([max(float(either[0]), floor) if either is not None else 1.0, 0.0])
+    low, high = max(dark[0], floor), max(light[0], floor)
+    slope = max((high - low) / (light[1] - dark[1]), 0.0)
+    if slope == 0.0:
+        return np.array([0.5 * (low + high), 0.0])
+    if low - slope * dark[1] < floor:
+        return np.array([floor, max((high - floor) / light[1], 0.0)])
+    return np.array([low - slope * dark[1], slope])
+
+
+def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple[int, int]) -> Array:
+    """Bend of the board's lines at every corner (n, 2) [1/px], half the second derivative across each edge.
+
+    A parabola along each row and column of corners: lens distortion bends a line by far less than a corner's own
+    window could tell.
+    """
+    columns, rows = inner_corners
+    index = np.arange(columns * rows).reshape(rows, columns)
+    curvature = np.zeros((len(points), 2))
+    for axis, lines in ((0, index), (1, index.T)):
+        for line in lines:
+            use = line[ok[line]]
+            if len(use) < 4:
+                continue
+            centre = points[use].mean(0)
+            direction = points[use[-1]] - points[use[0]]
+            direction = direction / np.linalg.norm(direction)
+            d = points[use] - centre
+            along, across = d @ direction, d @ np.array([-direction[1], direction[0]])  # both of mean 0
+            square = along * along
+            square = square - square.mean() - (square @ along) / square.sum() * along  # what a line leaves of it
+            bend = (square @ across) / (square @ square)
+            # an edge angle may point either way along its line, the kernel's normal follows it
+            edge = np.stack([np.cos(angles[line, axis]), np.sin(angles[line, axis])], axis=-1)
+            curvature[line, axis] = bend * np.sign(edge @ direction)
+    return curvature
+
+
+def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
+    """Relative gradient (n, 2) [1/px] of the contrast, over the light's, at every corner, by a polynomial over all.
+
+    levels : (n, 2) mean grey and half contrast. Of light that falls off their ratio is the same everywhere.
+    """
+    use = ok & (levels[:, 0] > 0) & (levels[:, 1] != 0)
+    ratio = np.zeros(len(points))
+    ratio[use] = np.log(np.abs(levels[use, 1] / levels[use, 0]))
+    n = int(use.sum())
+    degree = sum(n >= least for least in CORNERS_FOR_DEGREE)
+    if not degree:
+        return np.zeros((len(points), 2))
+    centre, scale = points[use].mean(0), np.ptp(points[use], axis=0).max() / 2
+    x, y = ((points - centre) / scale).T
+    powers = [(i, k - i) for k in range(degree + 1) for i in range(k + 1)]
+    A = np.stack([x**i * y**j for i, j in powers], axis=1)
+    for _ in range(3):  # dirt and shadows in single squares are no gradient
+        c = np.linalg.lstsq(A[use], ratio[use], rcond=None)[0]
+        left = np.abs(ratio - A @ c)
+        use &= left <= 4.0 * 1.4826 * np.median(left[use]) + 1e-12
+    along_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in powers], axis=1) @ c
+    along_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in powers], axis=1) @ c
+    return np.stack([along_x, along_y], axis=1) / scale
+
+
+def _judged(
+    grey: Array,
+    fit: _Fit,
+    displaced: Array,
+    noise: Array,
+    axes: Array,
+    rough: Array,
+    counts: tuple[int, int],
+    seen: Mask,
+    plain: float,
+) -> CornerView:
+    """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
+    found, sums = fit.found, fit.sums
+    spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
+    edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
+    contrast = 2 * np.abs(found[:, 6])
+    converged = fit.converged & np.isfinite(fit.covariance).all((1, 2)) & seen
+    typical = float(np.median(contrast[converged])) if converged.any() else 0.0
+    spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
+    chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
+    faint = converged & (contrast < MIN_CONTRAST_RATIO * typical)
+    fine = converged & (displaced < MAX_DISPLACEMENT) & ~faint & (chi_square < chi_limit)
+    covariance = fit.covariance * np.maximum(chi_square, 1.0)[:, None, None]
+    points, reasons = found[:, :2].copy(), np.where(faint, "covered, or in glare", "").astype(object)
+    saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing * min(plain / WINDOW, 1.0))
+    expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts, seen)
+    _, sigma_saddle = smooth_grid(saddles, counts, seen)
+    if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points lie smoother than the fine fits do
+        fine = np.zeros_like(fine)
+        expected, sigma = smooth_grid(saddles, counts, seen)
+    # edges that fit badly on both sides alike leave the corner where it is: no more error than the grid's scatter shows
+    stated = float(np.sqrt(np.median(np.trace(covariance[fine], axis1=1, axis2=2)) / 2)) if fine.any() else sigma
+    covariance = np.maximum(min(sigma / stated, 1.0) ** 2, 1 / np.maximum(chi_square, 1.0))[:, None, None] * covariance
+    sigma_saddle = max(sigma_saddle, LEAST_SIGMA)
+    off = np.linalg.norm(saddles - expected, axis=-1)
+    stands = ~fine & ~faint & seen & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
+    points[~fine] = saddles[~fine]
+    covariance[~fine] = sigma_saddle**2 * np.eye(2)
+    chi_square = np.where(fine, chi_square, np.nan)
+    for i in np.flatnonzero(~fine & ~stands & ~faint & seen):
+        reasons[i] = f"{off[i]:.1f} px from where the other corners put it (they scatter by {sigma_saddle:.2f} px)"
+    return CornerView(
+        image_size=(grey.shape[1], grey.shape[0]),
+        points=points,
+        covariance=covariance,
+        accepted=fine | stands,
+        reasons=tuple(str(reason) for reason in reasons),
+        chi_square=chi_square,
+        contrast=contrast,
+        blur=found[:, 4],
+        spacing=spacing,
+        noise=(float(noise[0]), float(noise[1])),
+    )

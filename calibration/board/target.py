@@ -1,0 +1,233 @@
+"""The calibration target: which points it carries, and where.
+
+Board axes of every target: i to the right and j upwards as the pattern stands upright, k out of the print.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kit.arrays import Array
+from calibration.kit.errors import CalibrationError
+
+SAME_PLACE = 0.01  # of the smallest distance between points: a turn that maps points that close is a symmetry
+
+
+@dataclass(frozen=True)
+class Target:
+    """Flat target with known points."""
+
+    kind: ClassVar[str]  # its name in recording.toml
+
+    @property
+    def points(self) -> Array:
+        """Points (n, 3) [m] in board axes; the third coordinate is zero."""
+        raise NotImplementedError
+
+    @property
+    def orders(self) -> list[NDArray[np.intp]]:
+        """The turns in its plane after which the target looks the same, as orders of its points; the first is none."""
+        return plane_symmetries(self.points[:, :2])
+
+    @property
+    def symmetry(self) -> int:
+        """In how many attitudes the target looks the same: 1, 2 or 4."""
+        return len(self.orders)
+
+    def __str__(self) -> str:
+        raise NotImplementedError
+
+    def described(self) -> dict[str, Any]:
+        """Kind and fields, as `target_of` takes them."""
+        return {"target": self.kind, **asdict(self)}
+
+
+def plane_symmetries(points: Array, mirrored: bool = False) -> list[NDArray[np.intp]]:
+    """Orders of points (n, 2) after the quarter turns about their middle, mirrored first or not, that keep the set."""
+    d = points - 0.5 * (points.min(0) + points.max(0))
+    apart = np.linalg.norm(d[:, None] - d, axis=-1)
+    limit = SAME_PLACE * float(apart[apart > 0].min())
+    found = []
+    for quarter in range(4):
+        c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
+        turned = d @ np.array([[c, s], [-s, c]], float) * ([1.0, -1.0] if mirrored else [1.0, 1.0])
+        distance = np.linalg.norm(turned[:, None] - d, axis=-1)
+        if distance.min(axis=1).max() < limit:
+            found.append(distance.argmin(axis=1))
+    return found
+
+
+@dataclass(frozen=True)
+class Board(Target):
+    """A chessboard. Board axes: origin at corner 0, i along the first count, j along the second, k out of the print.
+
+    Seen from the printed side, corner 0 is the lower left inner corner and the square outside it is dark; with an odd
+    first and an even second count (9 x 6) the whole short side there has dark corner squares. Corners run along i
+    first, then along j.
+    """
+
+    kind: ClassVar[str] = "chessboard"
+
+    inner_corners: tuple[int, int]  # along i (the long side), along j (the short side)
+    square: float  # side of a square [m]
+
+    def __post_init__(self) -> None:
+        counts = tuple(int(n) for n in self.inner_corners)
+        if len(counts) != 2 or min(counts) < 3:
+            raise CalibrationError(f"a chessboard needs at least 3 x 3 inner corners, got {self.inner_corners}")
+        if not (np.isfinite(self.square) and self.square > 0):
+            raise CalibrationError(f"the side of a square must be positive, got {self.square} m")
+        object.__setattr__(self, "inner_corners", counts)
+
+    @property
+    def points(self) -> Array:
+        """Inner corners (n, 3) [m] in board axes; the third coordinate is zero."""
+        columns, rows = self.inner_corners
+        j, i = np.mgrid[:rows, :columns]
+        return np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], axis=-1) * self.square
+
+    @property
+    def orders(self) -> list[NDArray[np.intp]]:
+        """Turns after which the colouring is the same, too."""
+        columns, rows = self.inner_corners
+        orders = board_orders(self.inner_corners)
+        if (columns + rows) % 2:
+            return orders[:1]
+        return orders if len(orders) == 2 or columns % 2 == 0 else orders[::2]
+
+    def __str__(self) -> str:
+        return f"a board of {self.inner_corners[0]} x {self.inner_corners[1]} inner corners"
+
+
+def board_orders(inner_corners: tuple[int, int]) -> list[NDArray[np.intp]]:
+    """The turns of a chessboard in its own plane that map its corners onto themselves: 2, or 4 for a square board."""
+    columns, rows = inner_corners
+    index = np.arange(columns * rows).reshape(rows, columns)
+    turns = (0, 1, 2, 3) if columns == rows else (0, 2)
+    return [np.rot90(index, k).ravel() for k in turns]
+
+
+def _upright(columns: Array, rows: Array, n_rows: int, step: float) -> Array:
+    """Points (n, 3) of places counted from the upper left; the origin is at the lower left."""
+    return np.stack([columns.ravel(), n_rows - 1 - rows.ravel(), np.zeros(columns.size)], axis=-1) * step
+
+
+@dataclass(frozen=True)
+class CharucoBoard(Target):
+    """A chessboard with an ArUco marker in every light square; points are its inner corners in OpenCV's order.
+
+    Upright as OpenCV draws it, the origin is the lower left inner corner.
+    """
+
+    kind: ClassVar[str] = "charuco"
+
+    squares: tuple[int, int]  # columns, rows of squares, dark and light
+    square: float  # side of a square [m]
+    marker: float  # side of a marker [m]
+    dictionary: str = "DICT_4X4_50"  # OpenCV's name
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "squares", _counts(self.squares, 4, "squares of a ChArUco board"))
+        if not 0 < self.marker < self.square < np.inf:
+            raise CalibrationError(
+                f"a marker of {self.marker} m does not fit into a square of {self.square} m: both are sides, in metres"
+            )
+
+    @property
+    def inner_corners(self) -> tuple[int, int]:
+        """Columns, rows of inner corners."""
+        return self.squares[0] - 1, self.squares[1] - 1
+
+    @property
+    def points(self) -> Array:
+        """Inner corners (n, 3) [m], from the upper left, row by row."""
+        columns, rows = self.inner_corners
+        j, i = np.mgrid[:rows, :columns]
+        return _upright(i, j, rows, self.square)
+
+    @property
+    def orders(self) -> list[NDArray[np.intp]]:
+        """One: every marker is another."""
+        return [np.arange(len(self.points))]
+
+    def __str__(self) -> str:
+        return f"a ChArUco board of {self.squares[0]} x {self.squares[1]} squares ({self.dictionary})"
+
+
+@dataclass(frozen=True)
+class CircleGrid(Target):
+    """Round dots in rows and columns, or with every other row shifted by half a step; in OpenCV's order.
+
+    Upright with the first row above and, in an asymmetric grid, not shifted; the origin is at the lower left.
+    """
+
+    kind: ClassVar[str] = "circles"
+
+    circles: tuple[int, int]  # in a row, number of rows
+    spacing: float  # between neighbours in a row; asymmetric: between rows, half the distance in a row [m]
+    asymmetric: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "circles", _counts(self.circles, 3, "circles of a grid"))
+        if not 0 < self.spacing < np.inf:
+            raise CalibrationError(f"the spacing of the circles must be positive, got {self.spacing} m")
+
+    @property
+    def points(self) -> Array:
+        """Centres (n, 3) [m], from the upper left, row by row."""
+        columns, rows = self.circles
+        j, i = np.mgrid[:rows, :columns]
+        return _upright(2 * i + j % 2 if self.asymmetric else i, j, rows, self.spacing)
+
+    def __str__(self) -> str:
+        kind = "an asymmetric grid" if self.asymmetric else "a grid"
+        return f"{kind} of {self.circles[0]} x {self.circles[1]} circles"
+
+
+@dataclass(frozen=True)
+class DotTarget(Target):
+    """Dots on a square lattice, three of them with a hole: at (0, 0), (marked[0], 0) and (0, marked[1])."""
+
+    kind: ClassVar[str] = "dots"
+
+    spacing: float  # of the lattice [m]
+    marked: tuple[int, int]  # steps from the origin to the marked dot on the x axis, and on the y axis
+    lattice: tuple[tuple[int, int], ...] = ()  # places of the dots that the views show
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "marked", _counts(self.marked, 1, "steps to the marked dots"))
+        object.__setattr__(self, "lattice", tuple((int(i), int(j)) for i, j in self.lattice))
+        if not 0 < self.spacing < np.inf:
+            raise CalibrationError(f"the spacing of the dots must be positive, got {self.spacing} m")
+
+    @property
+    def points(self) -> Array:
+        """Centres (n, 3) [m] of the dots on the lattice."""
+        lattice = np.array(self.lattice, float).reshape(-1, 2)
+        return np.column_stack([lattice * self.spacing, np.zeros(len(lattice))])
+
+    @property
+    def orders(self) -> list[NDArray[np.intp]]:
+        """One: the marked dots tell."""
+        return [np.arange(len(self.lattice))]
+
+    def __str__(self) -> str:
+        return f"a lattice of dots, marked at {self.marked[0]} and {self.marked[1]} steps"
+
+
+def _counts(given: Any, least: int, what: str) -> tuple[int, int]:
+    counts = tuple(int(n) for n in given)
+    if len(counts) != 2 or min(counts) < least:
+        raise CalibrationError(f"{what}: two whole numbers of at least {least} are needed, got {given}")
+    return counts[0], counts[1]
+
+
+_KINDS: dict[str, type[Target]] = {kind.kind: kind for kind in (Board, CharucoBoard, CircleGrid, DotTarget)}
+
+
+def target_of(description: dict[str, Any]) -> Target:
+    """The target that `Target.described` wrote down."""
+    fields = dict(description)
+    return _KINDS[fields.pop("target")](**fields)

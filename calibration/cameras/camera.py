@@ -1,0 +1,341 @@
+"""Pinhole cameras with Brown distortion, alone and as a stereo pair, with every derivative that a fit needs.
+
+Pixel (0, 0) is the centre of the top-left pixel; a camera's axes are x right, y down, z along the view. Distortion is
+Brown's with OpenCV's coefficients in OpenCV's order, so that numbers can be exchanged with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.polynomial.chebyshev import chebvander
+
+from calibration.cameras.splines import LensField
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Brief
+
+INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+N_INTRINSIC = len(INTRINSIC_PARAMETERS)
+RIG_PARAMETERS = (
+    *(f"left_{name}" for name in INTRINSIC_PARAMETERS),
+    *(f"right_{name}" for name in INTRINSIC_PARAMETERS),
+    *(f"right_left_rotation_{axis}" for axis in "xyz"),
+    *(f"right_left_translation_{axis}" for axis in "xyz"),
+    *(f"left_world_rotation_{axis}" for axis in "xyz"),
+    *(f"left_world_translation_{axis}" for axis in "xyz"),
+)
+N_RIG = len(RIG_PARAMETERS)  # 30
+# Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
+OF_LEFT, OF_RIGHT = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
+PAIR_TURN, PAIR_SHIFT = slice(18, 21), slice(21, 24)
+WORLD_TURN, WORLD_SHIFT = slice(24, 27), slice(27, 30)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera: pinhole and Brown distortion."""
+
+    fx: float  # [px]
+    fy: float  # [px]
+    cx: float  # [px]
+    cy: float  # [px]
+    distortion: tuple[float, float, float, float, float]  # k1, k2, p1, p2, k3, on normalised coordinates
+    image_size: tuple[int, int]  # width, height [px]
+
+    @property
+    def camera_matrix(self) -> Array:
+        """The 3 x 3 matrix K of the textbooks."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def parameters(self) -> Array:
+        """(9,) in the order of INTRINSIC_PARAMETERS."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
+    @classmethod
+    def from_parameters(cls, parameters: Array, image_size: tuple[int, int]) -> Camera:
+        """Inverse of `parameters`."""
+        fx, fy, cx, cy, *distortion = (float(p) for p in parameters)
+        k1, k2, p1, p2, k3 = distortion
+        return cls(fx, fy, cx, cy, (k1, k2, p1, p2, k3), image_size)
+
+
+def project(points_camera: Array, camera: Camera) -> Array:
+    """Pixels (..., 2) of points (..., 3) given in the camera's own axes; NaN behind the camera."""
+    a, b, _ = _on_unit_depth(points_camera)
+    xd, yd, *_ = _distorted(a, b, camera)
+    return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
+
+
+def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """Pixels (..., 2), d pixel / d point (..., 2, 3) and d pixel / d intrinsics (..., 2, 9); NaN behind the camera."""
+    a, b, iz = _on_unit_depth(points_camera)
+    xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
+    yd_a = xd_b
+    pixels = np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
+
+    d_point = np.empty((*a.shape, 2, 3))
+    d_point[..., 0, 0] = camera.fx * xd_a * iz
+    d_point[..., 0, 1] = camera.fx * xd_b * iz
+    d_point[..., 0, 2] = -camera.fx * (xd_a * a + xd_b * b) * iz
+    d_point[..., 1, 0] = camera.fy * yd_a * iz
+    d_point[..., 1, 1] = camera.fy * yd_b * iz
+    d_point[..., 1, 2] = -camera.fy * (yd_a * a + yd_b * b) * iz
+
+    r2 = a * a + b * b
+    d_intrinsics = np.zeros((*a.shape, 2, N_INTRINSIC))
+    d_intrinsics[..., 0, 0], d_intrinsics[..., 1, 1] = xd, yd
+    d_intrinsics[..., 0, 2] = d_intrinsics[..., 1, 3] = 1.0
+    for column, factor in ((4, r2), (5, r2**2), (8, r2**3)):
+        d_intrinsics[..., 0, column] = camera.fx * a * factor
+        d_intrinsics[..., 1, column] = camera.fy * b * factor
+    d_intrinsics[..., 0, 6] = camera.fx * 2 * a * b
+    d_intrinsics[..., 1, 6] = camera.fy * (r2 + 2 * b * b)
+    d_intrinsics[..., 0, 7] = camera.fx * (r2 + 2 * a * a)
+    d_intrinsics[..., 1, 7] = camera.fy * 2 * a * b
+    return pixels, d_point, d_intrinsics
+
+
+def _on_unit_depth(points_camera: Array) -> tuple[Array, Array, Array]:
+    """X / Z, Y / Z and 1 / Z of points (..., 3); NaN behind the camera."""
+    X, Y, Z = np.moveaxis(np.asarray(points_camera, float), -1, 0)
+    inverse = 1.0 / np.where(Z > 0, Z, np.nan)
+    return X * inverse, Y * inverse, inverse
+
+
+def _distorted(a: Array, b: Array, camera: Camera) -> tuple[Array, Array, Array, Array, Array]:
+    """Brown's distortion of normalised coordinates: xd, yd, dxd/da, dxd/db (= dyd/da), dyd/db."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = a * a + b * b
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial_r2 = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2
+    xd = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    yd = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    xd_a = radial + 2 * a * a * radial_r2 + 2 * p1 * b + 6 * p2 * a
+    xd_b = 2 * a * b * radial_r2 + 2 * p1 * a + 2 * p2 * b
+    yd_b = radial + 2 * b * b * radial_r2 + 6 * p1 * b + 2 * p2 * a
+    return xd, yd, xd_a, xd_b, yd_b
+
+
+NEWTON_PX = 1e-6  # the last step of Newton's method
+_AT_ONCE = 16384  # points whose numbers stay in a core's cache: a whole image takes 2.5 times as long
+
+
+def normalise(pixels: Array, camera: Camera) -> Array:
+    """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `project` up to depth.
+
+    NaN where Newton's method on the distortion does not come to within 1e-6 px (beyond the radius at which the
+    distortion polynomial folds).
+    """
+    pixels = np.asarray(pixels, float)
+    if pixels.size > 2 * _AT_ONCE:
+        parts = np.array_split(pixels.reshape(-1, 2), pixels.size // (2 * _AT_ONCE) + 1)
+        return np.concatenate([normalise(part, camera) for part in parts]).reshape(pixels.shape)
+    x, y = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
+    return np.stack(_undistorted(x, y, x, y, camera), axis=-1)
+
+
+def _undistorted(x: Array, y: Array, a: Array, b: Array, camera: Camera, iterations: int = 20) -> tuple[Array, Array]:
+    """What Brown's distortion takes to x, y, from a, b near it by Newton's method; NaN where it does not get there."""
+    with np.errstate(all="ignore"):  # beyond the fold the iteration may run away; it is judged below
+        for _ in range(iterations):
+            xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
+            rx, ry = x - xd, y - yd
+            det = xd_a * yd_b - xd_b * xd_b
+            inverse = 1.0 / det
+            step_a, step_b = (yd_b * rx - xd_b * ry) * inverse, (xd_a * ry - xd_b * rx) * inverse
+            a, b = a + step_a, b + step_b
+            px2 = camera.fx * camera.fy * (step_a * step_a + step_b * step_b)
+            if np.fmax.reduce(px2, axis=None, initial=0.0) < NEWTON_PX**2:  # NaN-blind; what is left is its square
+                break
+        # both slopes are positive up to the fold; beyond it are roots that no ray goes to
+        good = (px2 < NEWTON_PX**2) & (det > 0) & (xd_a + yd_b > 0)
+    return np.where(good, a, np.nan), np.where(good, b, np.nan)
+
+
+_NODES = 24  # of Chebyshev's polynomials along each side of an image: ordinary lenses come out to 1e-12
+
+
+def normalised_maps(camera: Camera) -> tuple[Array, Array]:
+    """Undistorted normalised coordinates x, y of every pixel, each (height, width): `normalise`, three times as fast.
+
+    It starts from polynomials through the coordinates of a few pixels, and is at its end after a step.
+    """
+    width, height = camera.image_size
+    x, y = (np.arange(width) - camera.cx) / camera.fx, (np.arange(height) - camera.cy) / camera.fy
+    nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    few = np.stack(np.meshgrid(*(0.5 * (size - 1) * (1 + nodes) for size in (width, height))), axis=-1)
+    at_nodes = np.moveaxis(normalise(few, camera), -1, 0)
+    inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))
+    along_x, along_y = (chebvander(np.linspace(-1, 1, size), _NODES - 1) @ inverse for size in (width, height))
+    smooth = bool(np.isfinite(at_nodes).all())
+    maps = np.empty((2, height, width))
+    rows = max(1, _AT_ONCE // width)
+    for first in range(0, height, rows):
+        part = slice(first, first + rows)
+        x_part, y_part = np.broadcast_arrays(x, y[part, None])
+        near = along_y[part] @ at_nodes @ along_x.T if smooth else (x_part, y_part)
+        # pixels beyond the fold of a distortion polynomial have no ray; the kernels skip windows that touch them
+        maps[0, part], maps[1, part] = _undistorted(x_part, y_part, near[0], near[1], camera)
+    return maps[0], maps[1]
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """A part of a rig's covariance that no image tells: what the sizes of a board or a disc may be off by."""
+
+    cause: str  # as in "the board's thickness"
+    shift: Array  # (30,) of RIG_PARAMETERS by one standard deviation
+    assumed: bool = False  # neither declared nor measured: a default, which other evidence may narrow
+
+
+@dataclass(frozen=True, repr=False)
+class StereoRig(Brief):
+    """Two calibrated cameras and the world (lab) frame they look at.
+
+    points_left = R_left_world @ points_world + t_left_world;  points_right = R_right_left @ points_left + t_right_left.
+    `covariance` is that of RIG_PARAMETERS, rotations as rotation vectors that multiply the estimate from the left
+    (R = exp([v]x) R_estimate); zero rows belong to parameters that were not estimated. It is common to all frames.
+    A rig without a table view has the left camera's axes for a world (`world_is_table` False).
+    """
+
+    left: Camera
+    right: Camera
+    R_right_left: Array  # (3, 3)
+    t_right_left: Array  # (3,) [m]
+    R_left_world: Array = field(default_factory=lambda: np.eye(3))  # (3, 3)
+    t_left_world: Array = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
+    covariance: Array = field(default_factory=lambda: np.zeros((N_RIG, N_RIG)))  # (30, 30)
+    world_is_table: bool = False
+    # What the lenses do beyond the polynomial: measured points are corrected by it before anything else (`splines`)
+    lens_field: LensField | None = None
+    allowances: tuple[Allowance, ...] = ()  # parts of the covariance, by cause; the views' own is what is left
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        sizes = [" x ".join(str(n) for n in camera.image_size) for camera in self.cameras]
+        return {
+            "images": f"{sizes[0]} px" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} px",
+            "focal length": " and ".join(f"{camera.fx:.1f}" for camera in self.cameras) + " px",
+            "baseline": f"{1e3 * self.baseline:.3f} mm",
+            "world": "the table" if self.world_is_table else "the left camera's axes",
+        }
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Left, right."""
+        return self.left, self.right
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the two projection centres [m]."""
+        return float(np.linalg.norm(self.t_right_left))
+
+    def camera_poses(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """(R_camera_world, t_camera_world) of the left and of the right camera."""
+        R_right_world = self.R_right_left @ self.R_left_world
+        t_right_world = self.R_right_left @ self.t_left_world + self.t_right_left
+        return (self.R_left_world, self.t_left_world), (R_right_world, t_right_world)
+
+    def project(self, points_world: Array) -> Array:
+        """Pixels (..., 2 cameras, n, 2) of points (..., n, 3) [m]; NaN behind a camera."""
+        views = [
+            project(points_world @ R.T + t, camera)
+            for camera, (R, t) in zip(self.cameras, self.camera_poses(), strict=True)
+        ]
+        return np.stack(views, axis=-3)
+
+    def project_with_jacobians(self, points_world: Array) -> tuple[Array, Array, Array]:
+        """Pixels (..., 2, n, 2), d/d point_world (..., 2, n, 2, 3) and d/d RIG_PARAMETERS (..., 2, n, 2, 30)."""
+        points_world = np.asarray(points_world, float)
+        points_left = points_world @ self.R_left_world.T + self.t_left_world
+        pixels_left, d_left, d_k_left = project_with_jacobians(points_left, self.left)
+        turned_right = points_left @ self.R_right_left.T
+        pixels_right, d_right, d_k_right = project_with_jacobians(turned_right + self.t_right_left, self.right)
+        d_right_left = d_right @ self.R_right_left  # d pixel_right / d point_left
+
+        arm_world = points_world @ self.R_left_world.T
+        d_rig = np.zeros((*points_world.shape[:-2], 2, points_world.shape[-2], 2, N_RIG))
+        d_rig[..., 0, :, :, OF_LEFT] = d_k_left
+        d_rig[..., 1, :, :, OF_RIGHT] = d_k_right
+        d_rig[..., 1, :, :, PAIR_TURN] = by_turning(d_right, turned_right)
+        d_rig[..., 1, :, :, PAIR_SHIFT] = d_right
+        for camera, d_point in enumerate((d_left, d_right_left)):
+            d_rig[..., camera, :, :, WORLD_TURN] = by_turning(d_point, arm_world)
+            d_rig[..., camera, :, :, WORLD_SHIFT] = d_point
+        d_world = np.stack([d_left @ self.R_left_world, d_right_left @ self.R_left_world], axis=-4)
+        return np.stack([pixels_left, pixels_right], axis=-3), d_world, d_rig
+
+    def perturbed(self, delta: Array) -> StereoRig:
+        """The rig after a small change delta (30,) of RIG_PARAMETERS (SI units, rotation vectors in radians)."""
+        delta = np.asarray(delta, float)
+        return replace(
+            self,
+            left=Camera.from_parameters(self.left.parameters + delta[OF_LEFT], self.left.image_size),
+            right=Camera.from_parameters(self.right.parameters + delta[OF_RIGHT], self.right.image_size),
+            R_right_left=rotation_from_vector(delta[PAIR_TURN]) @ self.R_right_left,
+            t_right_left=self.t_right_left + delta[PAIR_SHIFT],
+            R_left_world=rotation_from_vector(delta[WORLD_TURN]) @ self.R_left_world,
+            t_left_world=self.t_left_world + delta[WORLD_SHIFT],
+        )
+
+
+def by_turning(d_point: Array, arm: Array) -> Array:
+    """D pixel / d rotation vector (..., 2, 3) when the arm (..., 3) turns, from d pixel / d point (..., 2, 3).
+
+    d_point @ (v x arm) = (arm x d_point) . v
+    """
+    x, y, z = (arm[..., None, i] for i in range(3))  # numpy.cross takes three times as long
+    a, b, c = (d_point[..., i] for i in range(3))
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
+
+
+def placed_at(poses: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
+    """Fields of a StereoRig whose cameras, left and right, stand so: R (3, 3), t (3,) from world to camera axes."""
+    (R_left, t_left), (R_right, t_right) = poses
+    R = R_right @ R_left.T
+    return {"R_right_left": R, "t_right_left": t_right - R @ t_left, "R_left_world": R_left, "t_left_world": t_left}
+
+
+def rotation_from_vector(v: Array) -> Array:
+    """Rodrigues' formula: rotation vectors (..., 3) [rad] -> (..., 3, 3)."""
+    v = np.asarray(v, float)
+    square = np.sum(v * v, axis=-1)
+    small = square < 1e-12  # of which the series is exact
+    angle = np.sqrt(np.where(small, 1.0, square))
+    first = np.where(small, 1.0, np.sin(angle) / angle)[..., None, None]
+    second = np.where(small, 0.5, (1 - np.cos(angle)) / angle**2)[..., None, None]
+    S = np.zeros((*v.shape, 3))
+    S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    S = S - np.swapaxes(S, -1, -2)
+    return np.asarray(np.eye(3) + first * S + second * S @ S, np.float64)
+
+
+def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:
+    """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice."""
+    rays = [
+        np.concatenate([normalise(view, camera), np.ones((len(view), 1))], axis=-1)
+        for view, camera in zip(pixels, rig.cameras, strict=True)
+    ]
+    rows, rhs = [], []
+    for ray, (R, t) in zip(rays, rig.camera_poses(), strict=True):
+        for axis in (0, 1):
+            rows.append(R[axis] - ray[:, axis, None] * R[2])
+            rhs.append(ray[:, axis] * t[2] - t[axis])
+    A, b = np.stack(rows, axis=-2), np.stack(rhs, axis=-1)
+    good = np.isfinite(A).all(axis=(-2, -1)) & np.isfinite(b).all(axis=-1)
+    points = np.full((len(good), 3), np.nan)
+    normal = np.swapaxes(A[good], -1, -2) @ A[good]
+    points[good] = np.linalg.solve(normal, (np.swapaxes(A[good], -1, -2) @ b[good][..., None]))[..., 0]
+    for _ in range(iterations):
+        found, d_world, _ = rig.project_with_jacobians(points[good])
+        J = np.moveaxis(d_world, 0, 1).reshape(-1, 4, 3)
+        residual = np.moveaxis(pixels[:, good] - found, 0, 1).reshape(-1, 4, 1)
+        step = np.linalg.solve(np.swapaxes(J, -1, -2) @ J, np.swapaxes(J, -1, -2) @ residual)[..., 0]
+        points[good] += step
+        if not np.any(np.abs(step) > 1e-12):
+            break
+    return points

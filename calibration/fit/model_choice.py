@@ -1,0 +1,162 @@
+"""Which shape of the board the data support: by the error on views that the fit has not seen.
+
+The lens is not chosen so. A term that the views do not tell from zero is not zero for that: left out, it would put its
+error into all others, which nothing would say (1.8 to 2.3 times the stated variance by three to eight views). All terms
+are fitted, and `priors` knows how large they are in lenses.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.fit.board_motion import BoardMotion, split
+from calibration.fit.normal_equations import Problem, inverse_covariance, minimise
+from calibration.fit.refinement import Refinement, refine_stereo
+from calibration.fit.stereo_model import (
+    BOARD_MODELS,
+    N_STEREO,
+    RICHEST,
+    Observations,
+    StereoModel,
+    Terms,
+    predict_pixels,
+)
+from calibration.kit.arrays import Array, Mask
+
+HOPELESS = 1.5  # times the noise of the best model, left in the views it was fitted to: not worth views left out
+FOLDS = 5
+NEGLIGIBLE = 1e-5  # of chi-square, still to be gained: of 10^4 points, a third of a sigma of one parameter
+TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
+SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler model may be worse
+
+
+@dataclass(frozen=True)
+class TermsTried:
+    """One row of the cross-validation table."""
+
+    terms: Terms
+    n_parameters: int  # shared by all views
+    rms_px: float  # on the views that were fitted
+    held_out_rms_px: float  # on views left out, each with its own pose fitted
+    held_out_chi_square: float  # per observation, truncated, in units of the noise of this comparison
+    noise_px: float  # sigma per axis of this comparison beyond the corners' own noise: the least of its models
+    per_view: Array  # (n_views,) the same, NaN where a view was not used
+
+
+def held_out(
+    refinement: Refinement, sigma: float, good: Mask, motion: BoardMotion | None = None
+) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Per view, each view left out in turn: chi-square (truncated) of all points, squared distance [px^2] of good ones.
+
+    sigma : unexplained noise [px] for the comparison, the same for every candidate
+    good : (m,) the observations that count in the distance
+    motion : of the boards between the exposures, for the comparison
+    returns : chi-square, squared distance, number of all and of good points, each (n_views,)
+    """
+    used = refinement.observations[refinement.kept]
+    everything = refinement.observations
+    n_views = refinement.problem.n_views
+    chi2, square = np.full(n_views, np.nan), np.full(n_views, np.nan)
+    count, good_count = np.zeros(n_views, int), np.zeros(n_views, int)
+    views = np.unique(used.view)
+    weights = inverse_covariance(used.covariance, sigma**2)
+    whole = replace(refinement.problem, observations=used, weights=weights, motion=motion)
+    at_minimum = whole.linearise(refinement.model)
+    for fold in range(min(FOLDS, len(views))):
+        left_out = views[fold :: min(FOLDS, len(views))]
+        train = ~np.isin(used.view, left_out)
+        problem = replace(whole, observations=used[train], weights=whole.weights[train])
+        model = minimise(
+            problem,
+            refinement.model,
+            iterations=8,
+            tolerance=NEGLIGIBLE,
+            damping=1e-7,
+            normal=at_minimum.of_views(np.setdiff1d(views, left_out)),
+            rough=True,
+        ).model
+        tested = np.isin(everything.view, left_out)
+        test = everything[tested]
+        model = fit_poses(test, model, sigma, motion)
+        residuals = test.pixels - predict_pixels(model, test)
+        distance = np.einsum("mi,mij,mj->m", residuals, inverse_covariance(test.covariance, sigma**2), residuals)
+        for v in left_out:
+            of_view = test.view == v
+            chi2[v] = np.minimum(distance[of_view], TRUNCATE).sum()
+            square[v] = np.sum(residuals[of_view & good[tested]] ** 2)
+            count[v], good_count[v] = of_view.sum(), (of_view & good[tested]).sum()
+    return chi2, square, count, good_count
+
+
+def fit_poses(
+    observations: Observations, model: StereoModel, sigma: float, motion: BoardMotion | None = None
+) -> StereoModel:
+    """Poses of the target in the views of the observations, everything else held."""
+    model = replace(model, boards_right=None) if motion is None else split(model)
+    problem = Problem(
+        observations,
+        inverse_covariance(observations.covariance, sigma**2),
+        np.zeros((N_STEREO, 0)),
+        np.zeros((*model.points.shape, 0)),
+        len(model.R_left_board),
+        huber=3.0,
+        motion=motion,
+    )
+    return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
+
+
+def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
+    """The row of one fitted model, by the noise, the good points and the boards' motion of another; see `held_out`."""
+    sigma = quietest.unexplained_sigma
+    chi2, square, count, good_count = held_out(refinement, sigma, quietest.kept, quietest.problem.motion)
+    with np.errstate(invalid="ignore"):
+        per_view = chi2 / np.where(count > 0, count, np.nan)
+    return TermsTried(
+        terms=refinement.terms,
+        n_parameters=refinement.problem.stereo_basis.shape[1] + refinement.problem.shape_basis.shape[-1],
+        rms_px=refinement.rms(),
+        held_out_rms_px=float(np.sqrt(np.nansum(square) / max(good_count.sum(), 1))),
+        held_out_chi_square=float(np.nansum(chi2) / max(count.sum(), 1)),
+        noise_px=sigma,
+        per_view=per_view,
+    )
+
+
+def best(candidates: list[TermsTried]) -> int:
+    """Least held-out chi-square; a simpler model that is not clearly worse comes first."""
+    winner = min(candidates, key=lambda c: c.held_out_chi_square)
+    for i in sorted(range(len(candidates)), key=lambda i: candidates[i].n_parameters):
+        difference = candidates[i].per_view - winner.per_view
+        difference = difference[np.isfinite(difference)]
+        error = float(np.std(difference) / np.sqrt(max(len(difference) - 1, 1)))
+        if np.mean(difference) <= SIMPLER_WITHIN * error:
+            return i
+    return candidates.index(winner)
+
+
+def choose_board(
+    observations: Observations,
+    start: StereoModel,
+    nominal: Array,
+    boards: tuple[str, ...] = BOARD_MODELS,
+    distortion: str = RICHEST,
+    equal_aspect: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+    motion: BoardMotion | None = None,
+) -> tuple[Refinement, tuple[TermsTried, ...]]:
+    """Choose the shape that the board may have: of `boards`, simplest first; one alone is taken, not chosen.
+
+    Returns the refinement of the chosen terms and the table of what was compared. motion : as in `refine_stereo`
+    """
+    fits: list[Refinement] = []
+    for board in boards:
+        if fits:
+            progress(f"trying a {board} board")
+        terms, begin = Terms(distortion, board, equal_aspect), fits[0] if fits else None
+        fits.append(refine_stereo(observations, start, nominal, terms, begin=begin, motion=None if begin else motion))
+    quietest = min(fits, key=lambda fit: fit.unexplained_sigma)
+    fits = [fit for fit in fits if fit.unexplained_sigma <= HOPELESS * quietest.unexplained_sigma + 1e-3]
+    table = [candidate(fit, quietest) for fit in fits]
+    return fits[best(table)], tuple(table)

@@ -1,0 +1,234 @@
+"""What predicts the image of a flat target in two cameras: parameters, observations, derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.cameras.camera import (
+    N_INTRINSIC,
+    OF_LEFT,
+    OF_RIGHT,
+    PAIR_SHIFT,
+    PAIR_TURN,
+    Camera,
+    by_turning,
+    project,
+    project_with_jacobians,
+    rotation_from_vector,
+)
+from calibration.kit.arrays import Array
+from calibration.kit.errors import CalibrationError
+
+DISTORTION_MODELS: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "k1": ("k1",),
+    "k1 k2": ("k1", "k2"),
+    "k1 k2 p1 p2": ("k1", "k2", "p1", "p2"),
+    "k1 k2 k3": ("k1", "k2", "k3"),
+    "k1 k2 p1 p2 k3": ("k1", "k2", "p1", "p2", "k3"),
+}
+RICHEST = "k1 k2 p1 p2 k3"
+BOARD_MODELS = ("flat", "warped", "free")
+N_WARP = 5  # shape parameters of a warped board
+N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Image points of target points, flat over everything that was seen."""
+
+    view: NDArray[np.intp]  # (m,) 0..n_views-1
+    camera: NDArray[np.intp]  # (m,) 0 left, 1 right
+    point: NDArray[np.intp]  # (m,) index into the target's points
+    pixels: Array  # (m, 2) [px]
+    covariance: Array  # (m, 2, 2) [px^2]
+
+    def __post_init__(self) -> None:
+        m = len(self.view)
+        shapes = (self.camera.shape, self.point.shape, self.pixels.shape, self.covariance.shape)
+        if shapes != ((m,), (m,), (m, 2), (m, 2, 2)):
+            raise ValueError(f"shapes of observations do not match: {m} views, then {shapes}")
+        if not (np.isfinite(self.pixels).all() and np.isfinite(self.covariance).all()):
+            raise ValueError("observations must be finite: leave out what was not seen")
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def __getitem__(self, keep: NDArray) -> Observations:
+        names = ("view", "camera", "point", "pixels", "covariance")
+        return Observations(*(getattr(self, name)[keep] for name in names))
+
+
+@dataclass(frozen=True)
+class StereoModel:
+    """Everything that predicts where the target's points appear."""
+
+    cameras: tuple[Camera, Camera]
+    R_right_left: Array  # (3, 3)
+    t_right_left: Array  # (3,) [m]
+    R_left_board: Array  # (n_views, 3, 3)
+    t_left_board: Array  # (n_views, 3) [m]
+    points: Array  # (n, 3) target points in board axes [m], as refined
+    # (n_views, 3, 3) and (n_views, 3) [m] of the boards at the right camera's exposure, where they moved after the left
+    boards_right: tuple[Array, Array] | None = None
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What the refinement may change."""
+
+    distortion: str = RICHEST  # key of DISTORTION_MODELS, the same for both cameras
+    board: str = "flat"  # one of BOARD_MODELS
+    equal_aspect: bool = False  # fx = fy in each camera
+    fixed_intrinsics: bool = False
+
+    def __post_init__(self) -> None:
+        if self.distortion not in DISTORTION_MODELS:
+            raise CalibrationError(
+                f"distortion {self.distortion!r} is unknown; choose of {', '.join(DISTORTION_MODELS)}"
+            )
+        if self.board not in BOARD_MODELS:
+            raise CalibrationError(f"board model {self.board!r} is unknown; choose of {', '.join(BOARD_MODELS)}")
+
+    def stereo_basis(self) -> Array:
+        """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
+        names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+        free = () if self.fixed_intrinsics else ("fx", "fy", "cx", "cy", *DISTORTION_MODELS[self.distortion])
+        columns = []
+        for camera in range(2):
+            for i, name in enumerate(names):
+                if name not in free or (self.equal_aspect and name == "fy"):
+                    continue
+                column = np.zeros(N_STEREO)
+                column[camera * N_INTRINSIC + i] = 1.0
+                if self.equal_aspect and name == "fx":
+                    column[camera * N_INTRINSIC + 1] = 1.0
+                columns.append(column)
+        columns.extend(np.eye(N_STEREO)[2 * N_INTRINSIC :])
+        return np.array(columns).T
+
+
+def board_basis(nominal: Array, board: str) -> Array:
+    """(n, 3, n_shape): displacement of the target's points [m] per unit of each shape parameter [m].
+
+    flat: none. warped: out of the plane as x^2, x y, y^2 over the half size, and in it longer along one side or
+    sheared, as a print that the paper's feed has drawn out. free: every coordinate of every point.
+    Shift, turn and scale of the target as a whole are taken out: no image can tell them from a changed pose and
+    baseline, so the mean plane and the mean size stay those declared.
+    """
+    n = len(nominal)
+    if board == "flat":
+        return np.zeros((n, 3, 0))
+    d = nominal - nominal.mean(0)
+    size = np.abs(d).max()
+    rows = [np.broadcast_to(axis * size, d.shape) for axis in np.eye(3)]
+    rows += [np.cross(axis, d) for axis in np.eye(3)] + [d]
+    gauge = np.stack([row.reshape(-1) for row in rows], axis=-1)
+    q, _ = np.linalg.qr(gauge, mode="complete")
+    if board == "free":
+        return q[:, 7:].reshape(n, 3, 3 * n - 7)
+    x, y = (d / np.abs(d).max(0).clip(1e-12))[:, :2].T
+    warp = np.zeros((n, 3, N_WARP))
+    warp[:, 2, :3] = np.stack([x * x, x * y, y * y], axis=-1)
+    warp[:, :2, 3] = d[:, :2] * [0.5, -0.5] / size
+    warp[:, :2, 4] = d[:, 1::-1] * 0.5 / size
+    flat = warp.reshape(3 * n, N_WARP)
+    return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(n, 3, N_WARP)
+
+
+def predict_pixels(model: StereoModel, observations: Observations) -> Array:
+    """Pixels (m, 2) alone."""
+    _, arm, t = _arms(model, observations)
+    pixels = np.empty((len(observations), 2))
+    for index, camera in enumerate(model.cameras):
+        seen = observations.camera == index
+        points = arm[seen] + t[seen]
+        if index == 1:
+            points = points @ model.R_right_left.T + model.t_right_left
+        pixels[seen] = project(points, camera)
+    return pixels
+
+
+def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
+    """Pixels (m, 2) and derivatives: d/d stereo (m, 2, 24), d/d view pose (m, 2, 6), d/d target point (m, 2, 3)."""
+    m = len(observations)
+    R, arm, t = _arms(model, observations)
+    points_left = arm + t
+    pixels, d_pose = np.empty((m, 2)), np.empty((m, 2, 6))
+    d_left = d_pose[..., 3:]
+    d_stereo = np.zeros((m, 2, N_STEREO))
+    for index, camera in enumerate(model.cameras):
+        seen = np.flatnonzero(observations.camera == index)
+        if index == 0:
+            pixels[seen], d_left[seen], d_stereo[seen, :, :N_INTRINSIC] = project_with_jacobians(
+                points_left[seen], camera
+            )
+            continue
+        turned = points_left[seen] @ model.R_right_left.T
+        pixels[seen], d_right, d_k = project_with_jacobians(turned + model.t_right_left, camera)
+        d_stereo[seen, :, N_INTRINSIC : 2 * N_INTRINSIC] = d_k
+        d_stereo[seen, :, 2 * N_INTRINSIC : 2 * N_INTRINSIC + 3] = by_turning(d_right, turned)
+        d_stereo[seen, :, 2 * N_INTRINSIC + 3 :] = d_right
+        d_left[seen] = d_right @ model.R_right_left
+    d_pose[..., :3] = by_turning(d_left, arm)
+    return pixels, d_stereo, d_pose, d_left @ R
+
+
+def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:
+    """Rotation (m, 3, 3) of the board, its point turned by it (m, 3), and the board's place (m, 3)."""
+    R, t = model.R_left_board[observations.view], model.t_left_board[observations.view]
+    if model.boards_right is not None:
+        right = observations.camera == 1
+        R, t = (
+            np.where(right.reshape(-1, *[1] * (one.ndim - 1)), of[observations.view], one)
+            for one, of in zip((R, t), model.boards_right, strict=True)
+        )
+    return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
+
+
+def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
+    """The model after a step: stereo (24,), poses (n_views, 6) rotation vectors and shifts, displacement (n, 3).
+
+    poses : (n_views, 12) where the boards have places of their own at the right camera's exposure, those last
+    """
+    turns, boards_right = rotation_from_vector(poses[:, :3]), None
+    if model.boards_right is not None:
+        R, t = model.boards_right
+        boards_right = rotation_from_vector(poses[:, 6:9]) @ R, t + poses[:, 9:]
+    return StereoModel(
+        cameras=(
+            Camera.from_parameters(model.cameras[0].parameters + stereo[OF_LEFT], model.cameras[0].image_size),
+            Camera.from_parameters(model.cameras[1].parameters + stereo[OF_RIGHT], model.cameras[1].image_size),
+        ),
+        R_right_left=rotation_from_vector(stereo[PAIR_TURN]) @ model.R_right_left,
+        t_right_left=model.t_right_left + stereo[PAIR_SHIFT],
+        R_left_board=turns @ model.R_left_board,
+        t_left_board=model.t_left_board + poses[:, 3:6],
+        points=model.points + displacement,
+        boards_right=boards_right,
+    )
+
+
+def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
+    """The model with the terms that are not free put to zero: distortion, deviation of the board, fx - fy."""
+    if terms.board != "free":
+        basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
+        deviation = (model.points - nominal).reshape(-1)
+        coefficients = np.linalg.lstsq(basis, deviation, rcond=None)[0] if basis.shape[1] else np.zeros(0)
+        model = replace(model, points=nominal + (basis @ coefficients).reshape(nominal.shape))
+    if terms.fixed_intrinsics:
+        return model
+    free = DISTORTION_MODELS[terms.distortion]
+    names = ("k1", "k2", "p1", "p2", "k3")
+    cameras = []
+    for camera in model.cameras:
+        k1, k2, p1, p2, k3 = (
+            value if name in free else 0.0 for name, value in zip(names, camera.distortion, strict=True)
+        )
+        mean = 0.5 * (camera.fx + camera.fy)
+        fx, fy = (mean, mean) if terms.equal_aspect else (camera.fx, camera.fy)
+        cameras.append(replace(camera, fx=fx, fy=fy, distortion=(k1, k2, p1, p2, k3)))
+    return replace(model, cameras=(cameras[0], cameras[1]))

@@ -1,0 +1,182 @@
+"""A camera that was moved while the views were taken: the pairs before and after tell of two places of the cameras.
+
+Every pair tells by itself how the cameras stand to each other: from where either of them has the board. Boards that
+moved between the exposures, lenses beyond their model and noise scatter these; a camera that was pushed or turned makes
+a step of them, in the order in which the views were taken. Distances are measured in pixels, as a pair's images would
+see them, so that what a pair tells badly (a shift along the axis) counts as little as it is known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from calibration.cameras.camera import PAIR_SHIFT, PAIR_TURN
+from calibration.fit.stereo_model import Observations, StereoModel, predict
+from calibration.judge.pairs import PairsJudged
+from calibration.kit.arrays import Array
+
+LEAST = 6  # pairs: of fewer a step cannot be told from motions of the boards
+# Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
+# ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
+STEP = 4.0
+LEAST_SIDE = 3  # pairs on either side of a step: fewer are not a place of the cameras, but boards that moved
+ASTRAY = 0.1  # share of the pairs that may lie nearer to the other side's place
+LEAST_TOLD = 1e-5  # of singular values: below, the points lie on a line as seen from the camera
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step in how the cameras stand to each other."""
+
+    view: int  # the first one after it
+    turn: float  # [rad]
+    shift: float  # [m]
+    pixels: float  # [px] between pairs on either side of it, in the right image: root mean square of the usual two
+    scatter: float  # [px] between pairs of one side, the same way
+
+
+@dataclass(frozen=True)
+class CameraMoved:
+    """The stretches of pairs between such steps."""
+
+    steps: tuple[Step, ...]  # in order
+    stretches: tuple[tuple[int, ...], ...]  # the views of the pairs; one more than steps
+    kept: int  # the stretch that tells how the cameras stand
+
+    @property
+    def others(self) -> tuple[int, ...]:
+        """The views of the other stretches."""
+        return tuple(v for k, stretch in enumerate(self.stretches) if k != self.kept for v in stretch)
+
+    def set_apart(self, pairs: PairsJudged) -> PairsJudged:
+        """The pairs of the other stretches apart, each at the place that its left image alone gives the board."""
+        model = pairs.model
+        R, t = model.R_left_board.copy(), model.t_left_board.copy()
+        for v in self.others:
+            R[v], t[v] = pairs.left_poses[v]
+        apart = pairs.apart | dict.fromkeys(self.others, "a camera was moved")
+        return replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart)
+
+    def told(self, names: Sequence[tuple[str, str]], table_view: int | None) -> str:
+        """In words, for whoever took the views."""
+        steps = "; ".join(
+            f"from {names[step.view][0]} and {names[step.view][1]} on the cameras stand otherwise to each other than "
+            f"before, by {np.degrees(step.turn):.2g} deg and {1e3 * step.shift:.2g} mm ({step.pixels:.2g} px, where "
+            f"the pairs on either side agree to {step.scatter:.2g} px)"
+            for step in self.steps
+        )
+        kept = self.stretches[self.kept]
+        which = "most pairs" if table_view is None else "the view on the table"
+        return (
+            f"{steps}: a camera was moved or turned while the views were taken. How they stand to each other is taken "
+            f"from the {len(kept)} pairs {names[kept[0]][0]} to {names[kept[-1]][0]}, those with {which}; the images "
+            "of the others serve each its own camera. If the motion was recorded with the cameras as they stood at "
+            "other views, calibrate from these alone, or take new ones"
+        )
+
+
+def camera_moved(
+    observations: Observations, pairs: PairsJudged, model: StereoModel, table_view: int | None
+) -> CameraMoved | None:
+    """Find the steps; None where there are none, or too few pairs.
+
+    observations : with the views' numbers; pairs : as judged by cameras that were refined, `model` has those
+    table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
+    """
+    views, places, spread = _places(observations, pairs, model)
+    if len(views) < LEAST:
+        return None
+    steps: list[Step] = []
+    ends = [0, *_steps(_between(places, spread), places, views, (0, len(views)), steps), len(views)]
+    if not steps:
+        return None
+    stretches = tuple(tuple(views[a:b]) for a, b in pairwise(ends))
+    sizes = [len(stretch) for stretch in stretches]
+    kept = int(np.argmax(sizes))
+    if table_view is not None:
+        kept = int(np.searchsorted([step.view for step in sorted(steps, key=lambda s: s.view)], table_view, "right"))
+    return CameraMoved(tuple(sorted(steps, key=lambda step: step.view)), stretches, kept)
+
+
+def _places(observations: Observations, pairs: PairsJudged, model: StereoModel) -> tuple[list[int], Array, Array]:
+    """Views of pairs, how the cameras stand by each alone, turn and shift (n, 6) from `model`, and how well it sees it.
+
+    The latter (n, 6, 6) is the covariance of what displaces the right image's points by one pixel, root mean square,
+    once the board's place in the left image has taken up what it can. Pairs whose points lie on a line do not tell.
+    """
+    views, places, spreads = [], [], []
+    R_right_left = model.R_right_left
+    R, t = pairs.model.R_left_board.copy(), pairs.model.t_left_board.copy()
+    for v, (R_left, t_left) in pairs.left_poses.items():
+        R[v], t[v] = R_left, t_left
+    at_left = replace(model, R_left_board=R, t_left_board=t, boards_right=None)
+    for v in sorted(pairs.left_poses):
+        seen = observations[observations.view == v]
+        _, by_stereo, by_pose, _ = predict(at_left, seen)
+        right = seen.camera == 1
+        by_turn, by_shift = by_stereo[right][..., PAIR_TURN], by_stereo[right][..., PAIR_SHIFT]
+        by_pair = np.concatenate([by_turn, by_shift], axis=-1).reshape(-1, 6)
+        by_right, by_left = by_pose[right].reshape(-1, 6), by_pose[~right].reshape(-1, 6)
+        if not min(_determined(by_pair), _determined(by_left)) > LEAST_TOLD:
+            continue
+        carried = np.linalg.lstsq(by_pair, by_right, rcond=None)[0]  # a board's step, as one of the cameras
+        spread = carried @ np.linalg.solve(by_left.T @ by_left, carried.T) + np.linalg.inv(by_pair.T @ by_pair)
+        spreads.append(spread * right.sum())
+        (R_left, t_left), (R_right, t_right) = pairs.left_poses[v], pairs.right_poses[v]
+        turn = cv2.Rodrigues(R_right_left @ R_right @ R_left.T @ R_right_left.T)[0].ravel()
+        places.append(np.concatenate([turn, R_right_left @ (t_right - R_right @ R_left.T @ t_left)]))
+        views.append(v)
+    return views, np.reshape(places, (-1, 6)), np.reshape(spreads, (-1, 6, 6))
+
+
+def _determined(derivative: Array) -> float:
+    """Least over greatest singular value of a derivative (m, 6), each column by its own length; NaN out of sight."""
+    if not np.isfinite(derivative).all():
+        return float("nan")
+    values = np.linalg.svd(derivative / np.linalg.norm(derivative, axis=0), compute_uv=False)
+    return float(values[-1] / values[0])
+
+
+def _between(places: Array, spread: Array) -> Array:
+    """(n, n) [px] how far the places that two pairs tell of are apart in the right image, where both of them see it.
+
+    spread : (n, 6, 6) by which a deviation is one pixel, root mean square
+    """
+    apart = (places[:, None] - places[None])[..., None]
+    both = 0.5 * (spread[:, None] + spread[None])
+    scale = np.sqrt(np.einsum("ijkk->ijk", both))[..., None]
+    seen = np.linalg.solve(both / scale / np.swapaxes(scale, -1, -2), apart / scale) * apart / scale
+    return np.asarray(np.sqrt(np.maximum(seen.sum((-2, -1)), 0.0)), np.float64)
+
+
+def _steps(between: Array, places: Array, views: Sequence[int], part: tuple[int, int], steps: list[Step]) -> list[int]:
+    """Where steps are among a part of the pairs, in order: the clearest one, then those on either side of it."""
+    begin, end = part
+    if end - begin < 2 * LEAST_SIDE:
+        return []
+
+    def to_sides(cut: int) -> tuple[Array, Array]:
+        """Median distances (2, n) of each pair to those of its own side, and to those of the other."""
+        own, other = np.empty(end - begin), np.empty(end - begin)
+        for side, opposite in ((slice(begin, cut), slice(cut, end)), (slice(cut, end), slice(begin, cut))):
+            here = slice(side.start - begin, side.stop - begin)
+            within = between[side, side][~np.eye(side.stop - side.start, dtype=bool)]
+            own[here] = np.median(within.reshape(side.stop - side.start, -1), axis=1)
+            other[here] = np.median(between[side, opposite], axis=1)
+        return own, other
+
+    at = min(range(begin + LEAST_SIDE, end - LEAST_SIDE + 1), key=lambda cut: to_sides(cut)[0].sum())
+    own, other = to_sides(at)
+    pixels = float(np.median(other))
+    scatter = float(max(np.median(own[: at - begin]), np.median(own[at - begin :])))
+    if not pixels > STEP * scatter or np.mean(own > other) > ASTRAY:
+        return []
+    # in plain units: boards that moved scatter a turn and a shift that nearly cancel in the image
+    change = np.median(places[at:end], axis=0) - np.median(places[begin:at], axis=0)
+    turn, shift = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
+    steps.append(Step(views[at], float(turn), float(shift), pixels, scatter))
+    before, after = (_steps(between, places, views, side, steps) for side in ((begin, at), (at, end)))
+    return [*before, at, *after]

@@ -1,0 +1,109 @@
+"""Pixels of a sensor that do not see: hot, dead or stuck at a value, found in images of a scene that moves.
+
+A dot or a corner is fitted to a thousand pixels; one that is off by half the range, at the same place in every image,
+pulls it by more than the noise of all others. Cameras replace such pixels by their neighbours; many do not.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kit.arrays import Image, Mask
+
+OFF = 0.12  # of the images' range, by which a pixel differs from the median of its neighbours in every image
+STEADY = 0.04  # of the range: it changes by no more than that, whatever passes
+MIN_IMAGES = 4
+MOST = 0.01  # of all pixels: more are a pattern of the scene
+PASSED = 0.3  # of the range, by which the light around a pixel changed: squares, or a board and what is behind it
+OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
+
+
+def stuck_pixels(images: Sequence[Image] | NDArray) -> Mask | None:
+    """(height, width) True where a pixel is stuck in all grey images (n, height, width); None where none is."""
+    if len(images) < MIN_IMAGES:
+        return None
+    low, high = np.array(images[0]), np.array(images[0])
+    scale = float(np.ptp(low))
+    off = np.ones(low.shape, bool)
+    for image in images:
+        level = cv2.medianBlur(np.ascontiguousarray(image), 3)
+        off &= np.abs(image.astype(np.int32) - level) > OFF * scale
+        if not off.any():
+            return None
+        np.minimum(low, image, out=low)
+        np.maximum(high, image, out=high)
+    off &= high.astype(np.int32) - low <= STEADY * scale
+    return off if 0 < off.sum() <= MOST * off.size else None
+
+
+def blind_pixels(views: Sequence[Image] | NDArray) -> Mask | None:
+    """(height, width) True where a pixel keeps its value while the light around it does not; None where none does.
+
+    Of views of a board (n, height, width), grey: its squares are as dark as a dead pixel and as light as a hot one, so
+    that none differs from its neighbours in every view. It does OFTEN; a pixel of what rests behind the board may be
+    left as it is by an edge that comes near.
+    """
+    if len(views) < MIN_IMAGES:
+        return None
+    low, high = np.array(views[0]), np.array(views[0])
+    around = [cv2.medianBlur(low, 3) for _ in range(2)]
+    scale = float(max(int(view.max()) for view in views) - min(int(view.min()) for view in views))
+    differs = np.zeros(low.shape, np.int32)
+    for view in views:
+        np.minimum(low, view, out=low)
+        np.maximum(high, view, out=high)
+        level = cv2.medianBlur(np.ascontiguousarray(view), 3)
+        np.minimum(around[0], level, out=around[0])
+        np.maximum(around[1], level, out=around[1])
+        differs += np.abs(view.astype(np.int32) - level) > OFF * scale
+    blind = (high.astype(np.int32) - low <= STEADY * scale) & (around[1].astype(np.int32) - around[0] > PASSED * scale)
+    blind &= differs > OFTEN * len(views)
+    return blind if 0 < blind.sum() <= MOST * blind.size else None
+
+
+def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:
+    """One camera's views of a board with `blind_pixels` replaced in copies, and what is to be said of it ("": none).
+
+    views : grey (height, width) or colour (height, width, channels), of one size and type; each channel by itself.
+    Of a sensor under a colour filter each value is mixed from several pixels, and a blind one spreads a little.
+    """
+    first = views[0] if len(views) else np.zeros((0, 0))
+    if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:
+        return list(views), ""
+    blind, mended = np.zeros(first.shape[:2], bool), list(views)
+    for channel in range(1 if first.ndim == 2 else first.shape[2]):
+        one = [np.ascontiguousarray(view if view.ndim == 2 else view[..., channel]) for view in views]
+        mask = blind_pixels(one)
+        if mask is None:
+            continue
+        if not blind.any():
+            mended = [np.array(view) for view in views]
+        blind |= mask
+        for view, values in zip(mended, one, strict=True):
+            values = np.array(values)
+            repair(values, mask)
+            view.reshape(*view.shape[:2], -1)[..., channel] = values
+    n = int(blind.sum())
+    note = f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
+    return mended, note if n else ""
+
+
+def repair(images: NDArray, stuck: Mask) -> None:
+    """Replace, in place, the stuck pixels of images (..., height, width) by the median of their good neighbours."""
+    width = stuck.shape[1]
+    y, x = np.nonzero(stuck)
+    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+    v, u = y[:, None] + steps[:, 0], x[:, None] + steps[:, 1]
+    inside = (v >= 0) & (v < stuck.shape[0]) & (u >= 0) & (u < width)
+    good = inside & ~stuck[np.where(inside, v, 0), np.where(inside, u, 0)]
+    index = np.where(inside, v * width + u, 0)
+    # good ones first; places of others are taken by the good ones in turn
+    order = np.take_along_axis(index, np.argsort(~good, axis=1, kind="stable"), axis=1)
+    n = good.sum(axis=1)
+    order = np.take_along_axis(order, np.arange(len(steps)) % np.maximum(n, 1)[:, None], axis=1)[n > 0]
+    flat = images.reshape(-1, stuck.size)
+    if not np.shares_memory(flat, images):
+        raise ValueError("images must be contiguous, or one by one")
+    flat[:, (y * width + x)[n > 0]] = np.median(flat[:, order], axis=-1).astype(images.dtype)
