@@ -1,6 +1,9 @@
-"""Fixtures that every test may ask for."""
+"""Fixtures that every test may ask for, and the three circles of tests: default, statistical, slow."""
 
 import os
+import re
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded; as the command line does, for speed
@@ -9,6 +12,62 @@ import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+CIRCLES = ("statistical", "slow")  # run when they are named: -m statistical, -m slow, or the test itself
+DEFAULT_TEST_S = 2.0  # of processor time: some two thousand tests share three minutes of two cores
+REFERENCE_S = 0.01  # what `_reference` takes on the processor that the limit was set on
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """A slower processor may take longer."""
+    config.stash[_LIMIT] = DEFAULT_TEST_S * max(1.0, min(_reference() for _ in range(5)) / REFERENCE_S)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the circles that nobody named."""
+    named = set(re.findall(r"\w+", config.getoption("markexpr")))
+    asked = {argument.partition("[")[0] for argument in config.args if "::" in argument}
+    left_out = [
+        item
+        for item in items
+        if any(item.get_closest_marker(circle) and circle not in named for circle in CIRCLES)
+        and item.nodeid.partition("[")[0] not in asked
+    ]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """Fail a default test that takes more than its share."""
+    start = _processor_time()
+    result = yield
+    used, limit = _processor_time() - start, item.config.stash[_LIMIT]
+    if used > limit and not any(item.get_closest_marker(circle) for circle in CIRCLES):
+        pytest.fail(
+            f"{used:.1f} s of processor time, {limit:.1f} s allowed: compute less, share it in a fixture, "
+            "or mark it statistical (runs in CI) or slow (runs on demand)",
+            pytrace=False,
+        )
+    return result
+
+
+_LIMIT = pytest.StashKey[float]()
+
+
+def _reference() -> float:
+    """Processor time of a fixed piece of work, half in Python and half in NumPy [s]."""
+    start = time.process_time()
+    sum(i * i for i in range(100_000))
+    matrix = np.ones((200, 200))
+    for _ in range(10):
+        matrix = np.tanh(matrix @ matrix / 200)
+    return time.process_time() - start
+
+
+def _processor_time() -> float:
+    """Of this process and of those that it has started and seen to their end [s]."""
+    return time.process_time() + sum(os.times()[2:4])
 
 
 @pytest.fixture

@@ -99,6 +99,7 @@ def test_normal_equations_with_a_motion_have_the_cost_they_say(scene_maker, rng)
         assert_allclose(-(there - back) / (4 * step), gradient, rtol=5e-3, atol=5e-3 * np.linalg.norm(direction))
 
 
+@pytest.mark.statistical
 def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
     ratios, sizes = [], []
     for seed in range(6):
@@ -152,6 +153,7 @@ def test_pairs_that_were_synchronised_have_no_motion():
         assert asked.problem.motion.turn < 0.5e-3
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("seed", [404, 416])
 def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
     plan = laboratory.Plan(seed)
@@ -172,6 +174,7 @@ def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
     assert any("synchronised" in text for text in both.warnings)
 
 
+@pytest.mark.statistical
 def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
     ratios, sizes = [], []
     for seed in range(12):

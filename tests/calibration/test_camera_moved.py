@@ -77,6 +77,7 @@ def test_a_camera_that_was_moved_twice_leaves_three_stretches(rig):
     assert told(found)[0].count(" on the cameras stand otherwise") == 2
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("motion", [{}, {"shift": 1e-3, "turn": 1e-3}, {"correlation": 0.6}])
 def test_cameras_that_stood_still_are_not_said_to_have_moved(motion):
     for seed in range(4):

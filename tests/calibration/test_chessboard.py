@@ -118,6 +118,7 @@ def test_opencv_corners_at_the_usual_window_are_worse(board_drawer):
     assert error[0] < 0.5 * error[1]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     "optical_blur", [0.02, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.slow)]
 )
@@ -223,6 +224,7 @@ def test_an_image_too_large_for_the_rough_search_loses_nothing(board_drawer):
     assert_allclose(find_corners(large, (9, 6)).points - offset, find_corners(image, (9, 6)).points, atol=1e-4)
 
 
+@pytest.mark.statistical
 def test_squares_of_150_px_are_as_well_located_by_a_small_first_window(board_drawer, monkeypatch):
     board, camera = Board((4, 3), 8e-3), Camera(2400.0, 2410.0, 519.0, 403.0, (0.0,) * 5, (1040, 800))
     R, t = pose(board, (12.0, 9.0, 7.0), distance=0.13)
@@ -244,6 +246,7 @@ def test_squares_of_150_px_are_as_well_located_by_a_small_first_window(board_dra
     assert np.sqrt(np.mean(pull**2)) < 1.6  # 24 numbers
 
 
+@pytest.mark.statistical
 def test_squares_of_seven_pixels_are_found_where_opencv_stops(sample_clip):
     """The sample's views at 100 x 100: both finders 15 of 36, and each corner lies where the whole image has it."""
     views = [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in sorted(sample_clip.glob("calibration/*/*.png"))]

@@ -47,6 +47,7 @@ def motion(folder, *words, **environment):
     return int(n), *(np.array(line.split(), float) for line in found)
 
 
+@pytest.mark.statistical
 @pytest.mark.skipif("x86_64-unknown-linux" not in llvm.get_process_triple(), reason="code for Linux, x86-64")
 @pytest.mark.parametrize("environment", LEVELS)
 def test_where_the_code_that_ships_fits_nothing_is_compiled_and_motions_are_those_of_any_level(environment, tmp_path):
@@ -165,6 +166,7 @@ print(len(told), *rows[0])
 """
 
 
+@pytest.mark.statistical
 def test_kept_code_that_was_cut_off_is_made_anew_and_kept(tmp_path):
     def run():
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}

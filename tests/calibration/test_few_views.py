@@ -33,15 +33,18 @@ def mean_square(n, distortion="auto", board="auto", rigs=16, displaced=None):
 
 
 # 1.7, 1.2, 1.1; where terms were chosen for each set of views by its held-out error: 2.4, 2.7, 2.0
+@pytest.mark.statistical
 @pytest.mark.parametrize(("n", "most"), [(3, 2.0), (5, 1.5), (8, 1.4)])
 def test_few_views_are_off_by_what_they_state(n, most):
     assert 0.5 < mean_square(n)[0] < most
 
 
+@pytest.mark.statistical
 def test_terms_that_are_left_out_make_sigmas_too_small():
     assert mean_square(8, "k1")[0] > 2.0
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("size", "least", "most"), [(1.0, 0.2, 1.2), (0.0, 0.5, 1.4)])
 def test_a_board_that_is_told_to_be_flat_and_is_not_is_in_the_sigmas(rng, size, least, most):
     smooth = board_basis(BOARD.points, "warped") * 0.1 * np.array([3e-3, 3e-3, 3e-3, 1e-3, 1e-3])  # half a board: 0.1 m

@@ -41,6 +41,7 @@ def rec_a_calibration(shared_data):
     return calibrate_stereo(left, right, Board((9, 6), 8e-3), table_view=0, board_thickness=3e-3)
 
 
+@pytest.mark.statistical
 def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     (left, right), reference = opencv_photographs
     found = calibrate_from_corners(left, right, Board((9, 6), 25e-3))
@@ -81,6 +82,7 @@ def test_halves_of_the_opencv_photographs_agree_within_what_each_states(opencv_p
     assert 0.5 < np.mean(ratios) < 2
 
 
+@pytest.mark.statistical
 def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
     (left, right), reference = opencv_photographs
     found = calibrate_from_corners(left, right, Board((9, 6), 25e-3), CalibrationSettings("k1 k2 p1 p2 k3", "flat"))
@@ -89,6 +91,7 @@ def test_opencv_photographs_with_the_board_taken_as_flat(opencv_photographs):
     assert found.assessment.inflation > 2  # a bent board shows as views that disagree
 
 
+@pytest.mark.statistical
 def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
         truth = read_rig_group(file["rig"])
@@ -124,6 +127,7 @@ def vector_of(R):
     return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
+@pytest.mark.statistical
 def test_rec_a_lab_frame_is_where_the_views_suggest(rec_a_calibration):
     found = rec_a_calibration
     assert found.rms_px < 0.01  # located to 0.003 px per axis by the corners' own noise

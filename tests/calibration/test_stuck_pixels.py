@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 from numpy.testing import assert_array_equal
 
 from calibration import Board, CornerView, calibrate_stereo, find_corners
@@ -56,6 +57,7 @@ def test_neighbouring_stuck_pixels_do_not_stand_in_for_each_other(rng):
     assert np.all(images[0][mask] < 120)
 
 
+@pytest.mark.statistical
 def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_clip, tmp_path, rng):
     folder, where = sample_clip / "calibration", {}
     views = {}
@@ -86,6 +88,7 @@ def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_cli
         assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1e-3
 
 
+@pytest.mark.statistical
 def test_pixels_that_do_not_see_are_replaced_in_colour_views_and_in_arrays(sample_clip, rng):
     views, notes = {}, {}
     for side in ("left", "right"):

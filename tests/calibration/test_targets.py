@@ -138,6 +138,7 @@ def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
         find_charuco(image, CharucoBoard((9, 6), 12e-3, 8.5e-3, "4X4"))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("light", [(25.0, 215.0), (215.0, 25.0)], ids=["dark", "light"])
 @pytest.mark.parametrize("grid", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
 def test_circles_are_located_where_their_centres_are_not_their_ellipses(grid, light, rng):
@@ -157,6 +158,7 @@ def test_circles_are_located_where_their_centres_are_not_their_ellipses(grid, li
     assert np.sqrt(np.mean(nearest**2) / 2) > 0.03
 
 
+@pytest.mark.statistical
 def test_a_lens_that_bends_the_grid_does_not_shift_its_circles(rng):
     """k1 = -0.25 over 30 deg: the circles' images are bent by what shifts a round template by 0.02 px."""
     R, t = pose(SYMMETRIC, (10, -20, 0), distance=0.22)
@@ -232,6 +234,7 @@ AS_CHARUCO = 'target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm 
 AS_CIRCLES = 'target = "asymmetric_circles"\ncircles = [4, 11]\nspacing_mm = 8.0'
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("target", "declared"), [(CHARUCO, AS_CHARUCO), (ASYMMETRIC, AS_CIRCLES)], ids=["charuco", "circles"]
 )
@@ -306,6 +309,7 @@ def searched(monkeypatch):
     return shapes
 
 
+@pytest.mark.statistical
 def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_declared_one_is_not(board_drawer, searched):
     camera = Camera(2800.0, 2800.0, 500.0, 370.0, (0.0,) * 5, (1000, 750))
     board, R = Board((9, 6), 8e-3), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]

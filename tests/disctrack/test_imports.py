@@ -29,6 +29,7 @@ def run(code: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.statistical
 def test_physics_imports_no_image_file_or_plot_library():
     block = "import sys\n" + "".join(f"sys.modules[{name!r}] = None\n" for name in FORBIDDEN)
     done = run(block + "".join(f"import disctrack.{module}\n" for module in PHYSICS))
@@ -47,6 +48,7 @@ def test_importing_the_package_loads_nothing_heavy():
         assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
+@pytest.mark.statistical
 def test_a_measurement_waits_for_no_part_of_scipy():
     """Each takes from a tenth to half a second: more than following the disc through the sample recording."""
     stages = "disctrack.calibrate.stage, disctrack.track.stage, disctrack.track.overlay, disctrack.analyse.declaration"
@@ -131,6 +133,7 @@ def dependencies() -> dict[tuple[str, str], set[str]]:
     return found
 
 
+@pytest.mark.statistical
 def test_folders_ask_only_for_what_stands_above_them():
     step = {name: i for i, names in enumerate(STAIRS) for name in names}
     upwards = {}
@@ -174,6 +177,7 @@ def test_no_file_asks_for_one_that_asks_for_it():
         asked = {name: others for name, others in asked.items() if name not in free}
 
 
+@pytest.mark.statistical
 def test_a_public_class_has_a_name_of_its_own():
     """Plan, Motion or Found say nothing where two things bear the name; each example speaks its own language."""
     places: dict[str, list[str]] = {}

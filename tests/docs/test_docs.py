@@ -81,6 +81,7 @@ def run_shell(block: str, folder: Path) -> None:
     assert done.returncode == 0, f"{lines}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("page", RUN, ids=names(RUN))
 def test_short_blocks_run(page, workplace, monkeypatch):
     monkeypatch.chdir(workplace)
@@ -270,6 +271,7 @@ def test_a_wrong_option_or_block_would_be_noticed(workplace):
         run_shell("disctrack simulate no-such-scene.toml", workplace)
 
 
+@pytest.mark.statistical
 def test_an_editor_knows_the_types_of_the_recipes(tmp_path):
     """All of the page as one script, checked as strictly as mypy can, from outside the project."""
     pytest.importorskip("mypy")

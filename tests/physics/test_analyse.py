@@ -96,6 +96,7 @@ def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_giv
     assert_allclose(stopped.contact.circle.radius, free.contact.circle.radius, atol=2e-5)
 
 
+@pytest.mark.statistical
 def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analysed):
     """Seen in a mirror (y -> -y) psi runs backwards, and nothing else changes."""
     q = late.q * np.array([1, -1, 1, -1, 1, -1])
@@ -158,6 +159,7 @@ def test_lying_flat_everything_about_precession_is_unknown_not_wrong(true_motion
     assert not np.isfinite(analysis.contact.onset.time)
 
 
+@pytest.mark.statistical
 def test_disc_that_floats_is_noticed(late, analysed):
     """A table frame 50 um too low: the lowest point of the edge does not lie on the table."""
     q = late.q.copy()
@@ -227,6 +229,7 @@ def test_report_is_not_overwritten_unasked(tmp_path, late):
     assert (tmp_path / "trajectory_analysis" / "report.html").read_text() == "mine"
 
 
+@pytest.mark.statistical
 def test_rest_that_was_left_out_costs_nothing_and_changes_no_number(tmp_path, late, analysed):
     """The same motion in the middle of a recording ten times as long, of which the rest was not tracked."""
     long = at_full_length(replace(late, time=late.time - late.time[0] + 1.8), 10 * len(late), 1800)

@@ -55,6 +55,7 @@ def mean_ratio(name, seeds, true_motion, as_tracked):
     return {quantity: np.mean([f[quantity] for f in found]) for quantity in QUANTITIES}
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", MOTIONS)
 def test_squared_error_is_near_the_predicted_variance(name, true_motion, as_tracked):
     # smoothed noise is correlated over 20 frames: a copy holds 100 values and scatters by 15 %, the mean of 4 by 8 %
@@ -107,6 +108,7 @@ def test_amplitude_of_an_oscillation_is_kept(frequency, true_motion, as_tracked,
         assert abs(gain - 1) < 0.005
 
 
+@pytest.mark.statistical
 def test_gap_is_bridged_with_honest_sigma(true_motion, as_tracked):
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
     gap = np.r_[300:320]
@@ -122,6 +124,7 @@ def test_gap_is_bridged_with_honest_sigma(true_motion, as_tracked):
         assert 0.3 < np.mean([f[quantity] for f in found]) < 2.0
 
 
+@pytest.mark.statistical
 def test_ends_are_included_with_honest_sigma(true_motion, as_tracked):
     truth = true_motion(theta_deg=9, duration=3.0)[-400:]
     ends = np.r_[0:8, 392:400]
@@ -164,6 +167,7 @@ def test_disc_at_rest_has_no_velocity_beyond_its_sigma(true_motion, as_tracked, 
     assert np.isnan(propagate(motion, rates).value[:, 0]).all()
 
 
+@pytest.mark.statistical
 def test_euler_rates_come_with_honest_sigma_that_grows_as_the_disc_flattens(true_motion, as_tracked):
     truth = true_motion(theta_deg=9, duration=3.0)[-700:]
     ratios = []
@@ -239,6 +243,7 @@ def test_time_that_runs_backwards_is_an_error(true_motion, as_tracked, rng):
         differentiate(as_tracked(replace(truth, time=time), rng))
 
 
+@pytest.mark.statistical
 def test_what_repeats_in_the_poses_is_carried_to_the_rates(true_motion, as_tracked, rng):
     """A smooth error with the stated variance and pace: of pose and rates within their stated sigma, chi-square."""
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:300]

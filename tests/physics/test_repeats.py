@@ -259,6 +259,7 @@ def test_files_are_grouped_averaged_and_what_cannot_be_used_is_listed(compared):
     assert compared.tables[0].averages["n_theta"].n == 4
 
 
+@pytest.mark.statistical
 def test_page_tables_and_figures_say_the_same_as_the_comparison(compared, tmp_path):
     written = write(compared, tmp_path)
     page = written.page.read_text()

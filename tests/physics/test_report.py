@@ -29,6 +29,7 @@ def reported(tmp_path_factory, true_motion, as_tracked):
     return run_analyse(path, folder / "out", figures=True)
 
 
+@pytest.mark.statistical
 def test_report_needs_nothing_else(reported):
     page = reported.report.read_text()
     references = re.findall(r'(?:src|href)="([^"]{0,40})', page)
@@ -39,6 +40,7 @@ def test_report_needs_nothing_else(reported):
     assert "<script" not in page
 
 
+@pytest.mark.statistical
 def test_report_says_what_was_found(reported):
     page = reported.report.read_text()
     laws = reported.analysis.scaling.laws
@@ -51,6 +53,7 @@ def test_report_says_what_was_found(reported):
     assert not re.search(r"\bnan\b", re.sub(r"base64,[^\"]*", "", page))
 
 
+@pytest.mark.statistical
 def test_every_figure_is_there_as_png_and_pdf(reported):
     names = {path.stem for path in reported.figures}
     for number in ("04", "05", "06", "07", "08", "09", "10", "11", "12", "13", "14", "15", "16"):
@@ -84,6 +87,7 @@ def share_of_blue(picture: np.ndarray) -> float:
     return float(np.mean(np.abs(picture.astype(int) - BLUE_BGR).max(axis=2) < 12))
 
 
+@pytest.mark.statistical
 def test_report_shows_its_figures_in_a_browser(reported, tmp_path):
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:

@@ -361,6 +361,7 @@ def test_motion_agrees_with_the_world_vector_integration(name, tolerance):
     assert_allclose(motion.q[:, 3:], expected[:, 3:], atol=tolerance * 30)
 
 
+@pytest.mark.statistical
 def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one():
     """The oracle's table moves as the load on a rigid one would let it sink: the same to first order in c."""
     effects = (CATALOGUE["km"](k_m=4e-8), CATALOGUE["centre_of_mass"](c_1=1e-3, c_2=-5e-4, c_3=3e-4))
@@ -396,6 +397,7 @@ class _Creeping(newton_euler.Disc):
         return self
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("c", "film", "least", "most"), [(1e-3, 2e-3, 0.0, 1e-4), (0.02, 1.0, 0.01, 0.025), (0.02, 2e-3, 0.0, 1e-3)]
 )

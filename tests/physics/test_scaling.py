@@ -48,6 +48,7 @@ def of_motion(truth):
     return truth.time, truth.euler[:, 0], truth.euler[:, 1], truth.rates[:, 0], E
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("nutation", [0.05, 0.2])
 @pytest.mark.parametrize("n", [1 / 3, 1 / 2, 2 / 3])
 def test_known_exponents_lie_in_their_confidence_interval(n, nutation):

@@ -64,6 +64,7 @@ def in_this_process(monkeypatch):
     monkeypatch.setattr("disctrack.batch.run.run_here", run_here)
 
 
+@pytest.mark.statistical
 def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short_recording, tmp_path, capsys):
     root = tmp_path / "day"
     for name in ("r2", "r10"):
@@ -104,6 +105,7 @@ def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short
     assert all(name in page for name in rows)
 
 
+@pytest.mark.statistical
 def test_the_same_command_goes_on_where_something_was_wrong_and_nowhere_else(recording, tmp_path, in_this_process):
     root = tmp_path / "day"
     copy_of(recording, root / "r1")
@@ -126,6 +128,7 @@ def one(recording):
     return job
 
 
+@pytest.mark.statistical
 def test_what_counts_is_content_not_existence(one, recording):
     assert stage.do(one).status == "measured"
     results = recording / "results"
@@ -215,6 +218,7 @@ def test_an_unexpected_fault_of_one_is_its_own(recording, tmp_path, monkeypatch)
     assert "out of memory" in a.record.reason
 
 
+@pytest.mark.statistical
 def test_the_summary_is_that_of_all_shards(recording, tmp_path, in_this_process):
     root = tmp_path / "day"
     for name in ("a", "b", "c"):
@@ -250,6 +254,7 @@ def test_ctrl_c_in_the_diagnosis_of_all_keeps_the_summary_and_its_page_is_named(
     assert "batch_results/together/diagnosis.html" in said
 
 
+@pytest.mark.statistical
 def test_a_summary_tells_of_declarations_that_changed_since(recording, tmp_path, capsys, in_this_process):
     file = copy_of(recording, tmp_path / "day" / "a") / "recording.toml"
     command = ["batch", str(tmp_path / "day"), *FAST]

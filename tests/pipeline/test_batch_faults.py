@@ -146,6 +146,7 @@ def kill_at_random_instants(
     return died
 
 
+@pytest.mark.statistical
 def test_a_batch_killed_at_a_random_instant_leaves_only_whole_results_and_can_go_on(recording, tmp_path, undisturbed):
     died = kill_at_random_instants(recording, tmp_path, undisturbed, ("a",), kills=1, duration=0.8)
     assert sum(died.values()) == 1
@@ -163,6 +164,7 @@ def test_a_batch_killed_at_fifty_instants_leaves_only_whole_results_and_can_go_o
     assert len(died) > 1  # kills fell into different stages of a batch
 
 
+@pytest.mark.statistical
 def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_path):
     day = a_day(recording, tmp_path / "day", tuple("abcdefgh"))  # more than are done while this process looks
     process = start(day)
@@ -178,6 +180,7 @@ def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_pat
     assert statuses["not measured"] > 0
 
 
+@pytest.mark.statistical
 def test_a_killed_worker_is_tried_again_and_a_deadly_recording_fails_alone(day, monkeypatch):
     begin, deaths = processes.Worker.begin, {"a": 2, "b": 1}  # how often the process is killed
 
@@ -241,6 +244,7 @@ def dask_cluster(tmp_path):
         process.wait()
 
 
+@pytest.mark.statistical
 @_OF_ANOTHER_PROJECT
 def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(dask_cluster, day, monkeypatch):
     address, workers = dask_cluster

@@ -20,6 +20,7 @@ from disctrack.trajectory.file import read_findings, read_trajectory
 QUICK = ["--no-figures", "--no-video"]
 
 
+@pytest.mark.statistical
 def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys):
     results = tmp_path / "results"
     assert main(["run", str(short_recording), "-o", str(results), "--csv"]) == 0
@@ -135,6 +136,7 @@ def test_the_result_does_not_depend_on_the_number_of_reading_threads(recording, 
     np.testing.assert_array_equal(one.q, three.q)
 
 
+@pytest.mark.statistical
 def test_calibrate_without_a_recording(shared_data, tmp_path, capsys):
     folder = shared_data / "opencv_stereo_chessboard"
     path = tmp_path / "rig.h5"

@@ -210,6 +210,7 @@ def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsy
     assert "left 04.png" in message
 
 
+@pytest.mark.statistical
 def test_other_corners_than_declared_are_named_once_for_all_views(short_recording, tmp_path, capsys):
     shutil.copytree(short_recording / "calibration", tmp_path / "calibration", copy_function=os.link)
     shutil.copy(short_recording / "recording.toml", tmp_path)
@@ -235,6 +236,7 @@ def test_a_table_view_that_is_damaged_or_not_there(short_recording, tmp_path, ca
     assert "table view" in message
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("corners", ["8x6", "12x9"])
 def test_a_wrong_board_geometry(short_recording, tmp_path, capsys, corners):
     views = short_recording / "calibration"
@@ -309,6 +311,7 @@ def start(*words, **environment) -> subprocess.Popen:
     )
 
 
+@pytest.mark.statistical
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
 @pytest.mark.parametrize(
     "delay", [1.0, pytest.param(0.3, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow)]

@@ -65,6 +65,7 @@ def test_group_holds_the_moment_and_force_that_were_missing(diagnosed):
     assert np.sqrt(np.mean((moment[:, 0] / sigma[:, 0]) ** 2)) > 3  # m g 0.1 mm = 0.2 mN m tips the disc
 
 
+@pytest.mark.statistical
 def test_what_was_found_supplies_the_missing_force(diagnosed):
     """Two routes: accelerations of the poses without a model, and the force of the enlarged model."""
     result = diagnose_trajectory(read_trajectory(diagnosed[0]), separate=False)
@@ -117,6 +118,7 @@ def test_enlarged_model_simulates_the_measured_motion(diagnosed):
     assert "centre_of_mass" in tree["motion"]["rolling"]["effects"]
 
 
+@pytest.mark.statistical
 def test_against_the_enlarged_model_nothing_is_missing(diagnosed, tmp_path):
     model = str(diagnosed[1] / "model.toml")
     assert main(["diagnose", str(diagnosed[0]), "--model", model, "-o", str(tmp_path / "again")]) == 0

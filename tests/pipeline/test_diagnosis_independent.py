@@ -50,6 +50,7 @@ def tilted(slope, direction):
     return {"gravity": (G * x, G * y, -G * np.sqrt(1 - slope**2))}, {"table_tilt": {"tilt_x": x, "tilt_y": y}}
 
 
+@pytest.mark.statistical
 def test_a_tilted_table_in_images_of_an_independent_motion_is_found_and_sized(tmp_path):
     scene = small_scene(41, 70, 300.0)
     changes, truth = tilted(0.0061, 2.0)

@@ -71,6 +71,7 @@ def test_a_folder_of_any_name_gets_a_declaration_that_can_be_read(tmp_path):
     assert tomllib.loads((folder / "recording.toml").read_text())["name"] == folder.name
 
 
+@pytest.mark.statistical
 def test_init_takes_the_rest_from_an_earlier_recording_of_the_same_disc(sample_clip, tmp_path):
     folder = linked(sample_clip, tmp_path / "clip")
     (folder / "recording.toml").unlink()
@@ -116,6 +117,7 @@ def test_folders_behind_links_are_looked_into_once(tmp_path):
     assert found == {("left/*.png", "right/*.png"), ("calibration/left/*.png", "calibration/right/*.png")}
 
 
+@pytest.mark.statistical
 def test_check_names_the_file_of_a_view_that_is_not_used(sample_clip, tmp_path, capsys):
     folder = linked(sample_clip, tmp_path / "clip")
     views = sorted((folder / "calibration/right").glob("*.png"))
@@ -191,6 +193,7 @@ def checked(folder: Path, capsys) -> tuple[int, str]:
     return code, re.sub(r"\s+", " ", capsys.readouterr().out)
 
 
+@pytest.mark.statistical
 def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, capsys):
     assert main(["check", str(sample_clip), "-o", str(tmp_path / "check.png")]) == 0
     told = capsys.readouterr().out

@@ -100,6 +100,7 @@ def test_deep_video_gives_the_poses_of_its_grey_values(recording, from_png):
     assert (np.abs(found.q - from_png.q) <= 1e-5 * from_png.coordinate_sigma).all()
 
 
+@pytest.mark.statistical
 def test_chessboard_views_in_one_file_per_camera_give_the_same_rig(short_recording, tmp_path):
     model = ["--distortion", "k1 k2 p1 p2", "--board", "flat", "--no-figures"]
     recording = tmp_path / "recording"

@@ -52,6 +52,7 @@ def frames_of(folder: Path) -> np.ndarray:
     return np.concatenate([b.images.copy() for b in iter_pair_blocks(pairs.left, pairs.right, 0, FRAMES)])
 
 
+@pytest.mark.statistical
 def test_rig_and_poses_are_those_of_two_cameras_to_the_last_bit(halves, sample_clip, tmp_path):
     np.testing.assert_array_equal(frames_of(halves), frames_of(sample_clip))
     for folder, result in ((halves, "one"), (sample_clip, "two")):
@@ -103,6 +104,7 @@ def test_a_wrong_part_is_told(parts, told, halves, sample_clip, tmp_path):
         open_pairs(read_recording(tmp_path))
 
 
+@pytest.mark.statistical
 def test_init_sees_two_views_in_each_image_and_only_there(halves, sample_clip, tmp_path, capsys):
     for name in ("frames", "views"):
         shutil.copytree(halves / name, tmp_path / "both" / name)

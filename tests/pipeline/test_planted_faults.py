@@ -113,6 +113,7 @@ MIRRORED = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("said", MIRRORED)
 def test_images_mirrored_since_the_calibration_are_named(clip, said):
     images = np.ascontiguousarray(MIRRORED[said](clip.images[:8]))
@@ -123,6 +124,7 @@ def test_images_mirrored_since_the_calibration_are_named(clip, said):
     assert said in told
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("scale", "said"),
     [
@@ -176,6 +178,7 @@ def test_dots_declared_by_a_ruler_are_located_as_those_declared_right(clip):
     assert np.sqrt(np.nanmean(pulled**2)) < 5e-5  # 2.3e-3 by templates at the declared places; noise is 2e-3
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("shift", "diameter", "said"), [(0.5, 1.0, "centres_mm = [["), (0.0, 0.5, "diameter_mm is")])
 def test_dots_declared_too_far_off_to_be_followed_are_told(clip, shift, diameter, said):
     """Places by a ruler, or half the diameter: no dot fits the template, and the error says what to declare."""
@@ -198,6 +201,7 @@ CAMERA_MOVED = {  # turn [deg] about its own axes, shift [mm]
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("motion", CAMERA_MOVED)
 def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion):
     turn, shift = np.radians(CAMERA_MOVED[motion][0]), 1e-3 * np.array(CAMERA_MOVED[motion][1])
@@ -214,6 +218,7 @@ def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion)
     assert abs(float(found[2]) - 1e3 * np.linalg.norm(shift)) < 4.5
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("turn_deg", [0.05, 0.1])
 def test_a_camera_turned_a_little_is_one_fault_and_not_a_trembling_table_too(clip, turn_deg):
     """Poses do scatter there, as now this, now that dot is struck: named once, by its cause."""
@@ -240,6 +245,7 @@ def test_no_camera_is_said_to_have_moved_where_none_did(clip):
     assert moved_camera(clip.images[::4], clip.rig, clip.disc) == ""
 
 
+@pytest.mark.statistical
 def test_blobs_at_random_are_no_disc_of_any_kind(clip, rng):
     """Neither a camera that moved nor other dots are read into pictures of something else."""
     for _ in range(15):
@@ -314,6 +320,7 @@ def test_after_a_hand_the_disc_is_found_at_once(clip):
     assert (status[20:] == FrameStatus.MEASURED).all()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["nothing", "another layout"])
 def test_a_recording_without_the_disc_ends_soon_and_says_so(clip, kind):
     n, disc = 300, clip.disc

@@ -89,6 +89,7 @@ def test_the_rest_of_the_recording_is_as_without_the_trouble(name):
     assert np.all(np.abs(np.mean(error[rest], axis=0)) < 5 * noise / np.sqrt(rest.sum()))
 
 
+@pytest.mark.statistical
 def test_four_pixels_of_defocus_cost_noise_and_nothing_else():
     found, error, sigmas = filmed("four pixels of defocus", 6)
     assert np.all(found.trajectory.frame_status == FrameStatus.MEASURED)

@@ -40,6 +40,7 @@ def summary(outcome):
     return outcome[0]
 
 
+@pytest.mark.statistical
 def test_own_calibration_keeps_the_papers_claim(summary):
     """With a quarter of the paper's pixels; for all but psi and phi, which 1/sin(theta) spoils."""
     for rows in summary.rows.values():
@@ -49,6 +50,7 @@ def test_own_calibration_keeps_the_papers_claim(summary):
     assert complaints(summary) == ()
 
 
+@pytest.mark.statistical
 def test_every_pose_that_two_cameras_see_is_found_without_a_prior(summary):
     two, one, none = summary.sights
     assert (two.found, two.gross) == (two.n, 0)
@@ -56,6 +58,7 @@ def test_every_pose_that_two_cameras_see_is_found_without_a_prior(summary):
     assert one.gross == none.gross == 0
 
 
+@pytest.mark.statistical
 def test_noise_covariance_is_honest(outcome):
     """Normalised squared error of 50 poses through the true cameras: chance allows 1 +- 0.08 (one sigma)."""
     trial = outcome[1][0]
@@ -64,11 +67,13 @@ def test_noise_covariance_is_honest(outcome):
     assert abs(pooled.value - 1) < 4 * pooled.uncertainty
 
 
+@pytest.mark.statistical
 def test_calibration_covariance_is_honest_for_one_rig(summary):
     """One rig has six degrees of freedom: chi-square / 6 exceeds 3.7 once in a thousand rigs."""
     assert summary.calibration_consistency.value < 3.7
 
 
+@pytest.mark.statistical
 def test_scatter_is_near_the_cramer_rao_bound(summary):
     """At most 1.5 times the bound; and no method is better than it (three standard errors)."""
     e = summary.efficiency
@@ -77,6 +82,7 @@ def test_scatter_is_near_the_cramer_rao_bound(summary):
     assert np.all(e.bound_image <= e.bound * (1 + 1e-9))  # more pixels never tell less
 
 
+@pytest.mark.statistical
 def test_reported_sigma_is_the_scatter(summary):
     """Position and rotation of 4 poses x 7 degrees of freedom x 3 axes: an rms of 84 numbers is good to 8 %."""
     e = summary.efficiency
@@ -85,6 +91,7 @@ def test_reported_sigma_is_the_scatter(summary):
         assert 0.7 < ratio < 1.35
 
 
+@pytest.mark.statistical
 def test_psi_and_phi_follow_one_over_sine(summary):
     e = summary.efficiency
     low = np.degrees(e.q[:, 4]) < 10
@@ -94,6 +101,7 @@ def test_psi_and_phi_follow_one_over_sine(summary):
     assert 1 < summary.law_limit_deg(1) < summary.law_limit_deg(2) < 15
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("number", range(6))
 def test_planted_fault(summary, number):
     control = summary.controls[number]
@@ -101,12 +109,14 @@ def test_planted_fault(summary, number):
     assert control.must_be_noticed == (number >= 2)
 
 
+@pytest.mark.statistical
 def test_faults_are_noticed_by_the_measurement_itself(summary):
     """Without the truth: by warnings, refined dots, or the rim's distance from the table."""
     for control in summary.controls:
         assert bool(control.alarms) == control.must_be_noticed, control
 
 
+@pytest.mark.statistical
 def test_verdict_tells_the_numbers_and_files_are_whole(outcome, tmp_path):
     summary, trials = outcome
     files = write_validation(tmp_path, summary, trials, 1.0)
@@ -120,6 +130,7 @@ def test_verdict_tells_the_numbers_and_files_are_whole(outcome, tmp_path):
     assert sum(file.suffix == ".png" for file in files) == 2
 
 
+@pytest.mark.statistical
 def test_a_biased_calibration_turns_the_verdict(outcome):
     """Negative control of the summary: 20 um added to the measured heights."""
     _, (trial,) = outcome
@@ -229,6 +240,7 @@ def test_full_validation_over_many_rigs(tmp_path):
     assert rows["rotation"].total.rms < np.radians(3e-3)
 
 
+@pytest.mark.statistical
 def test_command_prints_the_verdict_and_tells_of_failed_checks(outcome, tmp_path, monkeypatch, capsys):
     """The measurement itself is that of the other tests."""
     monkeypatch.setattr("disctrack.validate.run.validate", lambda plan, **_: outcome)

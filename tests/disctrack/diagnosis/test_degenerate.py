@@ -37,6 +37,7 @@ class SquareBesidePower:
         return residual[:, None] / 3e-4, columns
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("inside", [0.0, 0.003])  # up to half a standard deviation of a
 def test_an_exponent_beside_a_law_at_its_bound(inside):
     """Where the other law comes to stand at zero the profile of the exponent has a kink."""

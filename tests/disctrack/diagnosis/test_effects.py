@@ -38,6 +38,7 @@ def system_of(trajectory, model="paper", candidates=None):
 ALWAYS = {"table tilt 0.35 deg", "centre of mass 0.1 mm off", "right camera 0.25 ms late"}
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", [n if n in ALWAYS else pytest.param(n, marks=pytest.mark.slow) for n in HIDDEN])
 def test_a_hidden_effect_is_found_named_and_sized(name):
     planted, faults, names = HIDDEN[name]
@@ -58,6 +59,7 @@ def test_a_hidden_effect_is_found_named_and_sized(name):
     assert result.before.ratio_to_floor > 1.5
 
 
+@pytest.mark.statistical
 def test_nothing_is_found_where_nothing_is_hidden():
     result = diagnose_trajectory(measured(seed=4))
     assert result.diagnosis.verdict == "nothing missing"
@@ -68,6 +70,7 @@ def test_nothing_is_found_where_nothing_is_hidden():
     assert abs(k_m.values["km.k_m"] - 0.381e-7) < 4 * k_m.sigma("km.k_m")
 
 
+@pytest.mark.statistical
 def test_a_thickness_within_its_tolerance_is_no_effect():
     """0.03 mm off in height, 2 sigma of what a caliper may err by and 20 of a micrometer's."""
     trajectory = measured({"contact_height.h_error": 3e-5}, seed=8, n=200, declared_rate=500.0)
@@ -79,6 +82,7 @@ def test_a_thickness_within_its_tolerance_is_no_effect():
     assert abs(after.values["contact_height.h_error"] - 3e-5) < 4 * after.sigma("contact_height.h_error") < 3e-5
 
 
+@pytest.mark.statistical
 def test_two_effects_are_found_together():
     hidden = {"table_tilt.tilt_x": 0.002, "kz.k_z": 2e-5}
     result = diagnose_trajectory(measured(hidden, seed=6, n=250, declared_rate=500.0))
@@ -88,6 +92,7 @@ def test_two_effects_are_found_together():
         assert abs(result.diagnosis.after.values[key] - value) < 4 * result.diagnosis.after.sigma(key)
 
 
+@pytest.mark.statistical
 def test_a_camera_that_turned_is_told_from_an_effect_of_the_motion():
     turned = Faults(right=CameraFault(rotation_deg=(0.02, 0.0, 0.0)))
     result = diagnose_trajectory(measured(faults=turned, seed=8, n=250, declared_rate=500.0))
@@ -154,6 +159,7 @@ def test_the_recording_proposed_to_separate_two_effects_separates_them():
     assert not again.diagnosis.found[0].cannot_be_told_from
 
 
+@pytest.mark.statistical
 def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     result = diagnose_trajectory(measured(faults=Faults(frame_rate_hz=1004.0), seed=14, n=300))
     (found,) = result.diagnosis.found

@@ -75,6 +75,7 @@ def test_a_saved_model_looks_at_the_disc_as_the_cameras_did(short, tmp_path):
     assert np.abs(rig.project(points) - short.rig.project(points)).max() < 20
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("faults", "name"),
     [
@@ -99,6 +100,7 @@ def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_pat
     assert second.diagnosis.verdict == "nothing missing", second.sentence  # ... and known
 
 
+@pytest.mark.statistical
 def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
     from tests.disctrack.diagnosis.test_starts import sliding
 

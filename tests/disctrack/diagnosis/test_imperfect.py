@@ -75,6 +75,7 @@ def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
     assert not systematic_of(measured(seed=3, n=200)).present
 
 
+@pytest.mark.statistical
 def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
     trajectory, _ = recording(seed=5)
     result = diagnose_trajectory(trajectory, separate=False)

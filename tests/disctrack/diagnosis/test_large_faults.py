@@ -43,6 +43,7 @@ def test_poses_with_the_fault_agree_again():
     assert np.isnan(in_step(late, 3e-3)[:3, 1]).all()  # nothing was seen before the first frame
 
 
+@pytest.mark.statistical
 def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
     result = diagnose_trajectory(measured(unseen=Unseen(clock=1.0), seed=1, n=200), separate=False)
     (found,) = result.diagnosis.found

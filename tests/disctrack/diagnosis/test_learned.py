@@ -35,6 +35,7 @@ def hiding(name: str, component: str, formula: str, size: float, **options):
     return measured({f"{name}.k": size}, laws=[effect_from_formulas(name, {component: formula})], **options)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "component", "formula", "size", "locked"),
     [
@@ -76,6 +77,7 @@ def test_the_moment_of_what_was_found_is_the_missing_one():
     assert min(of_all[0], of_all[2]) > 3  # there is something to agree on
 
 
+@pytest.mark.statistical
 def test_missing_moment_is_the_hidden_one():
     """The true course of the moment lies within the band: pulls of order one, and the band is narrow."""
     trajectory = hiding("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z", 1e-6, seed=7, n=400)
@@ -180,6 +182,7 @@ def test_an_effect_beside_a_law_is_claimed_only_if_no_form_of_the_law_may_do_as_
     assert stage._beside_any_form(replace(diagnosis, found=(known,)), [known], bent, 0.0)[0].found == ()
 
 
+@pytest.mark.statistical
 def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     """A spring that grows as the distance: from no spring at all nothing is near, beside a linear one its law is read.
 

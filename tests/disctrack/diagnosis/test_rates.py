@@ -44,6 +44,7 @@ def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
         assert abs(found.values[key] - value) < 4 * found.sigma(key), key
 
 
+@pytest.mark.statistical
 def test_a_trial_tells_what_became_of_the_hidden_effect():
     verdict = trial([hidden_effect("time_offset")], [1e-4], seed=3)
     assert verdict.named
@@ -56,6 +57,7 @@ def test_a_trial_tells_what_became_of_the_hidden_effect():
     assert verdict.stands_out == pytest.approx(np.sqrt(verdict.gain), abs=4)
 
 
+@pytest.mark.statistical
 def test_an_effect_below_its_sigma_is_not_asked_for():
     """A hundredth of what is found leaves a bound; two that the recording cannot tell apart do so, however large."""
     faint = trial([hidden_effect("time_offset")], [1e-7], seed=3)
@@ -66,12 +68,14 @@ def test_an_effect_below_its_sigma_is_not_asked_for():
     assert not alike.can_be_told
 
 
+@pytest.mark.statistical
 def test_a_trial_without_an_effect_finds_nothing():
     verdict = trial([], [], seed=4)
     assert verdict.verdict == "nothing missing"
     assert verdict.found == ()
 
 
+@pytest.mark.statistical
 def test_an_effect_stands_out_by_what_its_refit_gains():
     """The power curve's prediction, of a linearisation without the effect, is the gain of a fit with it."""
     effect, seed = hidden_effect("table_tilt"), 6

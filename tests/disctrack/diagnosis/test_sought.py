@@ -40,6 +40,7 @@ def test_an_exponent_is_not_looked_for():
     assert starts("rolling_power", {}, 60) == []
 
 
+@pytest.mark.statistical
 def test_what_a_flat_does_along_a_motion_nearby_is_known_and_what_gains_too_little_is_left(monkeypatch):
     """Round the rim 48 derivatives; along a motion that is micrometres away they do as well."""
     system, candidate, values = fitted("rim_flat", {"rim_flat.depth": 1e-5, "rim_flat.angle": 0.4}, 60)

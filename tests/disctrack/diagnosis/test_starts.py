@@ -83,6 +83,7 @@ def assert_nothing_is_claimed(result):
     assert abs(fit.values["km.k_m"] - K_M) < 4 * fit.sigma("km.k_m")
 
 
+@pytest.mark.statistical
 def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
     motion, n = sliding(0.2, (0.08, 0.04)), 220
     result = diagnose_trajectory(measured(motion=motion, seed=41, n=n))
@@ -99,6 +100,7 @@ def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
     assert f"until {end:.3f}"[:-1] in note
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n", [300, pytest.param(900, marks=pytest.mark.slow)])
 def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
     """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within 1e6 steps."""
@@ -113,6 +115,7 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
     assert sigma < 0.002 / 0.06
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("effects", [{"table_tilt.tilt_x": 5e-3}, {"kz.k_z": 3e-4}, {"slip.mu": 0.1}])
 def test_what_rolls_at_first_does_not_begin_in_slip(effects):
     trajectory = measured(effects, seed=100, n=150, theta_deg=20.0)
@@ -121,6 +124,7 @@ def test_what_rolls_at_first_does_not_begin_in_slip(effects):
     assert not slip_start._slips_slowly(Settings(), system)
 
 
+@pytest.mark.statistical
 def test_slip_to_the_end_of_the_recording_is_found_too():
     result = diagnose_trajectory(measured(motion=sliding(0.2, (0.2, 0.1)), seed=42, n=70))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
@@ -173,6 +177,7 @@ def test_slip_that_no_coefficient_describes_is_left_out_and_said_so():
     assert result.system.rows.start > 50
 
 
+@pytest.mark.statistical
 def test_dots_off_centre_are_not_taken_for_slip():
     """They give the contact a velocity all the time: pattern_offset or its class, not slip."""
     result = diagnose_trajectory(measured(faults=Faults(pattern_offset_mm=(1.0, 0.0)), seed=45, n=150))

@@ -119,6 +119,7 @@ def test_an_effect_without_a_derivative_hinders_no_judgement(rng):
     assert list(apart(system, found, 0.005, candidates=system.candidates)) == [7]
 
 
+@pytest.mark.statistical
 def test_difference_in_an_effect_is_a_chi_square_and_names_nobody_by_chance(rng):
     falls, false = [], 0
     for _ in range(40):
@@ -215,6 +216,7 @@ ROOT = Path(__file__).parents[3]
 FOUR = ("mass", "radius", "thickness", "density of the air")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n", [4, 8, 20])
 def test_of_a_law_that_is_the_same_for_all_no_dependence_is_told(rng, n):
     """Four covariates that have nothing to do with it: 200 draws, one in a hundred by chance."""

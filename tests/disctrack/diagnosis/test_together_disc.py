@@ -95,6 +95,7 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
     assert "more than once" in capsys.readouterr().err
 
 
+@pytest.mark.statistical
 def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagnosed(tmp_path, capsys):
     for seed in range(2):
         trajectory = measured(seed=50 + seed, n=60, theta_deg=5.0 + seed, declared_rate=RATE, rig_seed=RIG)

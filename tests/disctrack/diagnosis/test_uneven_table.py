@@ -19,6 +19,7 @@ STEP = {"direction": 0.9, "edge": 0.045, "length": 4e-3}  # as UNKNOWN["seam"], 
 HILL = {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}  # as UNKNOWN["bump"], of 30 um
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "title", "shape", "amount"),
     [

@@ -44,6 +44,7 @@ def of(data):
     return chance(linear, score_all(linear, system.candidates), 1.0, draws=1000)
 
 
+@pytest.mark.statistical
 def test_the_probability_is_uniform_where_nothing_is_missing(rng):
     found = [of(rng.standard_normal(120)) for _ in range(250)]
     p = np.array([c.p_value for c in found])

@@ -154,6 +154,7 @@ def test_a_number_that_nothing_in_its_run_shows_stays_as_it_is(answer):
     assert fitted.sigma("c") > answer.diagnosis.before.sigma("c")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("per", ["", "run"])
 def test_parameters_that_cannot_be_parted_are_told_beside_own_numbers(rng, per):
     """Mass and stiffness of oscillators, shared or each one's own: one of them is held."""
@@ -167,6 +168,7 @@ def test_parameters_that_cannot_be_parted_are_told_beside_own_numbers(rng, per):
     assert held in (("m",), ("s",))
 
 
+@pytest.mark.statistical
 def test_derivatives_need_no_more_columns_for_more_runs(rng):
     """What makes the cost linear: 40 runs with 160 numbers of their own, five columns."""
     runs = swings(rng, 40, 30)
@@ -192,6 +194,7 @@ def test_a_run_that_is_kept_back_as_a_whole_judges(rng):
     assert answer.before["x"].held_out > 1.1 * answer.after["x"].held_out
 
 
+@pytest.mark.statistical
 def test_of_many_runs_some_tell_a_gain_of_the_wrong_sign_and_the_others_follow(rng, monkeypatch):
     """No problem is larger than 80 initial states; a third of the runs have theirs fitted afterwards."""
     time, runs = np.arange(80) * 0.05, []
@@ -215,6 +218,7 @@ def test_of_many_runs_some_tell_a_gain_of_the_wrong_sign_and_the_others_follow(r
     assert misfit(system, values) < 0.02
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("fault", ["", "shaken", "noisy"])
 def test_a_run_that_does_not_fit_the_others_is_named(rng, fault):
     """What shakes one run of twelve, or a sensor three times as noisy there; else none is named."""

@@ -51,6 +51,7 @@ def test_noise_with_a_memory_is_measured(rng):
     assert found.memory == pytest.approx(truth.memory, rel=0.3)
 
 
+@pytest.mark.statistical
 def test_quadratic_drag_is_named_and_sized_where_heights_are_good(rng):
     found = analyse_drops(drops(rng, 2e-3, lambda per_cd, t: fallen(t, 0.5 * per_cd)))
     assert found.together.verdict == "found"
@@ -73,6 +74,7 @@ def test_quadratic_drag_is_named_and_sized_where_heights_are_good(rng):
     assert_allclose(seen["rubber,2"].seen[:, 0], h + 1e-3 * (h - 30) ** 2, atol=1e-7)
 
 
+@pytest.mark.statistical
 def test_free_fall_lacks_nothing(rng):
     for smooth in (0.0, 0.15):
         found = analyse_drops(drops(rng, 0.05, lambda per_cd, t: -GRAVITY * t**2 / 2, smooth))
@@ -80,6 +82,7 @@ def test_free_fall_lacks_nothing(rng):
         assert all(d.verdict == "nothing missing" for d in found.alone.values())
 
 
+@pytest.mark.statistical
 def test_the_drag_of_these_balls_is_certain_and_its_form_is_not_identifiable(answer):
     assert answer.together.verdict == "found"
     assert answer.together.diagnosis.before.reduced_chi_square == pytest.approx(13.23, abs=0.01)
@@ -92,6 +95,7 @@ def test_the_drag_of_these_balls_is_certain_and_its_form_is_not_identifiable(ans
     assert worse["quadratic_drag",] > 50
 
 
+@pytest.mark.statistical
 def test_errors_on_the_second_drops_are_those_that_others_found(answer):
     """Medians of the published data by least squares, as listed in PROVENANCE.md to 0.01 m."""
     reference = {
@@ -106,6 +110,7 @@ def test_errors_on_the_second_drops_are_those_that_others_found(answer):
         assert np.median(list(found.forecast.values())) == pytest.approx(forecast, abs=0.03)
 
 
+@pytest.mark.statistical
 def test_heavy_balls_lack_nothing_and_light_ones_lack_drag(answer):
     for name in ("Bowling Ball", "Golf Ball", "Baseball"):
         assert answer.alone[name].verdict == "nothing missing"
@@ -114,6 +119,7 @@ def test_heavy_balls_lack_nothing_and_light_ones_lack_drag(answer):
         assert answer.alone[name].found[0].endswith("_drag")
 
 
+@pytest.mark.statistical
 def test_shuffled_residuals_of_the_balls_give_no_finding(answer, rng):
     shuffled = []
     for stretch, seen in answer.together.predicted(answer.together.diagnosis.after):
@@ -125,6 +131,7 @@ def test_shuffled_residuals_of_the_balls_give_no_finding(answer, rng):
     assert not ask(shuffled, answer.noise, (*DRAG, *OTHERS)).found
 
 
+@pytest.mark.statistical
 def test_command_writes_the_diagnosis_and_a_figure(shared_data, tmp_path, capsys, monkeypatch, answer):
     monkeypatch.setattr("disctrack.examples.ball_drop.analyse_drops", lambda drops: answer)
     words = [str(shared_data / "ball_drop"), "-o", str(tmp_path)]

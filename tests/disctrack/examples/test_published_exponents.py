@@ -145,6 +145,7 @@ def fits_of_the_class(found):
     return fits | {r.candidate.name: r.fit for f in found.found for r in f.cannot_be_told_from}
 
 
+@pytest.mark.statistical
 def test_a_planted_bias_of_t_f_is_found_in_its_class_and_sized(published):
     """Sixteen trials per surface with the published scatter: something is missing for sure, and t_f may be it."""
     truth = ExponentSystem(published).start | {"t_f.bias": -0.012}
@@ -175,6 +176,7 @@ def test_nothing_is_claimed_where_nothing_was_planted(published, rng):
     assert not found.found
 
 
+@pytest.mark.statistical
 def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(published):
     """Each lowers chi-square by more than noise reaches (14.7 for one number), to within 1.7 sigma per surface."""
     system = ExponentSystem(published)
@@ -191,6 +193,7 @@ def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(p
     assert_allclose(explained[0].fit.values["t_f.bias"], -0.0103, atol=5e-4)  # 50 times the 0.2 ms that are stated
 
 
+@pytest.mark.statistical
 def test_effects_that_cannot_bend_the_law_are_refused_on_the_published_trials(published):
     """Something is missing there, but none of these is: offered alone they gain less than noise may."""
     system = ExponentSystem(published, ("kz", "theta_zero", "rolling_classical", "edge_radius", "smoothing"))

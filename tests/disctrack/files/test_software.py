@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import calibration
 import disctrack
 
@@ -18,6 +20,7 @@ def run(code: str, home: Path) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.statistical
 def test_a_result_counts_only_for_the_sources_that_made_it(tmp_path):
     for package in (calibration, disctrack):
         home = Path(package.__file__).parent
@@ -40,6 +43,7 @@ def test_a_result_counts_only_for_the_sources_that_made_it(tmp_path):
         first = changed
 
 
+@pytest.mark.statistical
 def test_a_compiled_loop_is_compiled_anew_when_what_it_calls_in_another_file_has_changed(tmp_path):
     inner = "from calibration.compiled import njit\n\n@njit\ndef f(x):\n    return x + {}\n"
     outer = (

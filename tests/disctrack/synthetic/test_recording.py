@@ -85,6 +85,7 @@ def dot_offsets_px(folder, camera_index, expected_px):
 NOISE_PX = 0.06
 
 
+@pytest.mark.statistical
 def test_recording_round_trip(scene, tmp_path):
     truth = synthetic.write_recording(tmp_path / "r", scene)
     recording = read_recording(tmp_path / "r")

@@ -35,6 +35,7 @@ def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch,
     assert folder in said[0]
 
 
+@pytest.mark.statistical
 def test_compiling_is_announced_and_slow_loading_is_not(capsys, tmp_path):
     file, told = tmp_path / "loops.py", []
     for source in ("def twice(x):\n    return 2 * x\n", "def twice(x):\n    return x + x\n"):

@@ -244,6 +244,7 @@ def test_photon_transfer_finds_the_sensors_law(rendered_pairs):
     assert_allclose(law.variance(np.array([25.0, 185.0])), SENSOR_NOISE.variance(np.array([25.0, 185.0])), rtol=0.05)
 
 
+@pytest.mark.statistical
 def test_dots_of_a_flat_target_need_only_a_homography(rng):
     """Analytic image: area of a blurred disc by its exact radial profile, sampled 12 x 12 per pixel."""
     H = np.array([[11.0, 0.6, 30.0], [-0.4, 10.2, 33.0], [2e-3, -3e-3, 1.0]])

@@ -158,6 +158,7 @@ def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
         read_recording(tmp_path)
 
 
+@pytest.mark.statistical
 def test_theta_is_that_of_mid_exposure(measured, rendered_pairs):
     q, runs = measured
     expected = -9.81 * EXPOSURE**2 / (6 * rendered_pairs.disc.radius)  # steady precession, exposure.py
@@ -170,6 +171,7 @@ def test_theta_is_that_of_mid_exposure(measured, rendered_pairs):
     assert np.mean(errors[2]) == pytest.approx(0.0, abs=4 * sigma)  # nobody tells
 
 
+@pytest.mark.statistical
 def test_the_smear_tells_the_exposure(measured):
     _, (none, told, smeared, wrong) = measured
     assert smeared.findings["exposure_s"] == pytest.approx([EXPOSURE, EXPOSURE], rel=0.1)
@@ -196,6 +198,7 @@ def test_a_blur_that_changes_with_obliqueness_is_no_exposure(motion, rendered_pa
     assert np.sqrt(found.value) == pytest.approx(200e-6, rel=0.02)
 
 
+@pytest.mark.statistical
 def test_no_smear_where_nothing_was_smeared(rendered_pairs, motion):
     """Negative control: the same motion frozen at mid exposure, and as an exposure too short to be seen."""
     q, qdot = motion
@@ -209,6 +212,7 @@ def test_no_smear_where_nothing_was_smeared(rendered_pairs, motion):
         assert run.findings["notes"] == []
 
 
+@pytest.mark.statistical
 def test_noise_hardly_grows(measured):
     without, *corrected = (run.trajectory for run in measured[1][:3])
     for each in corrected:

@@ -163,6 +163,7 @@ def test_h5py_finds_units_axes_and_whole_chunks(file):
         assert meanings[h5["status"][3]] == "unreadable"
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
 def test_xarray_opens_root_and_groups_with_their_axes(file, trajectory, engine):
     xarray = pytest.importorskip("xarray")
@@ -383,6 +384,7 @@ def run_python(code: str, folder, *arguments) -> subprocess.Popen:
     )
 
 
+@pytest.mark.statistical
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of file sizes are POSIX")
 def test_a_file_cut_off_by_the_system_is_removed(file, trajectory):
     """The kernel itself refuses the write after 20 kB, as a full disk does."""
@@ -463,6 +465,7 @@ def test_a_truncated_file_is_refused_wherever_it_is_cut(tmp_path, whole_content,
     assert not is_result_of(path, PROVENANCE)
 
 
+@pytest.mark.statistical
 @_fuzz
 @given(
     keys=st.lists(

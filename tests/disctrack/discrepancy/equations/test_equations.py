@@ -92,6 +92,7 @@ def test_noise_of_known_memory_and_numbers_of_a_group_of_runs(rng):
         diagnose(equations, replace(runs[0], groups={}), [terms.coulomb("v")])
 
 
+@pytest.mark.statistical
 def test_sensitivities_are_those_of_another_integrator(rng):
     equations = Equations(
         {"x": "v", "v": "-k*x - c*v*abs(v) + g*push"}, {"k": 9.0, "c": 0.1, "g": Parameter(2.0, per="run")},
@@ -200,6 +201,7 @@ def test_a_mass_matrix_is_solved():
     assert within(answer, "g", 9.81)
 
 
+@pytest.mark.statistical
 def test_noise_that_remembers_is_no_effect_and_widens_sigmas():
     """An autoregression of 0.9: for its white share alone the sigmas would be four times too small."""
     x, pulls, claims = swinging(lambda x, v: 0.0), [], 0
@@ -217,6 +219,7 @@ def test_noise_that_remembers_is_no_effect_and_widens_sigmas():
     assert np.sqrt(np.mean(np.square(pulls))) < 2.0  # of five standard normals: exceeded once in 10 000
 
 
+@pytest.mark.statistical
 def test_many_times_the_declared_noise_is_no_noise_whatever_it_remembers():
     x = swinging(lambda x, v: 0.0)
     white = np.random.default_rng(1).standard_normal(len(TIME) + 100)
@@ -231,6 +234,7 @@ def test_many_times_the_declared_noise_is_no_noise_whatever_it_remembers():
         assert ("no sensor's noise" in answer.diagnosis.reason) == (verdict == "unexplained")
 
 
+@pytest.mark.statistical
 def test_parameters_may_be_off_by_a_factor_of_two(rng):
     time = np.arange(0, 40, 0.02)
     angle = motion(lambda t, y: [y[1], -64 * np.sin(y[0]) - 0.05 * y[1]], [1.2, 0.0], time)[0]
@@ -241,6 +245,7 @@ def test_parameters_may_be_off_by_a_factor_of_two(rng):
     assert within(answer, "k", 64.0)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("learns", [False, True])
 def test_a_motor_that_runs_up_at_a_limited_current_is_not_led_astray(rng, monkeypatch, learns):
     """Its first part tells neither number, and a model without the limit fits that best with both a thousandfold.
@@ -322,6 +327,7 @@ def test_friction_in_the_joint_of_a_chaotic_double_pendulum_is_named(rng):
     assert any("stretches" in note for note in answer.notes)
 
 
+@pytest.mark.statistical
 def test_what_no_term_describes_is_unexplained():
     noise = SIGMA * np.random.default_rng(7).standard_normal(len(TIME))
     pushed = motion(
@@ -332,6 +338,7 @@ def test_what_no_term_describes_is_unexplained():
     assert answer.verdict == "unexplained"
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("learns", [False, True])
 def test_sigmas_hold_where_what_is_left_lasts_as_long_as_the_run(monkeypatch, learns):
     """Two turns with a slow force that no term describes: one block of residual says nothing about its own scatter.
@@ -436,6 +443,7 @@ def snippets():
     return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
+@pytest.mark.statistical
 def test_every_snippet_of_the_documentation_runs(capsys):
     scope: dict = {}
     for code in snippets():
@@ -486,6 +494,7 @@ def test_an_input_that_is_held_moves_what_was_at_rest():
     assert answer.sigmas["tau"] < 1e-3
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("k", [4e4, 4e6])
 def test_a_ball_that_bounces_on_a_stiff_contact(rng, k):
     """What the contact moves begins at a kink; the stiffer one is as short as jumps are smoothed at first."""
@@ -526,6 +535,7 @@ def tank():
     return equations, Run(time, {"level": y + 2e-3 * rng.standard_normal(len(time))}, inputs={"pump": pump(time)})
 
 
+@pytest.mark.statistical
 def test_what_sets_in_within_a_run_is_found_beside_a_term_that_names_the_channel(tank):
     """The overflow moves nothing before it begins: its derivative starts from nought at a kink."""
     equations, run = tank
@@ -537,6 +547,7 @@ def test_what_sets_in_within_a_run_is_found_beside_a_term_that_names_the_channel
     assert within(answer, "overflow.top", 2.3)
 
 
+@pytest.mark.statistical
 def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(tank):
     """The strongest line of a driven motion may be the slowest: how fast the data change is told by their memory."""
     equations, run = tank
@@ -657,6 +668,7 @@ def test_a_friction_that_holds_is_integrated_with_its_sensitivities():
         assert_allclose(derivative[..., i], expected, atol=0.01 * np.abs(expected).max())
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("friction", [0.8, 0.0])
 def test_friction_that_holds_an_arm_at_rest_is_found(rng, friction):
     """It sticks for half of the record: 100 s and no answer by the explicit method alone."""
@@ -723,6 +735,7 @@ def slowly_pushed(rng):
     return x, run, diagnose(Equations({"x": "v", "v": "-k*x"}, {"k": 8.0}), run, offered)
 
 
+@pytest.mark.statistical
 def test_a_law_of_time_is_learned_beside_a_known_friction(rng):
     _, _, answer = slowly_pushed(rng)
     assert set(answer.found) == {"viscous_v", "learned"}
@@ -766,6 +779,7 @@ LIMITED = {  # by term: what becomes of the input, what else acts, and the numbe
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", LIMITED)
 def test_limits_are_looked_for_along_the_motion(name, rng):
     """What saturates, sticks or strikes does so beyond a value that nobody declared; all are offered each time."""
@@ -813,6 +827,7 @@ def test_a_held_input_that_acts_late_is_found(late, rng):
         assert answer.sigmas["delay_u.tau"] < 1e-3
 
 
+@pytest.mark.statistical
 def test_a_search_that_takes_long_tells_what_would_make_it_shorter(monkeypatch, capfd):
     """Ten times as many samples of a turn as tell anything; a patience of no time stands in for a minute."""
     time = 0.001 * np.arange(4000)
@@ -856,6 +871,7 @@ def test_one_of_two_inputs_that_acts_late_is_integrated_exactly(rng, hold, late)
         assert_allclose(derivative[..., i], by_difference, atol=1e-3 * np.abs(by_difference).max())
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("top", [6.0, 60.0])
 def test_a_tank_that_runs_over_into_another_that_alone_is_seen(top):
     """Two tanks after a public benchmark, in small steps with levels that are cut off; the upper one is not seen."""
@@ -888,6 +904,7 @@ def test_a_tank_that_runs_over_into_another_that_alone_is_seen(top):
     assert within(answer, "k3", 0.055)
 
 
+@pytest.mark.statistical
 def test_a_number_of_the_equations_may_have_the_name_of_a_terms_own(rng):
     """A gain that is handed to a library term means the equations' number, whatever the term calls its own."""
     time = 0.02 * np.arange(800)
@@ -904,6 +921,7 @@ def test_a_number_of_the_equations_may_have_the_name_of_a_terms_own(rng):
     assert {s.name for s in found.rates[1].free_symbols} >= {"k", "term1_k", "term1_b"}
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_a_sensor_that_lags_shows_the_rest_before_the_first_sample_where_that_is_said(rng, at_rest):
     """A heater is switched on at the first sample: what went on before it is not the heated motion run backwards."""
@@ -923,6 +941,7 @@ def test_a_sensor_that_lags_shows_the_rest_before_the_first_sample_where_that_is
         assert answer.after["T"].rms > 10 * sigma
 
 
+@pytest.mark.statistical
 def test_a_gain_of_the_wrong_sign_is_passed_through_nought(rng):
     """A valve that drives a resonance: Gauss-Newton ends where with a gain of nought nothing moves."""
     time = np.arange(600) * 0.05
@@ -980,6 +999,7 @@ def test_single_samples_far_off_are_told(rng, wrong):
     assert all("run1 at 20 s, run1 at 55 s" in note for note in told)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("friction", [1.2, 0.0])
 def test_a_friction_that_stops_an_arm_is_led_to_over_growing_windows(rng, friction):
     """Under a sensor that wanders a little; from a motion without friction no step leads to one that stops."""
@@ -1024,6 +1044,7 @@ DRAGS = {  # by case: force on the fall, what is claimed, and seed, duration [s]
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("drag", DRAGS)
 def test_terms_that_undo_each_other_are_not_named(drag):
     """Drag by eddy currents falls with speed: springs and drags a hundred times gravity make it with opposite signs."""
@@ -1048,6 +1069,7 @@ def test_terms_that_undo_each_other_are_not_named(drag):
     assert len(same) == len(claimed)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("ratio", "place"), [(10, 0.25), (10, 0.1), (2, 0.25), (0, 0.0)])
 def test_a_stop_many_times_stiffer_than_the_spring_is_found(rng, ratio, place):
     """The model loses the motion at the first blow: other terms lead on, and are nothing beside the stop."""

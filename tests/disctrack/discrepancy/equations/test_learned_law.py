@@ -55,6 +55,7 @@ def recorded(force, seed):
 QUICK = ("a drag that saturates", "a spring of a table", "an odd friction", "a push by time")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in LAWS])
 def test_a_law_of_one_variable_is_learned(name):
     """Within 3 sigma of the true force nearly everywhere, on a course that it does not follow by being open."""
@@ -73,6 +74,7 @@ def test_a_law_of_one_variable_is_learned(name):
     assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", KNOWN)
 def test_known_terms_stay_named_where_they_act(name):
     force, names = KNOWN[name]
@@ -87,6 +89,7 @@ def test_known_terms_stay_named_where_they_act(name):
     assert_allclose(answer.law.force, answer.law.theirs, atol=5 * answer.law.sigma.max(), rtol=0)
 
 
+@pytest.mark.statistical
 def test_a_law_beside_a_known_term():
     """A wavy spring and a sensor whose zero drifts: neither alone is noise."""
     run = recorded(lambda x, v, t: -9 * np.sin(6 * x), seed=13)
@@ -97,6 +100,7 @@ def test_a_law_beside_a_known_term():
     assert abs(answer.values["drift_X.b"] - 0.01) < 3.5 * answer.sigmas["drift_X.b"]
 
 
+@pytest.mark.statistical
 def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
     """A cart whose friction saturates carries a pendulum; M and the law are those that the motion was made with."""
     time = np.arange(0, 8, 0.01)
@@ -126,6 +130,7 @@ def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
     assert abs(answer.values["M"] - 1) < 3.5 * answer.sigmas["M"]
 
 
+@pytest.mark.statistical
 def test_derivatives_of_a_law_are_those_of_its_motion():
     """By amplitudes and by the state, against differences of predictions."""
     run = recorded(lambda x, v, t: 0.0, seed=14)
@@ -146,6 +151,7 @@ def test_derivatives_of_a_law_are_those_of_its_motion():
         assert_allclose(derivative[..., 0, i], difference, atol=1e-3 * np.abs(difference).max(), rtol=0)
 
 
+@pytest.mark.statistical
 def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     variable, force = LAWS["a drag that saturates"]
     assert variable == "v"
