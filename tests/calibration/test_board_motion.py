@@ -139,6 +139,7 @@ def test_boards_that_were_held_still_count_for_more_than_those_that_moved():
     assert np.linalg.norm(error[[0, 1, 4, 5]]) < 1.5 * np.linalg.norm(alone[[0, 1, 4, 5]]) + 0.3
 
 
+@pytest.mark.statistical
 def test_pairs_that_were_synchronised_have_no_motion():
     for seed in range(3):
         rig = moved_boards.make_rig(seed)

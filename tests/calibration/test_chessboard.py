@@ -79,6 +79,7 @@ def lit(image, added, fall_off):
     return image * (1 - fall_off * np.hypot(x, y) / 400) + gleam
 
 
+@pytest.mark.statistical
 def test_added_light_shifts_no_corner(board_drawer, monkeypatch):
     board = Board((9, 6), 8e-3)
     R, t = pose(board, (10, 12, 7))
@@ -268,6 +269,7 @@ def test_an_empty_or_noisy_image_holds_no_board(rng):
         assert isinstance(find_corners(image, (9, 6)), BoardNotFound)
 
 
+@pytest.mark.statistical
 def test_a_dirty_corner_is_rejected_with_its_reason(board_drawer):
     board = Board((9, 6), 8e-3)
     R, t = pose(board)

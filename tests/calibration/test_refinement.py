@@ -155,6 +155,7 @@ def test_exact_corners_give_back_the_exact_rig(scene_maker, rng):
     assert_allclose(found.model.t_right_left, scene.model.t_right_left, atol=1e-9)
 
 
+@pytest.mark.statistical
 def test_the_minimum_is_the_one_that_scipy_finds(scene_maker, rng):
     scene = scene_maker(n_views=4, inner_corners=(5, 4))
     o = scene.observations(0.05, rng)

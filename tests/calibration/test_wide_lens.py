@@ -35,6 +35,7 @@ def corners(distortion, rng, n_views=14):
     return left, right
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("distortion", "named"), [(RATIONAL, True), (POLYNOMIAL, False)], ids=["rational", "polynomial"]
 )

@@ -29,7 +29,6 @@ def run(code: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
 
 
-@pytest.mark.statistical
 def test_physics_imports_no_image_file_or_plot_library():
     block = "import sys\n" + "".join(f"sys.modules[{name!r}] = None\n" for name in FORBIDDEN)
     done = run(block + "".join(f"import disctrack.{module}\n" for module in PHYSICS))
@@ -87,17 +86,29 @@ ROOMS_OF_DIAGNOSIS = {"disc": (), "pages": ("disc",), "trials": ("disc",)}
 
 
 @cache
+def statements(file: Path) -> list[ast.AST]:
+    """All imports, conditions and classes of a file."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    return [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom, ast.If, ast.ClassDef))]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sources_are_read_once() -> None:
+    for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
+        statements(file)
+
+
+@cache
 def imported(file: Path) -> set[str]:
     """Modules of ours that a file asks for, but for types."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
     for_types = {
         below
-        for node in ast.walk(tree)
+        for node in statements(file)
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
         for below in ast.walk(node)
     }
     found = set()
-    for node in ast.walk(tree):
+    for node in statements(file):
         if node in for_types:
             continue
         if isinstance(node, ast.Import):
@@ -133,7 +144,6 @@ def dependencies() -> dict[tuple[str, str], set[str]]:
     return found
 
 
-@pytest.mark.statistical
 def test_folders_ask_only_for_what_stands_above_them():
     step = {name: i for i, names in enumerate(STAIRS) for name in names}
     upwards = {}
@@ -177,14 +187,12 @@ def test_no_file_asks_for_one_that_asks_for_it():
         asked = {name: others for name, others in asked.items() if name not in free}
 
 
-@pytest.mark.statistical
 def test_a_public_class_has_a_name_of_its_own():
     """Plan, Motion or Found say nothing where two things bear the name; each example speaks its own language."""
     places: dict[str, list[str]] = {}
     for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
         if "examples" not in file.parts:
-            classes = [node for node in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(node, ast.ClassDef)]
-            for node in classes:
+            for node in (node for node in statements(file) if isinstance(node, ast.ClassDef)):
                 places.setdefault(node.name, []).append(file.name)
     assert {name: files for name, files in places.items() if len(files) > 1 and name[0] != "_"} == {}
 

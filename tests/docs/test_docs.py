@@ -263,6 +263,7 @@ def test_the_notebook_runs_and_its_last_lines_show_themselves(workplace, monkeyp
             assert len(repr(shown)) < 4000, cell
 
 
+@pytest.mark.statistical
 def test_a_wrong_option_or_block_would_be_noticed(workplace):
     assert commands_of("disctrack run x --no-such\n# disctrack nothing\ncat <<'END'\ndisctrack hidden\nEND\n") == [
         ["disctrack", "run", "x", "--no-such"]

@@ -117,6 +117,7 @@ def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analys
     assert_allclose(there.t_f, here.t_f, atol=1e-7)
 
 
+@pytest.mark.statistical
 def test_disc_at_rest_gives_no_rates_and_no_exponents(true_motion, as_tracked, rng):
     base = true_motion(theta_deg=9, duration=3.0)[:300]
     zero = np.zeros((300, 3))
@@ -169,6 +170,7 @@ def test_disc_that_floats_is_noticed(late, analysed):
     assert re.search(r"\+(49\.9|50\.[01]) um", said), said
 
 
+@pytest.mark.statistical
 def test_understated_noise_is_said(late):
     shy = replace(late, pose_covariance=late.pose_covariance / 9)
     texts = analyse(shy).warnings

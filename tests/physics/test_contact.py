@@ -83,6 +83,7 @@ def test_swapped_components_are_noticed(true_motion):
     assert np.abs(swapped - slip).max() > 0.3
 
 
+@pytest.mark.statistical
 def test_contact_quantities_are_honest_about_their_noise(true_motion, as_tracked):
     truth = true_motion(theta_deg=9, duration=3.0)[-700:]
     true = contact_quantities(exact(truth), MA_2014, 9.81)
@@ -121,6 +122,7 @@ def slip_to_roll():
     return simulate(model, start, 0.5)
 
 
+@pytest.mark.statistical
 def test_sliding_friction_is_measured_and_its_end_found(slip_to_roll, true_motion, as_tracked, rng):
     """Onset to 1 ms, path of slip to 0.1 %, coefficient of friction to 0.5 %, from poses with noise alone."""
     simulated = slip_to_roll

@@ -137,6 +137,7 @@ def test_ends_are_included_with_honest_sigma(true_motion, as_tracked):
         assert 0.6 < np.mean([f[quantity] for f in found]) < 1.6, quantity
 
 
+@pytest.mark.statistical
 def test_motion_across_a_gap_too_long_to_bridge_is_unknown(true_motion, as_tracked, rng):
     truth = true_motion(theta_deg=9, duration=3.0)[:600]
     motion = differentiate(as_tracked(truth, rng, missing=range(200, 400)))
@@ -195,6 +196,7 @@ def test_fast_spin_is_followed(true_motion, as_tracked, rng):
     assert_allclose(motion.omega_world, spin, atol=0.02)
 
 
+@pytest.mark.statistical
 def test_calibration_error_is_carried_as_one_common_error(true_motion, as_tracked, rng):
     """A rig parameter that turns and shifts all poses alike changes the found motion as the sensitivity says."""
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:300]

@@ -60,6 +60,7 @@ def test_steady_precession_rate(theta_deg, rate):
     assert_allclose(precession_rate(np.radians(theta_deg), MA_2014, 9.81)[0], rate, atol=0.006)
 
 
+@pytest.mark.statistical
 def test_energies_are_honest_about_their_noise(true_motion, as_tracked):
     truth = true_motion(theta_deg=9, duration=3.0)[-700:]
     true = exact(truth)

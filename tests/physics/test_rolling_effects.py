@@ -112,6 +112,7 @@ def test_compiled_law_equals_the_law_in_numpy(name, rng):
     assert np.abs(motion.contact_moment).max() + np.abs(motion.external_force).max() > 0
 
 
+@pytest.mark.statistical
 def test_a_new_effect_is_one_small_function():
     @effect("magnetic brake", "this test", EffectParameter("b", "N m s", 1e-6, "moment per rate", lower=0.0))
     def test_magnet(p, s, w):

@@ -118,6 +118,7 @@ def test_a_declared_exposure_that_no_header_confirms_is_told(recording, capsys):
     assert "exposure_us is 500, the left camera's header says 50 us" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.statistical
 def test_calibration_views_may_be_frames_of_one_file(short_recording, tmp_path, rig_file):
     """The same views as PNG files and as MRAW give the same rig."""
     text = (short_recording / "recording.toml").read_text()

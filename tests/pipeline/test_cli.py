@@ -101,6 +101,7 @@ def rested(recording) -> Path:
     return recording
 
 
+@pytest.mark.statistical
 def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, capsys):
     path = rested / "results" / "trajectory.h5"
     assert main(["run", str(rested), *QUICK]) == 0

@@ -92,6 +92,7 @@ def test_colour_images(recording, rng, capsys):
     assert "colour" in failure(capsys, "run", recording)
 
 
+@pytest.mark.statistical
 def test_grey_stored_as_colour_and_sixteen_bits_are_measured_and_said(recording, capsys):
     poses = []
     for change in (lambda g: g, lambda g: cv2.cvtColor(g, cv2.COLOR_GRAY2BGR), lambda g: g.astype(np.uint16) * 16):
@@ -143,6 +144,7 @@ def test_an_output_that_exists(recording, tmp_path, capsys):
     assert path.read_text() == "something dear"
 
 
+@pytest.mark.statistical
 def test_a_terminal_without_the_letters_of_a_name_does_not_end_the_work(tmp_path):
     """A scheduled job or an old log in ASCII: the name is told as escapes, the file is written."""
     scene = tmp_path / "scene.toml"

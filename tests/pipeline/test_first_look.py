@@ -156,6 +156,7 @@ def drawn(figure):
     return cv2.cvtColor(np.asarray(canvas.buffer_rgba())[..., :3].copy(), cv2.COLOR_RGB2GRAY), DPI / 25.4
 
 
+@pytest.mark.statistical
 def test_printed_dots_lie_where_they_are_declared():
     assert set(PAPERS_MM) == set(PAPERS)
     image, scale = drawn(dots_figure(MA_2014))

@@ -241,6 +241,7 @@ def test_cameras_that_are_one_frame_out_of_step_are_named_and_no_camera_has_move
     assert "moved" not in told
 
 
+@pytest.mark.statistical
 def test_no_camera_is_said_to_have_moved_where_none_did(clip):
     assert moved_camera(clip.images[::4], clip.rig, clip.disc) == ""
 

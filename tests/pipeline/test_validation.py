@@ -159,6 +159,7 @@ def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
     assert set(cameras_in_sight(q, rig, disc)) >= {1, 2}
 
 
+@pytest.mark.statistical
 def test_bound_from_images_equals_the_closed_form_for_a_shift_of_an_edge():
     """Along the optical axis's normal a flat bright disc tells of its shift what its edges' slopes tell.
 
@@ -199,6 +200,7 @@ def test_face_turned_away_tells_nothing():
     assert not dot_pixels(R_cw @ R, R_cw @ q[:3] + t_cw, rig.left, disc, rays).any()
 
 
+@pytest.mark.statistical
 def test_stress_finds_the_level_at_which_the_claim_fails():
     """Noise of a pixel: fails between the last level that holds and the first that does not, by its own record."""
     scene = scene_of(5, quick=True)
@@ -275,6 +277,7 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
     )  # 12 flat parts of some 100 pixels each
 
 
+@pytest.mark.statistical
 def test_exposure_shortens_the_nutation_by_the_law_of_the_mean(rng):
     """The mean over an exposure tau of an axis that precesses by a = psidot tau is shorter by a^2 / 24 sideways.
 

@@ -50,6 +50,7 @@ def test_a_shuffled_residual_of_the_disc_gives_no_finding():
     assert answer.found == ()
 
 
+@pytest.mark.statistical
 def test_a_camera_that_shakes_is_no_effect_of_the_motion():
     """Every frame of the right camera is shifted by 0.02 px, 3 sigma of a dot: a scatter that its dots share."""
     trajectory = measured(seed=12, n=200, declared_rate=500.0)
@@ -71,6 +72,7 @@ def test_independent_noise_has_no_common_modes():
     assert common_modes(system, fit(system, system.base, system.start())) is None
 
 
+@pytest.mark.statistical
 def test_before_the_base_fit_has_converged_nothing_is_attributed():
     """From a start whose motion ends before the recording there is no fit; from the measured poses there is."""
     system = system_of(measured({"table_tilt.tilt_x": 5e-4}, seed=11, n=100, declared_rate=500.0))

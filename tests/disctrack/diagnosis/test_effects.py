@@ -113,6 +113,7 @@ def test_a_wrong_effect_offered_alone_is_refused():
     assert answer.after.reduced_chi_square > 1.1
 
 
+@pytest.mark.statistical
 def test_derivatives_agree_with_differences_of_the_prediction():
     system = system_of(measured({"kz.k_z": 2e-5}, seed=12, n=80))
     base = fit(system, system.base, system.start())

@@ -197,6 +197,7 @@ def test_a_disc_that_is_held_and_stopped_is_diagnosed_in_between():
     assert sum("at rest or held" in text for text in result.notes) == 2
 
 
+@pytest.mark.statistical
 def test_a_disc_that_lies_flat_at_the_end_is_diagnosed_before_that():
     def lying(times):
         down = simulate(PAPER, start(2.0), times=np.r_[-1e-9, times], theta_end=np.radians(0.5)).q[1:]
@@ -209,6 +210,7 @@ def test_a_disc_that_lies_flat_at_the_end_is_diagnosed_before_that():
     assert any("lies flat" in text for text in result.notes)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     "frames", [np.arange(60, 120), np.arange(3, 40), np.flatnonzero(np.arange(200) % 3)], ids=["gap", "early", "many"]
 )
@@ -218,10 +220,12 @@ def test_lost_frames_claim_nothing(frames):
     assert any("no pose" in text or "cut off" in text for text in result.notes)
 
 
+@pytest.mark.statistical
 def test_one_camera_for_a_while_claims_nothing():
     assert_nothing_is_claimed(diagnose_trajectory(lost(measured(seed=49, n=150), np.arange(40, 110), camera=0)))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n", [45, 70, 100])
 def test_short_recordings_claim_nothing(n):
     assert_nothing_is_claimed(diagnose_trajectory(measured(seed=50 + n, n=n)))

@@ -157,6 +157,7 @@ def test_two_hidden_effects_are_both_named(rng):
     assert {f.candidate.name for f in answer.found} == {"damping", "hum"}
 
 
+@pytest.mark.statistical
 def test_noise_alone_raises_an_alarm_at_most_once_in_twenty(rng):
     alarms = sum(bool(diagnose(oscillator(rng), START).found) for _ in range(60))
     assert alarms <= 3  # the threshold promises one in a hundred

@@ -38,6 +38,7 @@ def drops(rng, sigma, law, smooth=0.0):
     ]
 
 
+@pytest.mark.statistical
 def test_noise_with_a_memory_is_measured(rng):
     truth = SmoothNoise(0.05, 0.2, 0.5)
     root = np.linalg.cholesky(truth.covariance(TIME))

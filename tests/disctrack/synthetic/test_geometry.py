@@ -147,6 +147,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
     assert_allclose(mass / 200, total, rtol=1e-4)
 
 
+@pytest.mark.statistical
 def test_edges_have_converged(rig):
     coarse, fine = (
         synthetic.expected_disc(POSES, rig, MA_2014, replace(PLAIN, render=replace(PLAIN.render, subpixels=s)))
@@ -155,6 +156,7 @@ def test_edges_have_converged(rig):
     assert np.abs(coarse - fine).max() < 0.1  # grey levels of 165
 
 
+@pytest.mark.statistical
 def test_chessboard_has_converged(rig):
     R, t = rotation_from_euler(0.4, 0.3, -0.2), np.array([0.002, 0.004, 0.012])
     coarse, fine = (

@@ -146,6 +146,7 @@ def test_faults_never_show_in_recording_toml(scene):
     assert synthetic.recording_toml(replace(scene, faults=faults)) == synthetic.recording_toml(scene)
 
 
+@pytest.mark.statistical
 def test_same_scene_gives_the_same_files_and_another_seed_another_rig(scene, tmp_path):
     first, second = (synthetic.write_recording(tmp_path / name, scene) for name in "ab")
     assert_array_equal(images(tmp_path / "a", "right"), images(tmp_path / "b", "right"))
@@ -181,6 +182,7 @@ def test_wrong_frame_rate_stretches_the_motion(scene, tmp_path):
     assert read_recording(tmp_path / "r").frame_rate == 1000.0
 
 
+@pytest.mark.statistical
 def test_turned_camera_shifts_its_picture_by_the_focal_length_times_the_angle(scene, tmp_path):
     turned = Faults(left=CameraFault(rotation_deg=(0.0, 0.1, 0.0)))  # to the right: the picture moves left
     shift = shift_of_faulty_dots(scene, tmp_path, turned, camera=0)
@@ -189,12 +191,14 @@ def test_turned_camera_shifts_its_picture_by_the_focal_length_times_the_angle(sc
     assert np.abs(shift[:, 1]).max() < 0.03
 
 
+@pytest.mark.statistical
 def test_moved_camera_shifts_its_picture_by_parallax(scene, tmp_path):
     moved = Faults(right=CameraFault(translation_mm=(0.5, 0.0, 0.0)))
     shift = shift_of_faulty_dots(scene, tmp_path, moved, camera=1)
     assert_allclose(shift[:, 0], -1.0, rtol=0.15)  # 0.5 mm at 0.5 mm per pixel, nearer dots more
 
 
+@pytest.mark.statistical
 def test_changed_lens_scales_the_picture(scene, tmp_path):
     shift = shift_of_faulty_dots(scene, tmp_path, Faults(left=CameraFault(focal_scale=1.01, k1_change=0.05)), camera=0)
     clean = synthetic.read_truth(tmp_path / "clean/truth.h5")
@@ -204,6 +208,7 @@ def test_changed_lens_scales_the_picture(scene, tmp_path):
     assert_allclose(shift, from_centre * (0.01 + 0.05 * r2), atol=0.01)
 
 
+@pytest.mark.statistical
 def test_misprinted_dots_and_pattern_off_centre_shift_together(scene, tmp_path):
     misprint = tuple((0.1 * k, -0.1) for k in range(6))
     faults = Faults(misprint_mm=misprint, pattern_offset_mm=(0.2, 0.3))

@@ -95,6 +95,7 @@ def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
     return np.array(expected), np.array(by_path), np.array(given)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("dark", "noise"), [(10000, NoiseModel(4e5, 0.0)), (5000, NoiseModel(1e4, 8.0))])
 def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     """Against dots drawn along the simulated motion (no renderer, no formula), found by their template."""

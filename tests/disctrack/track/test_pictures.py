@@ -71,6 +71,7 @@ def trajectory() -> Trajectory:
     )
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", sorted(plots.FIGURES))
 def test_every_figure_is_drawn_and_not_blank(trajectory, tmp_path, name):
     path = save_figure(plots.FIGURES[name](trajectory), tmp_path / f"{name}.png")

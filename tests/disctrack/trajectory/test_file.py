@@ -483,6 +483,7 @@ def test_a_file_without_some_of_its_parts_is_refused(tmp_path, whole_content, ke
         read_trajectory(path)
 
 
+@pytest.mark.statistical
 @_fuzz
 @given(data=st.data())
 def test_a_file_with_flipped_bytes_is_read_or_refused(tmp_path, whole_content, data):

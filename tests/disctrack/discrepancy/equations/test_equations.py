@@ -272,6 +272,7 @@ def test_a_motor_that_runs_up_at_a_limited_current_is_not_led_astray(rng, monkey
     assert 0.3 < answer.values["tau"] < 1.2
 
 
+@pytest.mark.statistical
 def test_a_sensor_off_its_zero_that_loses_the_motion_at_once_is_told(rng):
     time = np.arange(0, 12, 0.02)
     drive = np.cos(6.0 * time)
@@ -284,6 +285,7 @@ def test_a_sensor_off_its_zero_that_loses_the_motion_at_once_is_told(rng):
     assert "coulomb" not in told
 
 
+@pytest.mark.statistical
 def test_where_the_model_loses_the_motion_it_is_asked_in_stretches_and_then_as_a_whole(rng):
     """Hares and lynxes, the hares with a limit of their own that the equations do not know."""
     time = np.arange(0, 40, 0.2)
@@ -384,6 +386,7 @@ def test_a_forecast_goes_on_from_the_fitted_state(with_friction):
     assert np.abs(ahead - truth).max() < SIGMA
 
 
+@pytest.mark.statistical
 def test_parameters_that_cannot_be_parted_are_held_and_named():
     equations = Equations({"x": "v", "v": "-(stiffness/mass)*x"}, {"stiffness": 140.0, "mass": 1.0})
     noise = SIGMA * np.random.default_rng(2).standard_normal(len(TIME))
@@ -508,6 +511,7 @@ def test_a_ball_that_bounces_on_a_stiff_contact(rng, k):
     assert within(answer, "c", 15.0)
 
 
+@pytest.mark.statistical
 def test_where_derivatives_have_no_end_it_is_said(rng):
     """A tank that runs empty: the root of its level has no derivative there."""
     time = np.arange(0, 50, 0.1)
@@ -555,6 +559,7 @@ def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(tank):
     assert answer.verdict == "unexplained"
 
 
+@pytest.mark.statistical
 def test_a_term_whose_absence_led_the_fit_far_off_is_fitted_from_the_declared_values(rng):
     """A motor against dry friction of half its torque: without it the moment of inertia comes out sevenfold."""
     time = np.arange(0, 20, 0.02)
@@ -596,6 +601,7 @@ def test_an_input_held_for_an_hour_costs_a_step_a_sample(rng):
     assert steps < 1.1 * 3000  # 45 000 when the end of a step looked into the next piece
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("friction", [0.35, 0.0])
 def test_friction_that_ends_the_motion_within_few_turns_is_found_where_none_was_declared(friction):
     """Without it the model loses the data within a turn: a stretch shorter than that tells next to nothing."""
@@ -611,6 +617,7 @@ def test_friction_that_ends_the_motion_within_few_turns_is_found_where_none_was_
         assert answer.before["x"].held_out > 3 * answer.after["x"].held_out
 
 
+@pytest.mark.statistical
 def test_a_noisy_sensor_of_an_arm_at_rest_loses_nothing(rng):
     """Before the arm is pushed there is nothing but noise to follow."""
     time = 0.01 * np.arange(1200)
@@ -807,6 +814,7 @@ def test_limits_are_looked_for_along_the_motion(name, rng):
         assert within(answer, f"{name}.{number}", value)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("late", [0.03, 0.35, 0.0])
 def test_a_held_input_that_acts_late_is_found(late, rng):
     """A controller holds its output from sample to sample, 0.1 s; a third of one, or three and a half, is lost."""
@@ -961,6 +969,7 @@ def test_a_gain_of_the_wrong_sign_is_passed_through_nought(rng):
     assert all(within(answer, name, v) for name, v in {"k": -6, "l": 6, "e": 0.4, "c": 1.2, "s": 2}.items())
 
 
+@pytest.mark.statistical
 def test_few_samples_far_apart_of_a_reaction_whose_way_back_is_missing(rng):
     """Nine instants, from minutes to hours, of four substances: one of them shows little but what is missing.
 
@@ -1091,6 +1100,7 @@ def beyond_play(x, play):
     return x - np.clip(x, -play / 2, play / 2)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("play", "friction"), [(0.05, 0.0), (0.2, 0.0), (0.0, 0.0), (0.0, 0.15)])
 def test_play_of_a_spring_is_found_with_its_width(rng, play, friction):
     """Controls: neither nothing nor dry friction, which also takes more of small swings, is called a play."""
@@ -1108,6 +1118,7 @@ def test_play_of_a_spring_is_found_with_its_width(rng, play, friction):
         assert within(answer, "k", 49.0)
 
 
+@pytest.mark.statistical
 def test_play_of_a_coupling_acts_on_both_parts(rng):
     """Two driven parts of unequal mass; what the play takes from one is missing on the other, too."""
     time = 0.01 * np.arange(500)

@@ -263,6 +263,7 @@ def test_a_header_with_any_bytes_changed_is_read_or_refused(tmp_path, kind, bits
     opened_or_refused(tmp_path, header, images.nbytes)
 
 
+@pytest.mark.statistical
 @_fuzz
 @given(
     kind=st.sampled_from(["cih", "cihx"]),
