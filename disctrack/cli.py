@@ -18,6 +18,7 @@ from types import FrameType
 
 from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE, options
 from disctrack.files.software import __version__
+from disctrack.files.text import printable
 
 # The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
 # save. It must stand before numpy is loaded; a user's own setting is kept.
@@ -49,11 +50,11 @@ TRACEBACK_VARIABLE = "DISCTRACK_TRACEBACK"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. Errors are one line on stderr."""
     words = list(sys.argv[1:] if argv is None else argv)
-    with _interruptions() as interrupted:
-        return _answer(words, interrupted)
+    with _interruptions() as received:
+        return _answer(words, received)
 
 
-def _answer(words: Sequence[str], interrupted: threading.Event) -> int:
+def _answer(words: Sequence[str], received: Sequence[int]) -> int:
     try:
         _print_what_the_terminal_knows()
         _keep_compiled_loops_somewhere()
@@ -69,38 +70,42 @@ def _answer(words: Sequence[str], interrupted: threading.Event) -> int:
         with inputs_kept(), recorded_times():
             return int(command.run(arguments))
     except KeyboardInterrupt:
-        return _say_interrupted()
+        return _say_interrupted(received)
     except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
-        return _say_interrupted() if interrupted.is_set() else _tell(error)
+        return _say_interrupted(received) if received else _tell(error)
 
 
 @contextmanager
-def _interruptions() -> Iterator[threading.Event]:
-    """Set when Ctrl-C was pressed.
+def _interruptions() -> Iterator[list[int]]:
+    """Signals received: Ctrl-C, and what queueing systems and closed terminals send, all end a command in order.
 
     Compiled libraries that are struck while they are loaded turn KeyboardInterrupt into an error of their own, which
     would be told as ours.
     """
-    interrupted = threading.Event()
-    before = signal.getsignal(signal.SIGINT)
-    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
-        yield interrupted  # the caller decides what Ctrl-C does
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received  # signals are the main thread's
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        interrupted.set()
-        signal.default_int_handler(number, frame)
+        received.append(number)
+        raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, interrupt)
+    kinds = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {kind: signal.getsignal(kind) for kind in kinds}
+    heeded = [kind for kind in kinds if before[kind] in (signal.default_int_handler, signal.SIG_DFL)]
+    for kind in heeded:  # what the caller handles or, as nohup does, ignores, stays his
+        signal.signal(kind, interrupt)
     try:
-        yield interrupted
+        yield received
     finally:
-        signal.signal(signal.SIGINT, before)
+        for kind in heeded:
+            signal.signal(kind, before[kind])
 
 
 def _print_what_the_terminal_knows() -> None:
@@ -142,12 +147,18 @@ def _tell(error: Exception) -> int:
     return _say(f"internal error ({kind}: {error}). {TRACEBACK_VARIABLE}=1 shows where; please report it.", INTERNAL)
 
 
-def _say_interrupted() -> int:
-    return _say("interrupted. No half-written file is left; the same command continues.", INTERRUPTED)
+def _say_interrupted(received: Sequence[int]) -> int:
+    kind = received[0] if received else signal.SIGINT
+    how = "interrupted" if kind == signal.SIGINT else f"ended by {signal.Signals(kind).name}"
+    code = 128 + kind  # as shells count
+    try:
+        return _say(f"{how}. No half-written file is left; the same command continues.", code)
+    except OSError:  # the terminal has been closed
+        return code
 
 
 def _say(message: str, code: int) -> int:
-    print(f"disctrack: {' '.join(message.split())}", file=sys.stderr)
+    print(f"disctrack: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     return code
 
 
@@ -157,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="disctrack",
         description="Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.",
         epilog=f"Exit codes: {DONE} done, {FAILED} failed, {USAGE} wrong usage, {INCOMPLETE} done but some input could "
-        f"not be read, {INTERRUPTED} interrupted.",
+        f"not be read, {INTERRUPTED} interrupted (143 by SIGTERM, 129 by SIGHUP).",
     )
     parser.add_argument("--version", action="version", version=f"disctrack {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND")

@@ -1,7 +1,6 @@
 """`disctrack batch`: many recordings side by side."""
 
 import argparse
-import signal
 import sys
 
 from disctrack.batch import BatchOptions, BatchOutcome, Shard, run_batch, summarise_batch
@@ -17,11 +16,7 @@ def run(arguments: argparse.Namespace) -> int:
         outcome = summarise_batch(arguments.folders, options, arguments.output)
     else:
         shard = None if arguments.shard is None else Shard(*arguments.shard)
-        before = signal.signal(signal.SIGTERM, _interrupt)  # as queueing systems end a job whose time is over
-        try:
-            outcome = run_batch(arguments.folders, options, arguments.output, arguments.jobs, shard, arguments.cluster)
-        finally:
-            signal.signal(signal.SIGTERM, before)
+        outcome = run_batch(arguments.folders, options, arguments.output, arguments.jobs, shard, arguments.cluster)
     files = [outputs.relative(file) for file in outcome.files]
     print("\n".join([*outcome.lines(), *summary.file_lines(files)]))
     _tell_problems(outcome)
@@ -31,7 +26,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> BatchOptions:
-
     return BatchOptions(
         distortion=arguments.distortion,
         board=arguments.board,
@@ -51,7 +45,3 @@ def _tell_problems(outcome: BatchOutcome) -> None:
         print("disctrack: not everything was measured (see above). The same command tries it again.", file=sys.stderr)
     elif outcome.incomplete and not outcome.interrupted:
         print("disctrack: some of the input could not be used (see above).", file=sys.stderr)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt

@@ -286,6 +286,43 @@ def test_ctrl_c_that_a_library_turns_into_its_own_error_is_told_as_ctrl_c(record
     assert ("internal error" in told) == (not struck)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("ignored", [False, True])
+def test_what_queueing_systems_and_closed_terminals_send_ends_in_order(recording, monkeypatch, capsys, kind, ignored):
+    """In one line and with the code of a shell; not where the caller ignores it, as nohup does."""
+    from disctrack.commands import run as command
+
+    ended: list[str] = []
+
+    def going_on(arguments):
+        try:
+            signal.raise_signal(kind)
+        finally:
+            ended.append("cleared up")
+        return 0
+
+    monkeypatch.setattr(command, "run", going_on)
+    chosen = signal.SIG_IGN if ignored else signal.SIG_DFL
+    before = signal.signal(kind, chosen)
+    try:
+        code, told = main(["run", str(recording)]), capsys.readouterr().err
+        assert signal.getsignal(kind) is chosen
+    finally:
+        signal.signal(kind, before)
+    assert ended == ["cleared up"]
+    assert code == (0 if ignored else 128 + kind)
+    assert told.count("\n") == (not ignored)
+    assert (kind.name in told) == (not ignored)
+
+
+def test_a_name_cannot_steer_the_terminal(tmp_path, capsys):
+    assert main(["run", str(tmp_path / "\x1b]0;a title\x07")]) == 1
+    told = capsys.readouterr().err
+    assert "\\x1b]0;a title\\x07" in told
+    assert told.rstrip("\n").isprintable()
+
+
 def test_a_disk_that_fills_up_while_the_result_is_written(recording, monkeypatch, capsys):
     written = whole_files.os.fsync
 
