@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.motion_page import write_motion_page
 from disctrack.analyse.stage import run_analyse
-from disctrack.analyse.viewer import require_rerun, write_rerun
 from disctrack.commands import DONE
 from disctrack.commands._outputs import pair_of, tell_stale, write_times
 from disctrack.errors import RecordingError
@@ -24,14 +23,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
     path = arguments.trajectory
     folder = arguments.output or path.parent / f"{path.stem}_analysis"
-    motion = folder / "motion.rrd"
-    if arguments.rerun:
-        require_rerun(motion)  # at once: the analysis takes a while
     tell_stale(path)
     origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
     told = reusable(folder, origin)
     page = folder / "motion.html"
-    asked = [page, *([motion] if arguments.rerun else []), *([folder / "figures"] if arguments.figures else [])]
+    asked = [page, *([folder / "figures"] if arguments.figures else [])]
     more = not all(place.exists() for place in asked)
     if told is not None and not (arguments.overwrite or more):
         print(
@@ -52,9 +48,6 @@ def run(arguments: argparse.Namespace) -> int:
     with stage("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
     lines.append(f"              {page}")
-    if arguments.rerun:
-        write_rerun(motion, outcome.analysis)
-        lines.append(f"              {motion}")
     lines += [f"              {file}" for file in write_times(folder, "analyse")]
     remember(folder, origin, lines, (outcome.report, page, *outcome.figures))
     print("\n".join(lines))

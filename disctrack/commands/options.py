@@ -113,11 +113,6 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
         "--figures", action="store_true", help="also write every figure of the report as PNG and PDF, into figures/"
     )
     parser.add_argument(
-        "--rerun",
-        action="store_true",
-        help="also write motion.rrd for the 3-D viewer (needs rerun-sdk)",
-    )
-    parser.add_argument(
         "--recording",
         type=Path,
         metavar="FOLDER",

@@ -116,10 +116,3 @@ def test_asymptotic_exponents_are_not_refused_where_the_law_is_not_asymptotic(an
     page = (analysed_clip.parent / "report" / "report.html").read_text()
     assert "as θ → 0" in page
     assert "0.667 no" not in page
-
-
-def test_a_viewer_that_is_not_installed_is_said_before_the_work(analysed_clip, capsys, monkeypatch):
-    monkeypatch.setattr("disctrack.analyse.viewer.find_spec", lambda name: None)
-    monkeypatch.setattr("disctrack.analyse.stage.run_analyse", lambda *a, **k: pytest.fail("analysed first"))
-    assert main(["analyse", str(analysed_clip), "--overwrite", "--rerun"]) == 1
-    assert "pip install rerun-sdk" in capsys.readouterr().err
