@@ -199,7 +199,7 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
 
 def _diagnose(path: Path) -> tuple[Path, dict[str, Any]]:
     from disctrack.diagnosis import run_diagnose
-    from disctrack.diagnosis.disc.model_file import PAPER
+    from disctrack.diagnosis.model_file import PAPER
 
     outcome = run_diagnose(path, overwrite=True)
     pages = {file.name: file for file in outcome.files}

@@ -8,7 +8,7 @@ import numpy as np
 from disctrack.analyse.analysis import Analysis
 from disctrack.batch.columns import UNITS
 from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS, COORDINATES

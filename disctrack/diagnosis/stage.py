@@ -8,11 +8,12 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.brief import Brief
-from disctrack.diagnosis.disc.declared_dots import with_declared_dots
-from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
-from disctrack.diagnosis.disc.errors import energy_balance, errors
-from disctrack.diagnosis.disc.form_misfit import with_form
-from disctrack.diagnosis.disc.learned_law import (
+from disctrack.diagnosis.answer import DiscDiagnosis, Learned
+from disctrack.diagnosis.declared_dots import with_declared_dots
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.errors import energy_balance, errors
+from disctrack.diagnosis.form_misfit import with_form
+from disctrack.diagnosis.learned_law import (
     ALIKE,
     UNLIKELY,
     LearnedLaw,
@@ -22,14 +23,13 @@ from disctrack.diagnosis.disc.learned_law import (
     with_law,
     without_idle_terms,
 )
-from disctrack.diagnosis.disc.left_over import LeftOver, left_over
-from disctrack.diagnosis.disc.model_file import PAPER, declared_model, model_toml
-from disctrack.diagnosis.disc.plan import open_questions, plan, separations
-from disctrack.diagnosis.disc.regimes import regimes
-from disctrack.diagnosis.disc.slip_start import diagnose_motion, with_slip
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.left_over import LeftOver, left_over
+from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
 from disctrack.diagnosis.pages.words import law_text, sentence
+from disctrack.diagnosis.plan import open_questions, plan, separations
+from disctrack.diagnosis.regimes import regimes
+from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.memory import inflation, with_memory
@@ -453,7 +453,7 @@ def run_diagnose(
     figures : also write every figure of the page as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
-    from disctrack.diagnosis.disc.free_runs import evidence
+    from disctrack.diagnosis.free_runs import evidence
     from disctrack.diagnosis.pages.report import write_report  # matplotlib is wanted here only
 
     path = Path(path)

@@ -1,7 +1,7 @@
 """What can be diagnosed: anything with parameters, effects that it may lack, and a prediction with derivatives.
 
 The engine (fit, score, held_out, search) knows no more of the world than this module; what the numbers mean is the
-business of an adapter (`diagnosis.disc`, `examples`).
+business of an adapter (`disctrack.diagnosis`, `examples`).
 """
 
 from __future__ import annotations
@@ -34,10 +34,26 @@ class Quantity:
     linear: bool = False  # the prediction is linear in it with a derivative that is the same everywhere
     belongs_to: tuple[str, ...] = ()  # what must be the same in two recordings for them to share it; (): never shared
     declared: float | None = None  # beforehand, if only roughly: where a fit that was led far off may begin anew
+    reciprocal: str = ""  # name of 1 / value, where people know the number by that
     # of one block of rows alone, without bounds: the column in which `linearise` gives the derivatives by all such
     # numbers, each in the rows of its own block
     slot: str = ""
     block: int = 0  # number of that block
+
+    @property
+    def owner(self) -> str:
+        """The effect, law or part of the apparatus whose number this is: what stands before the first dot."""
+        return self.name.partition(".")[0]
+
+    @property
+    def part(self) -> str:
+        """Which of its owner's numbers this is."""
+        return self.name.partition(".")[2]
+
+    @property
+    def is_initial(self) -> bool:
+        """Does it belong to the state at the first instant, which matters to nobody else?"""
+        return self.owner == "state"
 
 
 @dataclass(frozen=True)

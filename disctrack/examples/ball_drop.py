@@ -19,13 +19,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis import Settings
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.noise_with_memory import SampleStretch, estimate
-from disctrack.discrepancy.search import CLASS_GAIN
+from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Subset
 from disctrack.errors import AnalysisError

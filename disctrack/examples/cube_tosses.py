@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from disctrack.diagnosis import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.pages.general import document, table
-from disctrack.diagnosis.pages.words import effect_text
+from disctrack.discrepancy.document import document, table
+from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
 from disctrack.discrepancy.system import Values
+from disctrack.discrepancy.words import effect_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Toss, read_tosses
 from disctrack.examples.cube_effects import GRAVITY

@@ -14,10 +14,9 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.published import SURFACES, published_table
-from disctrack.diagnosis import Candidate, Quantity
-from disctrack.diagnosis.disc.motion import SLIP, motion_candidates
+from disctrack.diagnosis.motion import SLIP, motion_candidates
 from disctrack.disc import MA_2014
-from disctrack.discrepancy.system import Values
+from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import READING, LastStage, Setup
 from disctrack.rolling import CATALOGUE, Model, effects

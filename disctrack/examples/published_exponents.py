@@ -19,12 +19,12 @@ from scipy import stats
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.analyse.published import PREDICTED
-from disctrack.diagnosis import Diagnosis, Settings, diagnose
-from disctrack.diagnosis.pages.general import document, table
-from disctrack.diagnosis.pages.words import quantity_text
+from disctrack.discrepancy.document import document, table
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
+from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
 from disctrack.discrepancy.system import Values
+from disctrack.discrepancy.words import quantity_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_model import LastStage, Setup
 from disctrack.examples.exponent_system import BRAKING, ExponentSystem, at, published_series

@@ -82,7 +82,6 @@ STAIRS = (
     ("__main__",),
 )
 ROOMS_OF_CALIBRATION = ("kit", "board", "cameras", "fit", "judge")  # each asks for those before it
-ROOMS_OF_DIAGNOSIS = {"disc": (), "pages": ("disc",), "trials": ("disc",)}
 
 
 @cache
@@ -197,8 +196,8 @@ def test_a_public_class_has_a_name_of_its_own():
     assert {name: files for name, files in places.items() if len(files) > 1 and name[0] != "_"} == {}
 
 
-@pytest.mark.parametrize("room", ROOMS_OF_DIAGNOSIS)
-def test_the_engine_of_a_diagnosis_knows_no_disc_and_no_page(room):
-    for file in (ROOT / "disctrack" / "diagnosis" / room).rglob("*.py"):
-        rooms = {name.split(".")[2] for name in imported(file) if name.startswith("disctrack.diagnosis.")}
-        assert rooms & set(ROOMS_OF_DIAGNOSIS) <= {room, *ROOMS_OF_DIAGNOSIS[room]}, file
+def test_discrepancy_knows_no_disc():
+    asked = {name for file in (ROOT / "disctrack" / "discrepancy").rglob("*.py") for name in imported(file)}
+    rooms = {name.split(".")[1] for name in asked if name.startswith("disctrack.")}
+    assert "system" in {name.split(".")[2] for name in asked if name.startswith("disctrack.discrepancy.")}
+    assert not rooms & {"diagnosis", "disc", "rolling", "trajectory", "track", "analyse"}

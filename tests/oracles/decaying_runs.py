@@ -6,10 +6,10 @@ c t exp(-g t), the air's, that goes with the root of its density; a hum, the rig
 
 import numpy as np
 
-from disctrack.diagnosis import Candidate, Quantity
-from disctrack.diagnosis.together.reduction import Reduction
-from disctrack.diagnosis.together.sharing import Member
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.joint.reduction import Reduction
+from disctrack.discrepancy.joint.sharing import Member
+from disctrack.discrepancy.system import Candidate, Quantity
 
 TIME = np.linspace(0.0, 3.0, 200)
 SIGMA = 0.01

@@ -15,7 +15,7 @@ import numpy as np
 
 from disctrack.cli import main as disctrack_cli
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc.declared_dots import with_declared_dots
+from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.trajectory.file import read_findings, read_trajectory
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import newton_euler, point_laboratory

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc.errors import simulated
-from disctrack.diagnosis.disc.left_over import left_over
+from disctrack.diagnosis.errors import simulated
+from disctrack.diagnosis.left_over import left_over
 from disctrack.rolling import Model
 from tests.oracles.required_wrench import required_wrench
 from tests.oracles.unknown_laws import UNKNOWN, Recording, recording

@@ -9,7 +9,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc.free_runs import evidence, force_of
+from disctrack.diagnosis.free_runs import evidence, force_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import simulate_scene
 from disctrack.trajectory.file import Provenance, read_group, read_trajectory, write_trajectory

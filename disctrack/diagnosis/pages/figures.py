@@ -10,11 +10,11 @@ from scipy.signal import periodogram
 from scipy.stats import chi2
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
-from disctrack.diagnosis.disc.errors import frequencies, simulated
-from disctrack.diagnosis.disc.form_misfit import LawCourse
-from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
-from disctrack.diagnosis.disc.learned_law import MissingMoment, learned_moment
+from disctrack.diagnosis.answer import DiscDiagnosis
+from disctrack.diagnosis.errors import frequencies, simulated
+from disctrack.diagnosis.form_misfit import LawCourse
+from disctrack.diagnosis.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
+from disctrack.diagnosis.learned_law import MissingMoment, learned_moment
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
 from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels, plain_powers

@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from disctrack.diagnosis.disc.errors import Ahead, Errors
-from disctrack.diagnosis.disc.plan import Separation
+from disctrack.diagnosis.errors import Ahead, Errors
 from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.pages.words import UNFOLLOWED, shown, together
-from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.search import Found, Tried
-from disctrack.discrepancy.significance import as_sigmas
+from disctrack.diagnosis.pages.words import UNFOLLOWED
+from disctrack.diagnosis.plan import Separation
+from disctrack.discrepancy.document import declared_json, effect_json, parameters_json, tried_json
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory.file import write_group
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis, Learned
-    from disctrack.diagnosis.disc.form_misfit import LawCourse
-    from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
+    from disctrack.diagnosis.answer import DiscDiagnosis, Learned
+    from disctrack.diagnosis.form_misfit import LawCourse
+    from disctrack.diagnosis.free_runs import ModelFreeEvidence
 
 GROUP = "diagnosis"
-
-
-def _parameters(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
-    found = []
-    for q in quantities:
-        name, value, sigma = shown(q, fit)
-        amount = {"name": name, "value": value, "sigma": sigma}
-        found.append(amount | {"unit": q.unit, "meaning": q.meaning})
-    return found
 
 
 def _separation(separation: Separation | None) -> dict[str, Any] | None:
@@ -47,39 +35,6 @@ def _separation(separation: Separation | None) -> dict[str, Any] | None:
         "duration_s": separation.duration,
         "angle_deg": np.degrees(separation.angle),
         "sigmas": separation.sigmas,
-    }
-
-
-def effect_json(found: Found, after: Fit, apart: Mapping[str, Separation | None] | None = None) -> dict[str, Any]:
-    """One effect found, of any system.
-
-    after : fit of the enlarged model
-    apart : recordings that would separate the effect from its rivals, by their names
-    """
-    apart = apart or {}
-    c = found.candidate
-    return {
-        "name": c.effect,
-        "candidate": c.name,
-        "kind": c.kind,
-        "title": c.title,
-        "source": c.source,
-        "parameters": _parameters(c.quantities, after),
-        "correlated": [vars(pair) for pair in together(found, after)],
-        "class": [
-            {
-                "name": r.candidate.name,
-                "angle_deg": np.degrees(r.angle),
-                "delta_chi_square": r.loss,
-                "parameters": _parameters(r.candidate.quantities, r.fit),
-                "separated_by": _separation(apart.get(r.candidate.name)),
-            }
-            for r in found.cannot_be_told_from
-        ],
-        "score": found.gain,
-        "threshold": found.threshold,
-        "significance_sigma": as_sigmas(found.gain, len(c.quantities)),
-        "held_out_gain": found.held_out_gain,
     }
 
 
@@ -118,24 +73,6 @@ def _errors(errors: Errors | None, longer: tuple[Ahead, ...] = ()) -> dict[str, 
     }
 
 
-def tried_json(tried: Tried) -> dict[str, Any]:
-    """What became of one candidate, of any system."""
-    return {
-        "name": tried.candidate.name,
-        "kind": tried.candidate.kind,
-        "score": tried.score,
-        "refit_gain": tried.gain,
-        "held_out_gain": tried.held_out_gain,
-        "reason": tried.reason,
-    }
-
-
-def declared_json(fit: Fit) -> dict[str, Any]:
-    """Numbers of the declared laws with their standard deviations."""
-    laws = [q for q in fit.quantities if not q.name.startswith("state.") and not np.isfinite(q.prior_sigma)]
-    return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
-
-
 def _learned(learned: Learned) -> dict[str, Any]:
     law = learned.law
     return {
@@ -151,7 +88,7 @@ def _learned(learned: Learned) -> dict[str, Any]:
         "phase_locked": law.locked,
         "mean_power_W": learned.power,
         "moment_about_contact": _course(learned.course),
-        "parameters": _parameters(law.candidate.quantities, learned.fit),
+        "parameters": parameters_json(law.candidate.quantities, learned.fit),
         "class": [],
         "score": learned.gain,
         "held_out_gain": learned.held_out_gain,
@@ -173,8 +110,10 @@ def _course(course: LawCourse | None) -> dict[str, Any]:
 def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     diagnosis = result.diagnosis
-    apart = result.separated_by
-    effects = [effect_json(f, diagnosis.after, apart.get(f.candidate.name)) for f in diagnosis.found]
+    effects = []
+    for f in diagnosis.found:
+        apart = result.separated_by.get(f.candidate.name, {})
+        effects.append(effect_json(f, diagnosis.after, {name: _separation(s) for name, s in apart.items()}))
     rows, longer = result.system.rows, beside.ahead if beside else ()
     document = {
         "verdict": diagnosis.verdict,
@@ -225,7 +164,7 @@ def write_diagnosis(
     axes = {"coordinate": Variable(np.array(COORDINATES), ("coordinate",), "1", "coordinate")}
     axes["contact_axis"] = Variable(np.array(["n0", "m0", "k"]), ("contact_axis",), "1", "axis of the contact frame")
     if beside is not None and beside.measured is not None:
-        from disctrack.diagnosis.disc.free_runs import force_of
+        from disctrack.diagnosis.free_runs import force_of
 
         force, sigma = np.full((2, n, 3), np.nan)
         force[system.rows] = beside.measured.force - force_of(system, result.diagnosis.before)

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.diagnosis.disc.plan import ENOUGH, Plan, Question
-from disctrack.diagnosis.pages.words import quantity_text
+from disctrack.diagnosis.plan import ENOUGH, Plan, Question
 from disctrack.discrepancy.significance import TWO_SIDED
+from disctrack.discrepancy.words import quantity_text
 from disctrack.pages.html import bullets, details, paragraph, table
 
 SAID = (

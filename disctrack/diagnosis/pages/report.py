@@ -5,15 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from disctrack.diagnosis.disc.diagnosis import DiscDiagnosis
-from disctrack.diagnosis.disc.errors import HORIZONS, Ahead, Errors
-from disctrack.diagnosis.disc.free_runs import ModelFreeEvidence
-from disctrack.diagnosis.disc.model_file import NONE, PAPER
+from disctrack.diagnosis.answer import DiscDiagnosis
+from disctrack.diagnosis.errors import HORIZONS, Ahead, Errors
+from disctrack.diagnosis.free_runs import ModelFreeEvidence
+from disctrack.diagnosis.model_file import NONE, PAPER
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.figures import all_figures
-from disctrack.diagnosis.pages.words import UNFOLLOWED, effect_text, law_text, quantity_text
+from disctrack.diagnosis.pages.words import UNFOLLOWED, law_text
 from disctrack.discrepancy.search import Found, Tried
 from disctrack.discrepancy.significance import as_sigmas
+from disctrack.discrepancy.words import effect_text, quantity_text
 from disctrack.files.whole import write_whole
 from disctrack.pages.figures import draw, gallery
 from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, text

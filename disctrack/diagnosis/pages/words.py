@@ -1,115 +1,20 @@
-"""A diagnosis in plain words."""
+"""The diagnosis of a disc in plain words."""
 
-from itertools import takewhile
-
-import numpy as np
-
-from disctrack.diagnosis.disc.errors import Errors
-from disctrack.diagnosis.disc.learned_law import LearnedLaw
-from disctrack.diagnosis.disc.left_over import LEVEL, LeftOver
-from disctrack.diagnosis.disc.motion import SLIP
-from disctrack.diagnosis.disc.systematic import Systematic
-from disctrack.discrepancy.correlated import Correlated, correlated
+from disctrack.diagnosis.errors import Errors
+from disctrack.diagnosis.learned_law import LearnedLaw
+from disctrack.diagnosis.left_over import LEVEL, LeftOver
+from disctrack.diagnosis.systematic import Systematic
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.search import Diagnosis, Found
-from disctrack.discrepancy.significance import TWO_SIDED
-from disctrack.discrepancy.system import Quantity
+from disctrack.discrepancy.search import Diagnosis
+from disctrack.discrepancy.words import effect_text
 
-SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
 UNFOLLOWED = "without it the model follows no part of the recording"  # so that there is no chi-square to compare
-_PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
-_PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
-
-
-def quantity_text(value: float, sigma: float, unit: str) -> str:
-    """Value and sigma with as many digits as the sigma deserves: "60.0(2) um" is written 60.0 +- 0.2 um."""
-    factor, prefix = 1.0, ""
-    if unit in _PREFIXED_UNITS and value:
-        for size, name in _PREFIXES:
-            factor, prefix = size, name
-            if abs(value) < 1000 * size:
-                break
-    value, sigma = value / factor, sigma / factor
-    unit = "" if unit == "1" else f" {prefix}{unit}"
-    if not sigma > 0:
-        return f"{value:.4g}{unit}"
-    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    if digits > 7 or abs(value) >= 1e6:
-        powers = [np.floor(np.log10(number)) for number in (max(abs(value), sigma), sigma)]
-        places = int(powers[0] - powers[1]) + 2  # down to sigma's second
-        return f"({value:.{places}g} +- {sigma:.2g}){unit}"
-    return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
-
-
-def shown(q: Quantity, fit: Fit) -> tuple[str, float, float]:
-    """Name, value and sigma of a fitted quantity as people know it: slip is fitted by 1/mu and shown by mu."""
-    name, value, sigma = q.name.partition(".")[2], fit.values[q.name], fit.sigma(q.name)
-    if q.name == SLIP and value > 0:
-        return "mu", 1.0 / value, sigma / value**2
-    return name, value, sigma
-
-
-def effect_text(found: Found, diagnosis: Diagnosis) -> str:
-    """One effect with its size and what it cannot be told from."""
-    fit = diagnosis.after
-    # a free velocity at the first instant says nothing to people that the remark on slip does not
-    amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities if not q.name.startswith("state.")]
-    sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
-    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, diagnosis)}"
-    text += "".join(f"; {bound}" for bound in bounds(found, fit))
-    if found.cannot_be_told_from:
-        rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)
-        text += f"; this recording cannot tell it from {rivals}"
-    return text
-
-
-def bounds(found: Found, fit: Fit) -> list[str]:
-    """Numbers of the effect that the data do not tell from nought: how large they may be, and what keeps them open."""
-    texts = []
-    spread = np.array([fit.sigma(name) for name in fit.names])
-    for q in found.candidate.quantities:
-        name, value, sigma = shown(q, fit)
-        if q.name.startswith("state.") or q.name == SLIP or q.null != 0.0:  # a limit is no size
-            continue
-        if not sigma > 0 or abs(value) >= TWO_SIDED * sigma:
-            continue
-        i = fit.names.index(q.name)
-        shared = np.abs(fit.covariance_with(q.name)) / np.where(spread > 0, spread, np.inf) / spread[i]
-        shared[i] = 0.0
-        partner = int(np.argmax(shared))
-        why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise"
-        most = quantity_text(abs(value) + TWO_SIDED * sigma, 0.0, q.unit)
-        texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
-    return texts
-
-
-def together(found: Found, fit: Fit) -> tuple[Correlated, ...]:
-    """Numbers of the effect that move together with each other or with those of a declared law."""
-    laws = [q.name for q in fit.quantities if not (np.isfinite(q.prior_sigma) or q.name.startswith("state."))]
-    return correlated(fit, [q.name for q in found.candidate.quantities if q.name != SLIP], laws)
-
-
-def together_text(found: Found, diagnosis: Diagnosis) -> str:
-    """What their standard deviations alone do not say; a pair that an earlier effect's text has named is left out."""
-    fit = diagnosis.after
-    units = {q.name: q.unit for q in fit.quantities}
-    earlier = takewhile(lambda effect: effect is not found, diagnosis.found)
-    named = {frozenset((pair.first, pair.second)) for effect in earlier for pair in together(effect, fit)}
-    text = ""
-    for pair in together(found, fit):
-        if frozenset((pair.first, pair.second)) in named:
-            continue
-        factor = f"{'+' if pair.factor >= 0 else '-'} {abs(pair.factor):.4g}"
-        known = quantity_text(pair.value, pair.sigma, units[pair.first])
-        text += f" (correlation {pair.correlation:.4f}: better known is {pair.first} {factor} {pair.second} = {known})"
-    return text
 
 
 def law_text(law: LearnedLaw, fit: Fit) -> str:
     """A learned law with its numbers."""
     numbers = ", ".join(
-        f"{q.name.partition('.')[2]} = {fit.values[q.name]:.4g} +- {fit.sigma(q.name):.2g}"
-        for q in law.candidate.quantities
+        f"{q.part} = {fit.values[q.name]:.4g} +- {fit.sigma(q.name):.2g}" for q in law.candidate.quantities
     )
     formulas = "; ".join(f"{component} = {formula}" for component, formula in law.formulas.items())
     return f"{law.title}: {formulas} with {numbers} (SI)" + (", locked to the disc's angles" if law.locked else "")

@@ -8,15 +8,16 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.pages.output import declared_json, effect_json, tried_json
 from disctrack.diagnosis.pages.report import tried_table
-from disctrack.diagnosis.pages.words import effect_text, quantity_text
-from disctrack.diagnosis.together.covariates import Hypothesis, alike
-from disctrack.diagnosis.together.loop import Bound, Dependence, OfRecording, TogetherDiagnosis
-from disctrack.diagnosis.together.sharing import EACH
+from disctrack.diagnosis.together.discs import DiscsTogether
+from disctrack.discrepancy.document import declared_json, effect_json, tried_json
+from disctrack.discrepancy.joint.covariates import Hypothesis, alike
+from disctrack.discrepancy.joint.sharing import EACH
+from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording
 from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.system import Quantity
+from disctrack.discrepancy.words import effect_text, quantity_text
 from disctrack.files.json_text import plain
 from disctrack.pages.figures import Drawn, panels
 from disctrack.pages.html import bullets, details, page, paragraph, section, table, typeset, warning
@@ -28,7 +29,7 @@ UNSEEN = 1e3  # times its typical size: an effect whose standard deviation is la
 AIR = "air"
 
 
-def sentence(answer: TogetherDiagnosis) -> str:
+def sentence(answer: DiscsTogether) -> str:
     """The answer in one or a few sentences."""
     d = answer.diagnosis
     n, left_out = len(answer.used), [r for r in answer.recordings if r.reason]
@@ -64,7 +65,7 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def lines(answer: TogetherDiagnosis) -> list[str]:
+def lines(answer: DiscsTogether) -> list[str]:
     """For the terminal."""
     d = answer.diagnosis
     said = [f"{'verdict':<13} {d.verdict}", f"{'':<13} {sentence(answer)}"]
@@ -110,7 +111,7 @@ def _exponents(h: Hypothesis) -> str:
     return f" ({said})" if said else ""
 
 
-def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
+def as_json(answer: DiscsTogether) -> dict[str, Any]:
     """The keys of diagnosis.json as far as they apply; and recordings, bounds, dependences."""
     d = answer.diagnosis
     both = {
@@ -197,7 +198,7 @@ def _bound_json(b: Bound) -> dict[str, Any]:
     }
 
 
-def whole_page(answer: TogetherDiagnosis, pictures: str) -> str:
+def whole_page(answer: DiscsTogether, pictures: str) -> str:
     """The page, with the figures' HTML."""
     d = answer.diagnosis
     parts = [
@@ -215,7 +216,7 @@ def whole_page(answer: TogetherDiagnosis, pictures: str) -> str:
     return page("Many recordings: what does the model lack?", parts)
 
 
-def _effects(answer: TogetherDiagnosis) -> list[str]:
+def _effects(answer: DiscsTogether) -> list[str]:
     d = answer.diagnosis
     return [
         f"{_effect_text(f, d)}. Without it chi-square rises by {f.gain:.5g}, "
@@ -244,7 +245,7 @@ def _dependence_table(x: Dependence) -> str:
     )
 
 
-def _recordings(answer: TogetherDiagnosis) -> str:
+def _recordings(answer: DiscsTogether) -> str:
     read = [r for r in answer.recordings if r.labels]
     kinds = [k for k in ("disc", "surface", "rig", "air") if len({r.labels[k] for r in read}) > 1]
     rows, classes = [], []
@@ -267,7 +268,7 @@ def _recordings(answer: TogetherDiagnosis) -> str:
     return table(caption, header, rows, [c or "ok" for c in classes])
 
 
-def _by_number(answer: TogetherDiagnosis) -> str:
+def _by_number(answer: DiscsTogether) -> str:
     shown = _of_interest(answer)
     numbers = sorted({k for b in shown for k in b.by_number})
     rows = []
@@ -304,7 +305,7 @@ def _in_all(b: Bound, i: int, unit: str) -> list[str]:
     return [value, "" if b.upper is None else quantity_text(float(f"{b.upper:.2g}"), 0.0, unit)]
 
 
-def _of_interest(answer: TogetherDiagnosis) -> list[Bound]:
+def _of_interest(answer: DiscsTogether) -> list[Bound]:
     """What was found, and the effects that one recording sees worst for their usual size: those of the air first."""
     found = {f.candidate.name for f in answer.diagnosis.found}
 
@@ -323,7 +324,7 @@ def _of_interest(answer: TogetherDiagnosis) -> list[Bound]:
     return sorted(usable, key=rank)[:SHOWN]
 
 
-def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
+def figures(answer: DiscsTogether) -> tuple[Drawn, ...]:
     """Every shared law: what each recording says alone, and what all say together."""
     sharing, after = answer.system.sharing, answer.diagnosis.after
     alone = [r.alone for r in answer.recordings if not r.reason]
@@ -351,7 +352,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlabel("recording, from 0")
         unit = f" ({typeset(q.unit)})" if q.unit != "1" else ""
-        axes.set_ylabel(q.name.partition(".")[2].partition("[")[0] + unit)
+        axes.set_ylabel(q.part.partition("[")[0] + unit)
         caption = "Each recording alone with its standard deviation; the band is two of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
     return tuple(drawn)

@@ -9,22 +9,23 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.declaration import contradictions, density
-from disctrack.diagnosis.disc.declared_dots import with_declared_dots
-from disctrack.diagnosis.disc.large_faults import find_large
-from disctrack.diagnosis.disc.model_file import PAPER, Declared, declared_model
-from disctrack.diagnosis.disc.plan import Plan, Question, plan
-from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
-from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.disc.systematic import (
+from disctrack.diagnosis.declared_dots import with_declared_dots
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.large_faults import find_large
+from disctrack.diagnosis.model_file import PAPER, Declared, declared_model
+from disctrack.diagnosis.plan import Plan, Question, plan
+from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.systematic import (
     Systematic,
     find_systematic,
     noise_over_stated,
     smooth_field,
 )
-from disctrack.diagnosis.together.reduction import Reduced, Reduction
-from disctrack.diagnosis.together.sharing import Member
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.joint.reduction import Reduced, Reduction
+from disctrack.discrepancy.joint.sharing import Member
+from disctrack.discrepancy.joint.together import Alone
 from disctrack.discrepancy.memory import inflation
 from disctrack.discrepancy.row_noise import THIRD
 from disctrack.discrepancy.system import Quantity, Values
@@ -87,18 +88,6 @@ def _density(trajectory: Trajectory) -> float:
 
 def _disc_words(disc: Disc) -> str:
     return f"{2e3 * disc.radius:g} x {2e3 * disc.half_thickness:g} mm, {1e3 * disc.mass:g} g"
-
-
-@dataclass(frozen=True)
-class Alone:
-    """What one recording says of itself with a model, fitted alone."""
-
-    values: dict[str, float]  # of all its quantities
-    sigmas: dict[str, float]  # of those that it may share and that have no prior
-    inflation: dict[str, float]  # by which these grow because what is left has a memory
-    chi_square: float
-    degrees: int
-    converged: bool
 
 
 @dataclass(frozen=True)
@@ -175,7 +164,7 @@ class DiscMember:
         used, places = self.system.used[rows], self.system.observed[rows]
         return self.member, self.systematic, [places[:, c][used[:, c]] for c in range(2)]
 
-    def with_systematic(self, systematic: Systematic) -> Member:
+    def with_common(self, systematic: Systematic) -> Member:
         """The member with systematic errors that it has in common with others."""
         if systematic != self.systematic:
             self._prepare(systematic)
@@ -302,7 +291,7 @@ def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Sy
 
 
 def build(item: Item) -> DiscMember:
-    """For a `Crew`. Raises AnalysisError where it cannot be used, with what was declared that may be why."""
+    """For a crew. Raises AnalysisError where it cannot be used, with what was declared that may be why."""
     trajectory = item.recorded.trajectory
     heavy = density(trajectory.disc)
     if heavy:  # laws in proportion to the load would fit it all the same

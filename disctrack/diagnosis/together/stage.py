@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from disctrack.diagnosis.disc.model_file import PAPER
-from disctrack.diagnosis.together.loop import TogetherDiagnosis, diagnose_together
+from disctrack.diagnosis.model_file import PAPER
+from disctrack.diagnosis.together.discs import DiscsTogether, diagnose_together
 from disctrack.diagnosis.together.recordings import Recorded, read_recorded
 from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
@@ -23,7 +23,7 @@ FOLDER = "together_diagnosis"
 class TogetherOutcome:
     """What `run_together` did."""
 
-    result: TogetherDiagnosis | None  # None where an earlier result of the same files was complete
+    result: DiscsTogether | None  # None where an earlier result of the same files was complete
     files: tuple[Path, ...]
     summary: tuple[str, ...]
     unusable: tuple[str, ...] = ()  # recordings that could not be read, or not be fitted with the others

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from disctrack.diagnosis.disc.left_over import left_over
-from disctrack.diagnosis.disc.model_file import declared_model
-from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.disc.systematic import DOT_SIGMA
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.left_over import left_over
+from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stage import diagnose_trajectory
+from disctrack.diagnosis.systematic import DOT_SIGMA
 from disctrack.diagnosis.trials.hidden_effects import Planted
 from disctrack.diagnosis.trials.imperfect import Laboratory
 from disctrack.diagnosis.trials.rates import draw, trajectory_of

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 
 from calibration.kit.arrays import Array
 from disctrack.diagnosis import DiscSystem, Settings
-from disctrack.diagnosis.disc.model_file import PAPER, declared_model
+from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, HiddenEffect, Planted
 from disctrack.diagnosis.trials.rates import FRAME_RATE, draw, trajectory_of
 from disctrack.discrepancy.fit import fit

@@ -9,14 +9,14 @@ error. They are fitted together without any effect; the derivatives by every eff
 import argparse
 from dataclasses import replace
 
-from disctrack.diagnosis.together.crew import Crew
-from disctrack.diagnosis.together.joint import JointSystem
-from disctrack.diagnosis.together.loop import sigmas_of_first
 from disctrack.diagnosis.together.recordings import Item, Recorded, build, labels_of
-from disctrack.diagnosis.together.sharing import Sharing
 from disctrack.diagnosis.trials.hidden_effects import Planted
 from disctrack.diagnosis.trials.rates import FRAME_RATE, draw, trajectory_of
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.joint.crew import Crew
+from disctrack.discrepancy.joint.joint_system import JointSystem
+from disctrack.discrepancy.joint.sharing import Sharing
+from disctrack.discrepancy.joint.together import sigmas_of_first
 from disctrack.errors import DiscTrackError
 
 NUMBERS = (1, 2, 5, 10, 20, 50, 100)

@@ -12,8 +12,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.pages.general import document, table
-from disctrack.diagnosis.pages.words import effect_text
+from disctrack.discrepancy.document import document, table
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.law import LearnedForce
 from disctrack.discrepancy.equations.loop import Answered, ask
@@ -22,6 +21,7 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.discrepancy.whiteness import LAGS, ljung_box, no_memory
+from disctrack.discrepancy.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole

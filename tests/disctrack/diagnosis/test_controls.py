@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose
-from disctrack.diagnosis.disc.model_file import declared_model
-from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.model_file import declared_model
+from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.row_noise import common_modes
 from disctrack.discrepancy.score import Linearisation, score_all

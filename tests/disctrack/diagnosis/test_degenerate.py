@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import covariance_within, fit
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.system import Quantity

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disctrack.diagnosis.disc.declared_dots import misprinted, with_declared_dots
+from disctrack.diagnosis.declared_dots import misprinted, with_declared_dots
 from tests.oracles.measured_disc import measured
 
 SIGMA = np.full((6, 2), 0.3)

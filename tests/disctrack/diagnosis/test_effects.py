@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, Settings, diagnose, diagnose_trajectory
-from disctrack.diagnosis.disc.model_file import declared_model
-from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.model_file import declared_model
+from disctrack.diagnosis.motion import motion_candidates
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.discrepancy.fit import fit
 from disctrack.rolling import CATALOGUE

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import rotation_from_vector
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
-from disctrack.diagnosis.disc.faults import measurement_candidates, predict
-from disctrack.diagnosis.disc.model_file import declared_model, model_toml
-from disctrack.diagnosis.disc.start import first_state
+from disctrack.diagnosis.faults import measurement_candidates, predict
+from disctrack.diagnosis.model_file import declared_model, model_toml
+from disctrack.diagnosis.motion_start import first_state
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
 from disctrack.synthetic import rig_of

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis.disc import form_misfit
-from disctrack.diagnosis.disc.system import Patience
+from disctrack.diagnosis import form_misfit
+from disctrack.diagnosis.disc_system import Patience
 from disctrack.discrepancy.system import GivenUp
 from disctrack.rolling import Model, sensitivities, simulate, steady_precession
 from disctrack.rolling.model import body_constants

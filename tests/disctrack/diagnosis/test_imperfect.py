@@ -11,11 +11,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory
-from disctrack.diagnosis.disc.left_over import LeftOver
-from disctrack.diagnosis.disc.model_file import declared_model
-from disctrack.diagnosis.disc.stretch import at_rest
-from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
+from disctrack.diagnosis.left_over import LeftOver
+from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stage import _doubtful
+from disctrack.diagnosis.stretch import at_rest
+from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.diagnosis.trials.imperfect import ORDINARY, Laboratory
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.memory import inflation, long_run_variance

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc.faults import setup_of
-from disctrack.diagnosis.disc.large_faults import in_step, poses_with, rig_as_it_is
+from disctrack.diagnosis.faults import setup_of
+from disctrack.diagnosis.large_faults import in_step, poses_with, rig_as_it_is
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.cameras import rig_after_faults
 from disctrack.synthetic.description import CameraFault, Faults, Scene

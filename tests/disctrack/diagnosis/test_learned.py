@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose_trajectory, stage
-from disctrack.diagnosis.disc.law_library import Family, families
-from disctrack.diagnosis.disc.learned_law import (
+from disctrack.diagnosis.law_library import Family, families
+from disctrack.diagnosis.learned_law import (
     GainOfFamily,
     _busy,
     _law,
@@ -20,7 +20,7 @@ from disctrack.diagnosis.disc.learned_law import (
     with_law,
     without_idle_terms,
 )
-from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found

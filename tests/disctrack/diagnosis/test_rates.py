@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.disc.model_file import declared_model
+from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, Planted, hidden_effect
 from disctrack.diagnosis.trials.power import power
 from disctrack.diagnosis.trials.rates import draw, trajectory_of, trial

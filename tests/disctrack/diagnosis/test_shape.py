@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose, diagnose_trajectory
-from disctrack.diagnosis.disc.model_file import declared_model
-from disctrack.diagnosis.disc.motion import motion_candidates
+from disctrack.diagnosis.model_file import declared_model
+from disctrack.diagnosis.motion import motion_candidates
 from disctrack.diagnosis.trials.hidden_effects import hidden_effect
 from disctrack.diagnosis.trials.rates import draw, together, trajectory_of
 from disctrack.discrepancy.fit import fit

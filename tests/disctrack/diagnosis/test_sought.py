@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.disc.model_file import PAPER, declared_model
+from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.trials.recordings import measured
 from disctrack.discrepancy.fit import fit
 

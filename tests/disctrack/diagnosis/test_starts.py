@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc import slip_start
-from disctrack.diagnosis.disc.stretch import free_stretch
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis import diagnose_trajectory, slip_start
+from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.pages.output import as_json
+from disctrack.diagnosis.stretch import free_stretch
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import Settings
 from disctrack.errors import AnalysisError

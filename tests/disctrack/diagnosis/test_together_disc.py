@@ -8,8 +8,8 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc.plan import Planner, Proposal
-from disctrack.diagnosis.together.loop import diagnose_together
+from disctrack.diagnosis.plan import Planner, Proposal
+from disctrack.diagnosis.together.discs import diagnose_together
 from disctrack.diagnosis.together.recordings import Recorded
 from disctrack.diagnosis.trials.recordings import K_M, measured
 from disctrack.synthetic.description import Scene

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose_trajectory
-from disctrack.diagnosis.disc.law_library import families
+from disctrack.diagnosis.law_library import families
 from disctrack.frames import nodal_axes_world
 from disctrack.rolling import Model, State, simulate
 from disctrack.rolling.effects import effect_from_formulas

@@ -10,12 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from disctrack.diagnosis import Candidate, Quantity, Settings, diagnose
 from disctrack.discrepancy.fit import compress, fit, solve_bounded, triangle
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
-from disctrack.discrepancy.search import _Search
-from disctrack.discrepancy.system import GivenUp, TrialGivenUp
+from disctrack.discrepancy.search import Settings, _Search, diagnose
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp
 from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 
 SIGMA = 0.01

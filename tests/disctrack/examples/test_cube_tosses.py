@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import diagnose
+from disctrack.discrepancy.search import diagnose
 from disctrack.examples.cube_data import CLEARANCE, HALF_WIDTH, flights, read_tosses, without_copies
 from disctrack.examples.cube_system import CubeTosses, whitening_blind_to
 from disctrack.examples.cube_tosses import SETTINGS, analyse_tosses, main

@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.analyse.published import SURFACES
-from disctrack.diagnosis import diagnose
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.search import diagnose
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
 from disctrack.examples.exponent_model import LastStage, Setup, slope

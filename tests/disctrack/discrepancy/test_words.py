@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from disctrack.diagnosis.pages.words import bounds
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.score import Score
 from disctrack.discrepancy.search import Found, _bounds
 from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.discrepancy.words import bounds
 
 TILT = tuple(Quantity(f"table_tilt.tilt_{axis}", "rad", 1e-6) for axis in "xy")
 DECLARED = Quantity("km.k_m", "m s^2", 1e-9)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import Settings, diagnose
-from disctrack.diagnosis.together.covariates import alike, hypotheses
-from disctrack.diagnosis.together.crew import Crew
-from disctrack.diagnosis.together.fitting_in import Blocks, apart
-from disctrack.diagnosis.together.joint import JointSystem
-from disctrack.diagnosis.together.sharing import Sharing
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.joint.covariates import alike, hypotheses
+from disctrack.discrepancy.joint.crew import Crew
+from disctrack.discrepancy.joint.fitting_in import Blocks, apart
+from disctrack.discrepancy.joint.joint_system import JointSystem
+from disctrack.discrepancy.joint.sharing import Sharing
+from disctrack.discrepancy.search import Settings, diagnose
 from disctrack.errors import AnalysisError
 from tests.oracles.decaying_runs import build, fitted_at_once, renamed, runs
 
@@ -212,7 +212,7 @@ def test_the_sigma_of_an_exponent_is_its_scatter_however_small_the_law_s_constan
     assert np.std(constant[:, 0]) == pytest.approx(np.mean(constant[:, 1]), rel=0.15)
 
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 FOUR = ("mass", "radius", "thickness", "density of the air")
 
 
@@ -282,7 +282,7 @@ def test_processes_that_end_at_once_are_an_error_and_no_silence(tmp_path):
     script = tmp_path / "unguarded.py"
     script.write_text(
         "import numpy as np\nfrom tests.oracles.decaying_runs import build, runs\n"
-        "from disctrack.diagnosis.together.crew import Crew\n"
+        "from disctrack.discrepancy.joint.crew import Crew\n"
         "items = runs(np.random.default_rng(1), 200)\n"
         "with Crew(build, items, 2) as crew:\n    crew.call('share', [(['state.a', 'state.b'],)] * 200)\n"
     )
@@ -297,7 +297,7 @@ def test_processes_that_end_at_once_are_an_error_and_no_silence(tmp_path):
 def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_path):
     script = tmp_path / "guarded.py"  # each process reads it for 3 s, as long imports take
     script.write_text(
-        "import os, time\nfrom disctrack.diagnosis.together.crew import Crew\n"
+        "import os, time\nfrom disctrack.discrepancy.joint.crew import Crew\n"
         "def build(item):\n    time.sleep(100)\n"
         "os.write(1, b'%d\\n' % os.getpid())\ntime.sleep(0.0 if __name__ == '__main__' else 3.0)\n"
         "if __name__ == '__main__':\n    with Crew(build, [1, 2], 2) as crew:\n        crew.call('share', [(), ()])\n"

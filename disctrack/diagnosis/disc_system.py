@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from calibration.kit.arrays import Array, Mask
-from disctrack.diagnosis.disc.faults import Sight, faults_of, measurement_candidates, predict, setup_of
-from disctrack.diagnosis.disc.motion import (
+from disctrack.diagnosis.faults import Sight, faults_of, measurement_candidates, predict, setup_of
+from disctrack.diagnosis.motion import (
     SLIP,
     model_quantities,
     motion_candidates,
@@ -21,10 +21,10 @@ from disctrack.diagnosis.disc.motion import (
     state_of,
     state_quantities,
 )
-from disctrack.diagnosis.disc.sought import sought
-from disctrack.diagnosis.disc.start import STRETCHES, start_values
-from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
-from disctrack.diagnosis.disc.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
+from disctrack.diagnosis.motion_start import STRETCHES, start_values
+from disctrack.diagnosis.sought import sought
+from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.discrepancy.fit import triangle
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.motion import state_of
-from disctrack.diagnosis.disc.stretch import MIN_FRAMES, MIN_THETA, Stretch
-from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.together.reduction import Reduction
-from disctrack.diagnosis.together.sharing import LAWS
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.motion import state_of
+from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.joint.reduction import Reduction
+from disctrack.discrepancy.joint.sharing import LAWS
 from disctrack.discrepancy.score import Linearisation, cleared, score, span
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Candidate, Quantity

@@ -20,9 +20,9 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.learned_law import WIDTH, LearnedLaw, _Blocks, probe
-from disctrack.diagnosis.disc.motion import state_of
-from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
+from disctrack.diagnosis.disc_system import THETA_END, DiscSystem
+from disctrack.diagnosis.learned_law import WIDTH, LearnedLaw, _Blocks, probe
+from disctrack.diagnosis.motion import state_of
 from disctrack.discrepancy.fit import Fit, triangle
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate

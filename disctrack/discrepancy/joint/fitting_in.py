@@ -14,8 +14,8 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.together.joint import JointSystem
 from disctrack.discrepancy.fit import Fit, prior_rows, triangle
+from disctrack.discrepancy.joint.joint_system import JointSystem
 from disctrack.discrepancy.system import Candidate
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.system import Subset, System
 

@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 
 from calibration.cameras.camera import StereoRig, placed_at
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.faults import MeasurementSetup, faults_of, setup_of
-from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
-from disctrack.diagnosis.disc.system import DiscSystem
-from disctrack.diagnosis.disc.systematic import Systematic, find_systematic, with_noise_of_frames
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.faults import MeasurementSetup, faults_of, setup_of
+from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found, Tried
 from disctrack.discrepancy.system import Candidate, Values

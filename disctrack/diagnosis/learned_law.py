@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.errors import simulated
-from disctrack.diagnosis.disc.law_library import Family, families
-from disctrack.diagnosis.disc.left_over import left_over
-from disctrack.diagnosis.disc.motion import STATE_SCALES, state_of
-from disctrack.diagnosis.disc.system import THETA_END, DiscSystem
+from disctrack.diagnosis.disc_system import THETA_END, DiscSystem
+from disctrack.diagnosis.errors import simulated
+from disctrack.diagnosis.law_library import Family, families
+from disctrack.diagnosis.left_over import left_over
+from disctrack.diagnosis.motion import STATE_SCALES, state_of
 from disctrack.discrepancy.fit import Fit, fit, prior_rows, triangle
 from disctrack.discrepancy.nuisances import is_linear, projection
 from disctrack.discrepancy.shape import profiled

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
-from disctrack.diagnosis.disc.stretch import FIRST_WINDOW
+from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
+from disctrack.diagnosis.stretch import FIRST_WINDOW
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.system import Values
 from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_rotation
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.disc.system import DiscSystem
+    from disctrack.diagnosis.disc_system import DiscSystem
 
 
 STRETCHES = (0.03, 0.08, 0.2, 0.5)  # [s] a linear step from one stretch's fit stays in the next one's basin

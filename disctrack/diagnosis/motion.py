@@ -98,5 +98,6 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
 
 def slip_candidate(effect: type[Effect]) -> Candidate:
     """Slip by 1/mu, which is zero where the disc never slips; without a derivative until it slips somewhere."""
-    inverse = Quantity(SLIP, "1", 0.1, lower=0.0, upper=1e3, typical=10.0, meaning="1 / coefficient of friction")
+    meaning = "1 / coefficient of friction"
+    inverse = Quantity(SLIP, "1", 0.1, lower=0.0, upper=1e3, typical=10.0, reciprocal="mu", meaning=meaning)
     return Candidate(effect.name, effect.name, "motion", effect.title, effect.source, (inverse,), threshold=True)

@@ -15,8 +15,8 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from disctrack.diagnosis.together.joint import Request
-from disctrack.diagnosis.together.reduction import Reduced
+from disctrack.discrepancy.joint.joint_system import Request
+from disctrack.discrepancy.joint.reduction import Reduced
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.recording.readers.blocks import ONE_THREAD
 

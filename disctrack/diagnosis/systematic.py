@@ -21,7 +21,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.disc.system import DiscSystem, StaticView
+    from disctrack.diagnosis.disc_system import DiscSystem, StaticView
     from disctrack.discrepancy.system import Values
 
 

@@ -17,7 +17,7 @@ from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Values
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.disc.system import DiscSystem
+    from disctrack.diagnosis.disc_system import DiscSystem
 
 ANGLES = 48  # round the rim: 7.5 deg apart, half the width of a flat
 PEAKS = 6  # of the spectrum

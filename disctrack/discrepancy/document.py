@@ -6,12 +6,73 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.diagnosis.pages.output import effect_json, tried_json
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.discrepancy.search import Diagnosis
+from disctrack.discrepancy.search import Diagnosis, Found, Tried
+from disctrack.discrepancy.significance import as_sigmas
+from disctrack.discrepancy.words import shown, together
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+def parameters_json(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
+    """Fitted numbers with their standard deviations."""
+    found = []
+    for q in quantities:
+        name, value, sigma = shown(q, fit)
+        amount = {"name": name, "value": value, "sigma": sigma}
+        found.append(amount | {"unit": q.unit, "meaning": q.meaning})
+    return found
+
+
+def effect_json(found: Found, after: Fit, apart: Mapping[str, Any] = _NOTHING) -> dict[str, Any]:
+    """One effect found, of any system.
+
+    after : fit of the enlarged model
+    apart : what would separate the effect from its rivals, by their names
+    """
+    c = found.candidate
+    return {
+        "name": c.effect,
+        "candidate": c.name,
+        "kind": c.kind,
+        "title": c.title,
+        "source": c.source,
+        "parameters": parameters_json(c.quantities, after),
+        "correlated": [vars(pair) for pair in together(found, after)],
+        "class": [
+            {
+                "name": r.candidate.name,
+                "angle_deg": np.degrees(r.angle),
+                "delta_chi_square": r.loss,
+                "parameters": parameters_json(r.candidate.quantities, r.fit),
+                "separated_by": apart.get(r.candidate.name),
+            }
+            for r in found.cannot_be_told_from
+        ],
+        "score": found.gain,
+        "threshold": found.threshold,
+        "significance_sigma": as_sigmas(found.gain, len(c.quantities)),
+        "held_out_gain": found.held_out_gain,
+    }
+
+
+def tried_json(tried: Tried) -> dict[str, Any]:
+    """What became of one candidate, of any system."""
+    return {
+        "name": tried.candidate.name,
+        "kind": tried.candidate.kind,
+        "score": tried.score,
+        "refit_gain": tried.gain,
+        "held_out_gain": tried.held_out_gain,
+        "reason": tried.reason,
+    }
+
+
+def declared_json(fit: Fit) -> dict[str, Any]:
+    """Numbers of the declared laws with their standard deviations."""
+    laws = [q for q in fit.quantities if not q.is_initial and not np.isfinite(q.prior_sigma)]
+    return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
 
 
 def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, Any]:
@@ -20,7 +81,7 @@ def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, 
     noise : variance of the noise over that stated; the chi-squares are in units of it
     """
     ratio = None if held is None or not np.isfinite(held.chi_square) else held.ratio_to_floor / np.sqrt(noise)
-    free = {q.name: q for q in fit.quantities if not q.name.startswith("state.")}
+    free = {q.name: q for q in fit.quantities if not q.is_initial}
     return {
         "reduced_chi_square": fit.reduced_chi_square / noise,
         "held_out": {"ratio_to_noise_floor": ratio},

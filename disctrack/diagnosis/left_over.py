@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field
 
 from calibration.kit.brief import Brief
-from disctrack.diagnosis.disc.errors import Errors
-from disctrack.diagnosis.disc.form_misfit import LawCourse
-from disctrack.diagnosis.disc.learned_law import LearnedLaw
-from disctrack.diagnosis.disc.plan import Plan, Separation
-from disctrack.diagnosis.disc.regimes import Regimes
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.errors import Errors
+from disctrack.diagnosis.form_misfit import LawCourse
+from disctrack.diagnosis.learned_law import LearnedLaw
+from disctrack.diagnosis.plan import Plan, Separation
+from disctrack.diagnosis.regimes import Regimes
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.search import Diagnosis

@@ -6,8 +6,8 @@ from typing import Protocol
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.together.reduction import Reduced
-from disctrack.diagnosis.together.sharing import Sharing
+from disctrack.discrepancy.joint.reduction import Reduced
+from disctrack.discrepancy.joint.sharing import Sharing
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 
 Request = tuple[int, dict[str, float], tuple[str, ...]]  # recording, its shared values, names

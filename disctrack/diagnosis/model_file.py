@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from calibration.cameras.camera import StereoRig, placed_at, rotation_from_vector
-from disctrack.diagnosis.disc.faults import scene_faults, setup_of, values_in_scene
-from disctrack.diagnosis.disc.scene_rig import scene_with_rig
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.faults import scene_faults, setup_of, values_in_scene
+from disctrack.diagnosis.scene_rig import scene_with_rig
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables

@@ -12,13 +12,13 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
-from disctrack.diagnosis.disc.errors import simulated
-from disctrack.diagnosis.disc.large_faults import Assumed, find_clock, find_large, in_words, with_large
-from disctrack.diagnosis.disc.motion import SLIP, SLIP_VELOCITY, slip_candidate
-from disctrack.diagnosis.disc.start import first_slip
-from disctrack.diagnosis.disc.stretch import Stretch, free_stretch
-from disctrack.diagnosis.disc.system import MOST_SLIP_STEPS, DiscSystem, Patience
-from disctrack.diagnosis.disc.systematic import find_systematic, with_noise_of_frames
+from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem, Patience
+from disctrack.diagnosis.errors import simulated
+from disctrack.diagnosis.large_faults import Assumed, find_clock, find_large, in_words, with_large
+from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
+from disctrack.diagnosis.motion_start import first_slip
+from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance

@@ -7,20 +7,19 @@ out. The cost is linear in the number of recordings.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.disc.model_file import PAPER
-from disctrack.diagnosis.disc.plan import Plan, Question
-from disctrack.diagnosis.together.covariates import Hypothesis, hypotheses
-from disctrack.diagnosis.together.crew import Crew
-from disctrack.diagnosis.together.fitting_in import Blocks, FitsIn, apart
-from disctrack.diagnosis.together.joint import JointSystem
-from disctrack.diagnosis.together.recordings import Alone, Item, Recorded, Say, build, in_common, labels_of
-from disctrack.diagnosis.together.sharing import EACH, Member, Sharing
 from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
+from disctrack.discrepancy.joint.crew import Crew
+from disctrack.discrepancy.joint.fitting_in import Blocks, FitsIn, apart
+from disctrack.discrepancy.joint.joint_system import JointSystem
+from disctrack.discrepancy.joint.sharing import EACH, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, cleared, score_all, span
 from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
 from disctrack.discrepancy.significance import TWO_SIDED
@@ -30,8 +29,22 @@ from disctrack.errors import AnalysisError, DiscTrackError
 TEST_EVERY = 3  # of the recordings, every so many is foretold from the others
 ROUNDS = 3  # of leaving recordings out
 NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
-OPEN = 6  # questions that further recordings are sought for
 OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
+
+
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What one recording says of itself with a model, fitted alone."""
+
+    values: dict[str, float]  # of all its quantities
+    sigmas: dict[str, float]  # of those that it may share and that have no prior
+    inflation: dict[str, float]  # by which these grow because what is left has a memory
+    chi_square: float
+    degrees: int
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -78,7 +91,6 @@ class TogetherDiagnosis:
     dependences: tuple[Dependence, ...]
     notes: tuple[str, ...]
     unusable: tuple[str, ...] = ()  # recordings that were left out unheard, as they could not be read or fitted
-    plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
 
     @property
     def used(self) -> tuple[str, ...]:
@@ -86,71 +98,62 @@ class TogetherDiagnosis:
         return tuple(m.name for m in self.system.sharing.members)
 
 
-def diagnose_together(
-    recordings: Sequence[Recorded],
-    model: str = PAPER,
+def answer_together(
+    crew: Crew,
+    described: Sequence[tuple[str, Mapping[str, str]]],
+    in_common: Callable[[list[Any]], list[Any]],
     settings: Settings | None = None,
-    processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
-    settle: bool = False,
-    unread: Mapping[str, str] | None = None,
+    unread: Mapping[str, str] = _NOTHING,
 ) -> TogetherDiagnosis:
-    """What does the model lack, of all recordings together?
+    """What does the model lack, of all the crew's recordings together?
 
-    model : as `diagnose_trajectory`
-    unread : further recordings that are told of as left out, and why
-    processes : among which the recordings are dealt out; the answer does not depend on their number
-    settle : also compute which further recording would settle what is left open
-    Raises AnalysisError where fewer than two recordings can be used.
+    crew : objects with the methods `told` (a Member first of all), `with_common`, `share`, `reduce` and `alone`
+    described : name and labels of each
+    in_common : of all that was told, what each is then given by `with_common`: errors that it shares with others
+    unread : further recordings that are reported as left out, and why
+    The crew is left with the recordings that the answer rests on.
+    Raises AnalysisError where fewer than two can be used.
     """
     settings = replace(settings or Settings(), noise=1.0)
-    labels = labels_of(recordings)
-    items = [Item(r, label, model) for r, label in zip(recordings, labels, strict=True)]
-    progress(f"{len(items)} recordings, each alone")
-    with Crew(build, items, processes) as crew:
-        told = crew.call("told", [()] * len(items))
-        reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
-        kept = [i for i in range(len(items)) if i not in reasons]
-        _enough(kept, recordings, reasons, unread or {})
+    names, n = [name for name, _ in described], len(described)
+    told = crew.call("told", [()] * n)
+    reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
+    kept = [i for i in range(n) if i not in reasons]
+    _enough(kept, names, reasons, unread)
+    crew.keep(kept)
+    refitted = crew.call("with_common", [(s,) for s in in_common([told[i] for i in kept])])
+    reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
+    members: list[Member] = [m for m in refitted if not isinstance(m, DiscTrackError)]
+    kept = [i for i in kept if i not in reasons]
+    unusable = (*(names[i] for i in reasons), *unread)
+    for round_ in range(ROUNDS + 1):
+        _enough(kept, names, reasons, unread)
         crew.keep(kept)
-        members: list[Member] = []
-        refitted = crew.call("with_systematic", [(s,) for s in in_common([told[i] for i in kept])])
-        reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
-        members = [m for m in refitted if not isinstance(m, DiscTrackError)]
-        kept = [i for i in kept if i not in reasons]
-        unusable = (*(recordings[i].name for i in reasons), *(unread or {}))
-        for round_ in range(ROUNDS + 1):
-            _enough(kept, recordings, reasons, unread or {})
-            crew.keep(kept)
-            system, diagnosis = _search(members, crew, settings, progress)
-            most = len(members) - (2 * len(items) + 2) // 3 if round_ < ROUNDS else 0
-            effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
-            out = apart(system, diagnosis.after, settings.false_alarm, most, effects)
-            if not out:
-                break
-            for k, effect in out.items():
-                reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
-            members = [m for k, m in enumerate(members) if k not in out]
-            kept = [i for k, i in enumerate(kept) if k not in out]
-        progress("each recording against the others")
-        diagnosis, alone = _with_memory(system, diagnosis, crew)
-        by_recording = (
-            *_of_recordings(items, kept, reasons, system, diagnosis, alone),
-            *(OfRecording(name, {}, reason) for name, reason in (unread or {}).items()),
-        )
-        bounds = _bounds(system, diagnosis)
-        proposed = _plan(system, diagnosis, bounds, crew) if settle else None
-    dependences = _dependences(system, diagnosis)
-    notes = _notes(by_recording)
-    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, notes, unusable, proposed)
+        system, diagnosis = _search(members, crew, settings, progress)
+        most = len(members) - (2 * n + 2) // 3 if round_ < ROUNDS else 0
+        effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
+        out = apart(system, diagnosis.after, settings.false_alarm, most, effects)
+        if not out:
+            break
+        for k, effect in out.items():
+            reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
+        members = [m for k, m in enumerate(members) if k not in out]
+        kept = [i for k, i in enumerate(kept) if k not in out]
+    progress("each recording against the others")
+    diagnosis, alone = _with_memory(system, diagnosis, crew)
+    by_recording = (
+        *_of_recordings(described, kept, reasons, system, diagnosis, alone),
+        *(OfRecording(name, {}, reason) for name, reason in unread.items()),
+    )
+    bounds, dependences = _bounds(system, diagnosis), _dependences(system, diagnosis)
+    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, _notes(by_recording), unusable)
 
 
-def _enough(
-    kept: Sequence[int], recordings: Sequence[Recorded], reasons: Mapping[int, str], unread: Mapping[str, str]
-) -> None:
+def _enough(kept: Sequence[int], names: Sequence[str], reasons: Mapping[int, str], unread: Mapping[str, str]) -> None:
     if len(kept) >= 2:
         return
-    told = {recordings[i].name: reason for i, reason in reasons.items()} | dict(unread)
+    told = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
     said = "; ".join(f"{name}: {reason}" for name, reason in list(told.items())[:5])
     raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
 
@@ -204,7 +207,7 @@ def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple
 
 
 def _of_recordings(
-    items: Sequence[Item],
+    described: Sequence[tuple[str, Mapping[str, str]]],
     kept: Sequence[int],
     reasons: dict[int, str],
     system: JointSystem,
@@ -214,13 +217,12 @@ def _of_recordings(
     blocks = Blocks(system, diagnosis.after)
     everyone = list(range(len(kept)))
     found = []
-    for i, item in enumerate(items):
-        name, labels = item.recorded.name, dict(item.labels)
+    for i, (name, labels) in enumerate(described):
         if i in reasons:
-            found.append(OfRecording(name, labels, reasons[i]))
+            found.append(OfRecording(name, dict(labels), reasons[i]))
             continue
         k = kept.index(i)
-        found.append(OfRecording(name, labels, "", blocks.fits_in(k, everyone), alone[k]))
+        found.append(OfRecording(name, dict(labels), "", blocks.fits_in(k, everyone), alone[k]))
     return tuple(found)
 
 
@@ -266,36 +268,6 @@ def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> d
             for c in system.candidates
         }
     return found
-
-
-def _plan(system: JointSystem, diagnosis: Diagnosis, bounds: Sequence[Bound], crew: Crew) -> Plan | None:
-    """Recordings beside all these, with disc, surface and cameras of the longest of them."""
-    sharing, after = system.sharing, diagnosis.after
-    longest = int(np.argmax(system.weights))
-    local = {c.name for c in sharing.members[longest].candidates}
-    found = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
-    open_sizes = [b for b in bounds if b.upper is not None and b.candidate.kind == "motion"]
-    open_sizes.sort(key=lambda b: -float(b.sigma[0]) / b.candidate.quantities[0].typical)
-    questions = [*found, *(Question(b.candidate) for b in open_sizes)]
-    questions = [q for q in questions if {c.name for c in (q.effect, q.rival) if c is not None} <= local][:OPEN]
-    if not questions:
-        return None
-    known = {q.name: q for q in after.quantities}
-    tested = [q for x in questions for c in (x.effect, x.rival) if c is not None for q in c.quantities]
-    new = {q.name: q for q in tested if q.name not in known}
-    everything = {**known, **new}
-    names = {there: shared for there, shared in sharing.shared_names(longest).items() if shared in everything}
-    others = [n for n in everything if n not in set(names.values())]
-    _, derivative = system.linearise({q.name: q.null for q in new.values()} | after.values, [*others, *names.values()])
-    rows = derivative.reshape(-1, derivative.shape[-1])
-    priors = np.zeros((len(others), rows.shape[1]))
-    priors[:, : len(others)] = np.diag([1.0 / everything[n].prior_sigma for n in others])
-    R = triangle(np.concatenate([rows, priors]))
-    said = Say(tuple(names), R[len(others) :, len(others) :])
-    extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
-    values = sharing.local_values(longest, after.values)
-    answer = crew.ask(longest, "planned", values, extra, questions, said)
-    return answer if isinstance(answer, Plan) else None
 
 
 def _spread(base: Array, mine: Array) -> Array:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import trapezoid
 
-from disctrack.diagnosis.disc.motion import state_of
-from disctrack.diagnosis.disc.system import DiscSystem
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.motion import state_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.system import Values

@@ -1,1 +1,0 @@
-"""The rolling disc, its cameras, table and dots as a system that the engine can diagnose."""
