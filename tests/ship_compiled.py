@@ -26,7 +26,7 @@ from calibration import _corner_kernel, _normal_kernel, compiled
 from calibration.board import corner_fit
 from calibration.fit import normal_equations
 from disctrack.discrepancy.equations import _ode_kernel, _stiff_kernel
-from disctrack.recording.readers import _lzw, _png
+from disctrack.recording.readers import _png
 from disctrack.rolling import equations, integrate
 from disctrack.rolling._compiled import law_types, may_call, system_types
 from disctrack.rolling.effects.base import HELPERS, catalogue
@@ -38,8 +38,6 @@ PREPARED = (  # function, what compiles it, for how many types
     (_corner_kernel.fit_corners, corner_fit.prepare, 1),
     (_normal_kernel.accumulate, normal_equations.prepare, 1),
     (_png._undo_filters, _png.prepare, 2),
-    (_lzw.decode_lzw, _lzw.prepare, 1),
-    (_lzw.undo_differences, _lzw.prepare, 2),
     (_kernels.track_frames, lambda: [following.prepare(bits) for bits in (np.uint8, np.uint16)], 2),
     (_kernels.look, lambda: [dots.prepare(bits) for bits in (np.uint8, np.uint16)], 2),
     (_pose_kernel.fit, pose.prepare, 1),

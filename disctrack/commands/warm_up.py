@@ -9,7 +9,6 @@ from calibration.compiled import when_compiling
 from calibration.fit import normal_equations
 from disctrack.commands import DONE
 from disctrack.progress import compiling
-from disctrack.recording.readers import _lzw as lzw
 from disctrack.recording.readers import _png as png
 from disctrack.rolling import _assembly as assembly
 from disctrack.rolling import integrate
@@ -25,7 +24,6 @@ def run(arguments: argparse.Namespace) -> int:
     with when_compiling(lambda: compiled.append(None)):
         with compiling("readers", 1):
             png.prepare()
-            lzw.prepare()
         with compiling("corners", 8):
             corner_fit.prepare()
             normal_equations.prepare()

@@ -2,7 +2,6 @@
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -11,22 +10,11 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._png import PngHeader, decode_plain_grey
-from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size
-from disctrack.recording.readers.tiff_directories import Code, Field, Tag, Tiff, TiffContent, assembled
-from disctrack.recording.readers.tiff_pixels import plain_grey
+from disctrack.recording.readers.raw import check_claim
+from disctrack.recording.readers.tiff_pages import TiffContent, page_pixels, pages_of
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_WHITE_IS_ZERO = 0  # of tag 262
-# Compressions that OpenCV's libtiff decodes; of most others it delivers black images without a word.
-_BY_LIBTIFF = frozenset((1, 2, 3, 4, 5, 6, 7, 8, 32771, 32773, 32946))
-_OTHERS = {
-    34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 34933: "PNG", 34934: "JPEG XR", 22610: "JPEG XR",
-    50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL",
-}  # fmt: skip
-# A header may claim any size, and decoding must not exhaust the memory. Even a black image does not shrink by more than
-# this when compressed (deflate: 1032); small ones are let pass.
-_MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
 
 
 def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
@@ -36,7 +24,7 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     Raises RecordingError that begins with `where`.
     """
     try:
-        header = _checked_container(content)
+        header = _checked_container(content, where)
         image = _tiff(content, where) if content[:4] in _TIFF_SIGNATURES else None
     except _Damaged as fault:
         raise RecordingError(f"{where}: {fault}. Copy or export this image again.") from fault
@@ -78,100 +66,33 @@ class _Damaged(Exception):
     """The text says what is wrong with the file as a container."""
 
 
-def _checked_container(content: bytes) -> PngHeader | None:
+def _checked_container(content: bytes, where: str) -> PngHeader | None:
     """Header of a PNG, None for other formats; only PNG has checksums, the others an end or a length to check."""
     if not content:
         raise _Damaged("the file is empty")
     if content.startswith(_PNG_SIGNATURE):
-        return _checked_png(content)
+        return _checked_png(content, where)
     if content.startswith(b"\xff\xd8"):
         if b"\xff\xd9" not in content[-1024:]:
             raise _Damaged("the JPEG file is truncated (no end marker)")
-        _check_size(*_jpeg_size(content), len(content))
+        check_claim(*_jpeg_size(content), len(content), where)
     if content.startswith(b"BM") and len(content) >= 26:
         declared = struct.unpack_from("<I", content, 2)[0]
         if declared > len(content):
             raise _Damaged(f"the BMP file ends after {len(content)} of {declared} bytes")
         width, height = struct.unpack_from("<ii", content, 18)
-        _check_size(abs(width), abs(height), len(content))
+        check_claim(abs(width), abs(height), len(content), where)
     return None
 
 
-def _tiff(content: bytes, where: str) -> NDArray | None:
-    """Pixels of the first page; None where libtiff must say what it is."""
+def _tiff(content: bytes, where: str) -> NDArray:
+    """Pixels of the first page."""
+    source = TiffContent(content)
     try:
-        tiff = Tiff(TiffContent(content))
-        tags, _ = tiff.directory(tiff.first)
-        _check_size(tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT), len(content))
-        alone = Code.TILE_OFFSETS not in tags and tiff.value(tags, Code.PHOTOMETRIC, 1) != _WHITE_IS_ZERO
-        whole = plain_grey(tiff, tags, tiff.pieces(tags, "")) if alone else None
-        unknown = _not_decoded(tiff, tags)
-        several = not alone and tiff.value(tags, Code.BITS, 1) >= 8
-    except RecordingError:
-        return None
-    if unknown:
-        raise _Damaged(unknown)
-    return page_of_tiff(tiff, tiff.first, where) if several else whole
-
-
-def _not_decoded(tiff: Tiff, tags: Mapping[int, Tag]) -> str:
-    """What OpenCV would leave out of a page without a word; "" where it does not."""
-    compression = tiff.value(tags, Code.COMPRESSION, 1)
-    if compression in _BY_LIBTIFF:
-        return ""
-    name = _OTHERS.get(compression, "unknown")
-    return f"its pixels are compressed by a method ({compression}, {name}) that is not read; LZW and deflate are"
-
-
-def page_of_tiff(tiff: Tiff, offset: int, where: str) -> NDArray:
-    """Pixels of the page with its directory at `offset`, by libtiff unless they are plain grey; tiles one by one.
-
-    Upright, and light is more: orientation and a white that is zero are undone.
-    """
-    tags, _ = tiff.directory(offset)
-    pieces, fields = tiff.pieces(tags, where), tiff.fields(tags, where)
-    if unknown := _not_decoded(tiff, tags):
-        raise RecordingError(f"{where}: {unknown}. Export this image again.")
-    if Code.TILE_OFFSETS in tags:
-        pixels = _tiles(tiff, tags, pieces, fields, where)
-    else:
-        plain = plain_grey(tiff, tags, pieces)
-        pixels = decode(assembled(tiff.order, fields, pieces), where) if plain is None else plain
-    if tiff.value(tags, Code.PHOTOMETRIC, 1) == _WHITE_IS_ZERO and pixels.dtype.kind == "u":
-        pixels = ~pixels
-    return np.ascontiguousarray(_upright(pixels, tiff.value(tags, Code.ORIENTATION, 1)))
-
-
-def _tiles(
-    tiff: Tiff, tags: Mapping[int, Tag], pieces: Sequence[bytes], fields: dict[int, Field], where: str
-) -> NDArray:
-    """Pixels of a page in tiles."""
-    width, height = tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
-    tile_width, tile_height = tiff.value(tags, Code.TILE_WIDTH), tiff.value(tags, Code.TILE_HEIGHT)
-    check_frame_size(width, height, where)
-    check_frame_size(tile_width, tile_height, where)
-    columns, rows = -(-width // tile_width), -(-height // tile_height)
-    if len(pieces) != columns * rows or tile_width * tile_height * len(pieces) > 4 * MOST_PIXELS:
-        raise RecordingError(
-            f"{where}: {len(pieces)} tiles for {columns} x {rows}; the page is damaged. Copy it again."
-        )
-    fields = fields | {Code.WIDTH: fields[Code.TILE_WIDTH], Code.HEIGHT: fields[Code.TILE_HEIGHT]}
-    for tag in (Code.TILE_WIDTH, Code.TILE_HEIGHT, Code.ROWS_PER_STRIP):
-        fields.pop(tag, None)
-    tiles = [decode(assembled(tiff.order, fields, [piece]), where) for piece in pieces]
-    if any(tile.shape[:2] != (tile_height, tile_width) for tile in tiles):
-        raise RecordingError(f"{where}: tiles of other sizes than announced; the page is damaged. Copy it again.")
-    lines = [np.hstack(tiles[row * columns : (row + 1) * columns]) for row in range(rows)]
-    return np.vstack(lines)[:height, :width]
-
-
-def _upright(pixels: NDArray, orientation: int) -> NDArray:
-    """Pixels whose row 0 and column 0 lie at the sides that TIFF 6.0 numbers (section 8), or Exif."""
-    if orientation in (5, 6, 7, 8):
-        pixels = pixels.swapaxes(0, 1)
-    if orientation in (2, 3, 6, 7):
-        pixels = pixels[:, ::-1]
-    return pixels[::-1] if orientation in (3, 4, 7, 8) else pixels
+        page = next(pages_of(source))
+    except (RecordingError, StopIteration) as error:
+        raise _Damaged(f"not a readable image, or damaged ({error})") from error
+    return page_pixels(source, page, where)
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
@@ -188,7 +109,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def _checked_png(content: bytes) -> PngHeader:
+def _checked_png(content: bytes, where: str) -> PngHeader:
     position, end, view = 8, len(content), memoryview(content)
     ihdr: tuple[int, ...] = ()
     data: list[tuple[int, int]] = []
@@ -203,7 +124,7 @@ def _checked_png(content: bytes) -> PngHeader:
             raise _Damaged(f"the PNG is damaged: wrong checksum of chunk {kind.decode('latin-1')!r} at byte {position}")
         if kind == b"IHDR" and length == 13:
             ihdr = struct.unpack_from(">IIBBBBB", content, start)
-            _check_size(ihdr[0], ihdr[1], end)
+            check_claim(ihdr[0], ihdr[1], end, where)
         elif kind == b"IDAT":
             data.append((start, stop))
         elif kind == b"tRNS":
@@ -212,9 +133,3 @@ def _checked_png(content: bytes) -> PngHeader:
             return PngHeader(ihdr[0], ihdr[1], ihdr[2], ihdr[3], ihdr[6] != 0, transparent, tuple(data))
         position = stop + 4
     raise _Damaged(f"the PNG file is truncated after {end} bytes (no end chunk)")
-
-
-def _check_size(width: int, height: int, n_bytes: int) -> None:
-    """Refuse a size that the file's n_bytes cannot hold."""
-    if width * height > min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes)):
-        raise _Damaged(f"the header claims {width} x {height} px, more than any such camera has or the file can hold")

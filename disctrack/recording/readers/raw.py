@@ -23,6 +23,8 @@ from disctrack.recording.readers.base import Frames
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
+# Even a black image does not shrink by more than this when compressed (deflate: 1032); small ones are let pass.
+_MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
 _PIECE = 1 << 20  # bytes hashed at a time
 
 
@@ -151,4 +153,13 @@ def check_frame_size(width: int, height: int, where: str) -> None:
         raise RecordingError(
             f"{where}: the header claims images of {width} x {height} px, which no camera of this kind has. "
             "The header is damaged, or not of this format: copy the file again."
+        )
+
+
+def check_claim(width: int, height: int, n_bytes: int, where: str) -> None:
+    """Raise RecordingError, beginning with `where`, for a size that n_bytes cannot hold, however compressed."""
+    if width * height > min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes)):
+        raise RecordingError(
+            f"{where}: the header claims {width} x {height} px, more than any such camera has or the file can hold. "
+            "Copy or export this image again."
         )

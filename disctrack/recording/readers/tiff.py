@@ -1,16 +1,15 @@
 """TIFF files of many pages: one file per camera, or several that continue one another.
 
-Pages without compression are read at the speed of memory, grey strips by LZW or deflate are decoded here; any other
-page goes to libtiff as a file of its own, made of the page's directory and its compressed bytes.
+Pages without compression are read at the speed of memory.
 """
 
 import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,26 +19,20 @@ import numpy as np
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, Frames, first_readable
-from disctrack.recording.readers.decoding import as_grey, page_of_tiff
+from disctrack.recording.readers.decoding import as_grey
 from disctrack.recording.readers.raw import RawFile, RawFrames, check_frame_size
-from disctrack.recording.readers.tiff_directories import Code, Tag, Tiff, assembled, chain
-
-_REDUCED_IMAGE = 1  # bit of tag 254: a thumbnail of another page
+from disctrack.recording.readers.tiff_pages import Page, page_pixels, pages_of
 
 
 def is_stack(file: Path) -> bool:
     """True for a TIFF file that holds more than one frame; False also for what is no TIFF file at all."""
+    found = 0
     try:
-        tiff = Tiff(RawFile(file))
-        first, following = tiff.directory(tiff.first)
-        if not following:
-            return _pages_announced(tiff.description(first)) > 1
+        for page in islice(pages_of(RawFile(file)), 2):
+            found += max(_pages_announced(page.description), 1)
     except RecordingError:
-        return False
-    try:  # a thumbnail may follow, which is no frame
-        return any(not tiff.value(tags, Code.SUBFILE, 0) & _REDUCED_IMAGE for _, tags in islice(chain(tiff), 1, None))
-    except RecordingError:
-        return True  # cut short after the first page
+        return found > 0  # cut short after the first page
+    return found > 1
 
 
 def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
@@ -48,47 +41,30 @@ def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     The frame rate is taken from the notes of ImageJ or OME in the first page, time stamps from those of OME.
     """
     raw_files = [RawFile(file) for file in files]
-    tiffs = [Tiff(file) for file in raw_files]
     pages, notes = [], []
-    for number, tiff in enumerate(tiffs):
-        found, note = _pages(tiff, number)
-        pages += found
+    for number, file in enumerate(raw_files):
+        found, note = _pages(file)
+        pages += [(number, page) for page in found]
         notes += [f"{camera} camera: {note}"] if note else []
     if not pages:
         raise RecordingError(f"{files[0]}: a TIFF file without a page that can be read. Export it again.")
-    rate, stamps = _times(tiffs[0].description(tiffs[0].directory(tiffs[0].first)[0]), len(pages))
-    first = pages[0]
+    first = pages[0][1]
+    rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.width, first.height, str(files[0]))
-    if all(page.raw_offset >= 0 and page.layout == first.layout for page in pages):
+    offsets = np.array([page.plain_offset for _, page in pages], np.int64)
+    if (offsets >= 0).all() and all(page.layout == first.layout for _, page in pages):
         return RawFrames(
             raw_files,
-            np.array([page.file for page in pages]),
-            np.array([page.raw_offset for page in pages], np.int64),
+            np.array([number for number, _ in pages]),
+            offsets,
             (first.width, first.height),
-            np.dtype(f"{tiffs[0].order}u{first.bits // 8}"),
+            first.dtype,
             camera,
             notes=tuple(notes),
             timestamps=stamps,
             frame_rate=rate,
         )
-    return TiffPages(tiffs, pages, camera, tuple(notes), stamps, rate)
-
-
-@dataclass(frozen=True)
-class _Page:
-    """One frame: where its directory and, if it is stored plainly, its pixels lie."""
-
-    file: int
-    directory: int  # byte offset
-    width: int
-    height: int
-    bits: int
-    order: str  # "<" or ">"
-    raw_offset: int  # -1: compressed, tiled, colour, or in pieces
-
-    @property
-    def layout(self) -> tuple[int, int, int, str]:
-        return self.width, self.height, self.bits, self.order
+    return TiffPages(raw_files, pages, camera, tuple(notes), stamps, rate)
 
 
 class TiffPages(Frames):
@@ -96,14 +72,15 @@ class TiffPages(Frames):
 
     def __init__(
         self,
-        tiffs: Sequence[Tiff],
-        pages: Sequence[_Page],
+        files: Sequence[RawFile],
+        pages: Sequence[tuple[int, Page]],
         camera: str,
         notes: tuple[str, ...],
         timestamps: Array | None,
         frame_rate: float | None,
     ) -> None:
-        self._tiffs, self._pages, self.camera = list(tiffs), list(pages), camera
+        """Frames from pages, each with the number of its file."""
+        self._files, self._pages, self.camera = list(files), list(pages), camera
         self.timestamps, self.frame_rate, self.notes = timestamps, frame_rate, notes
         first = first_readable(len(pages), camera, lambda index: self._decoded(index, None, self._place(index)))
         self.image_size, self.dtype = first.shape[::-1], first.dtype
@@ -114,98 +91,54 @@ class TiffPages(Frames):
 
     def describe(self, index: int) -> str:
         """File and page."""
-        return f"{self._place(index)}, frame {index} (directory at byte {self._pages[index].directory})"
+        return f"{self._place(index)}, frame {index} (directory at byte {self._pages[index][1].directory})"
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of the pages of frames start..stop-1, as they are stored."""
         total = hashlib.sha256()
-        for index in range(start, stop):
-            tiff = self._tiffs[self._pages[index].file]
-            try:
-                tags, _ = tiff.directory(self._pages[index].directory)
-                content = assembled(tiff.order, tiff.fields(tags, ""), tiff.pieces(tags, ""))
-                total.update(hashlib.sha256(content).digest())
-            except RecordingError:
-                total.update(b"unreadable")
+        for number, page in self._pages[start:stop]:
+            total.update(hashlib.sha256(page.layout.encode()).digest())
+            for place, size in zip(page.places, page.sizes, strict=True):
+                self._files[number].update_digest(total, place, size)
         return total.hexdigest()
 
     def _place(self, index: int) -> str:
-        return str(self._tiffs[self._pages[index].file].file.path)
+        return str(self._files[self._pages[index][0]].path)
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        page = self._pages[index]
-        check_frame_size(page.width, page.height, where)
-        try:
-            return as_grey(page_of_tiff(self._tiffs[page.file], page.directory, where), where)
-        except RecordingError as error:
-            text = str(error)
-            raise RecordingError(text if text.startswith(where) else f"{where}: {text}") from error
+        number, page = self._pages[index]
+        return as_grey(page_pixels(self._files[number], page, where), where)
 
 
-def _pages(tiff: Tiff, number: int) -> tuple[list[_Page], str | None]:
+def _pages(file: RawFile) -> tuple[list[Page], str | None]:
     """Frames of one file, and a note where the chain of directories breaks off."""
-    pages: list[_Page] = []
+    pages: list[Page] = []
     note = None
     try:
-        for offset, tags in chain(tiff):
-            if not tiff.value(tags, Code.SUBFILE, 0) & _REDUCED_IMAGE:
-                pages.append(_page(tiff, number, offset, tags))
+        for page in pages_of(file):
+            pages.append(page)
     except RecordingError as error:
         if not pages:
             raise
         note = f"only {len(pages)} pages are whole ({error})"
     if len(pages) == 1:
-        pages = _without_directories(tiff, pages[0])
+        pages = _without_directories(file, pages[0])
     return pages, note
 
 
-def _page(tiff: Tiff, number: int, offset: int, tags: Mapping[int, Tag]) -> _Page:
-    width, height = tiff.value(tags, Code.WIDTH), tiff.value(tags, Code.HEIGHT)
-    bits = tiff.value(tags, Code.BITS, 1)
-    return _Page(number, offset, width, height, bits, tiff.order, _raw_offset(tiff, tags, width * height * bits // 8))
-
-
-def _raw_offset(tiff: Tiff, tags: Mapping[int, Tag], size: int) -> int:
-    """Where the pixels lie, one after the other and as they are; -1 if they do not."""
-    plain = {
-        Code.COMPRESSION: (1,),
-        Code.PHOTOMETRIC: (1,),
-        Code.ORIENTATION: (1,),
-        Code.FILL_ORDER: (1,),
-        Code.SAMPLES: (1,),
-        Code.SAMPLE_FORMAT: (1,),
-    }
-    if Code.TILE_OFFSETS in tags or tiff.value(tags, Code.BITS, 1) not in (8, 16):
-        return -1
-    if any(tiff.value(tags, tag, 1) not in allowed for tag, allowed in plain.items()):
-        return -1
-    places = [min(place, tiff.file.size) for place in tiff.values(tags, Code.STRIP_OFFSETS)]  # beyond it nothing lies
-    if len(places) == 1:
-        return places[0]
-    counts = tiff.values(tags, Code.STRIP_COUNTS)
-    follow = len(places) == len(counts) and all(a + n == b for a, n, b in zip(places, counts, places[1:], strict=False))
-    return places[0] if follow and sum(counts) == size else -1
-
-
-def _without_directories(tiff: Tiff, first: _Page) -> list[_Page]:
+def _without_directories(file: RawFile, first: Page) -> list[Page]:
     """All frames of a file with one directory, as ImageJ writes stacks: the others follow the first without a gap."""
-    tags, _ = tiff.directory(first.directory)
-    n = _pages_announced(tiff.description(tags))
-    size = first.width * first.height * first.bits // 8
+    n, size = _pages_announced(first.description), first.width * first.height * first.dtype.itemsize
     if n < 2 or size == 0:
         return [first]
-    if first.raw_offset < 0:
+    if first.plain_offset < 0:
         raise RecordingError(
-            f"{tiff.file.path}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
+            f"{file.path}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
             "from another corner, compressed, or no grey values of 8 or 16 bit). Export it again, black as zero."
         )
-    most = max(1, -(-tiff.file.size // size))  # of a file cut short the frames that begin in it; the next is the end
-    return [
-        _Page(
-            first.file, first.directory, first.width, first.height, first.bits, first.order, first.raw_offset + i * size
-        )
-        for i in range(min(n, most))
-    ]
+    most = max(1, -(-file.size // size))  # of a file cut short the frames that begin in it; the next is the end
+    start = first.plain_offset
+    return [replace(first, places=(start + i * size,), sizes=(size,)) for i in range(min(n, most))]
 
 
 def _pages_announced(description: str) -> int:

@@ -1,0 +1,216 @@
+"""Pages of TIFF files: tifffile reads their directories, imagecodecs their pieces.
+
+Both take a file at its word. Here nothing is read or made that the file cannot hold, whatever its numbers say, and what
+a damaged file makes of it is an error that names the file.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from disctrack.errors import RecordingError
+from disctrack.recording.readers.raw import MOST_PIXELS, check_claim, check_frame_size
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
+
+_REDUCED_IMAGE = 1  # bit of a page's subfile type: a thumbnail of another page
+_WHITE_IS_ZERO, _PALETTE = 0, 3
+_COMPRESSIONS = {1: "none", 5: "LZW", 7: "JPEG", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
+_OTHERS = {
+    2: "fax", 3: "fax", 4: "fax", 34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 34933: "PNG", 34934: "JPEG XR",
+    22610: "JPEG XR", 50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL",
+}  # fmt: skip
+# Tags by which the pixels of two pages are decoded alike.
+_LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
+
+
+class Source(Protocol):
+    """What a file must give to be read as TIFF: a RawFile, or TiffContent."""
+
+    path: Path
+    size: int
+
+    def bytes_at(self, offset: int, size: int, where: str) -> bytes:
+        """Bytes from an offset on. Raises RecordingError where there are fewer."""
+        ...
+
+
+class TiffContent:
+    """A file's content that was read already."""
+
+    def __init__(self, content: bytes, path: Path = Path("TIFF content")) -> None:
+        self._content, self.size, self.path = content, len(content), path
+
+    def bytes_at(self, offset: int, size: int, where: str) -> bytes:
+        """Bytes from an offset on. Raises RecordingError where there are fewer."""
+        if offset < 0 or size < 0 or offset + size > self.size:
+            raise RecordingError(f"{where}: {size} bytes at byte {offset} are announced, but there are {self.size}.")
+        return self._content[offset : offset + size]
+
+
+@dataclass(frozen=True)
+class Page:
+    """One page: where its directory and the pieces of its pixels lie."""
+
+    directory: int  # byte offset
+    places: tuple[int, ...]  # byte offsets of strips or tiles
+    sizes: tuple[int, ...]  # [bytes]
+    layout: str  # all by which the pixels are decoded
+    like: tifffile.TiffPage  # the first page of the file with this layout; of it no more than the layout is meant
+    description: str
+
+    @property
+    def width(self) -> int:
+        """[px]."""
+        return int(self.like.imagewidth)
+
+    @property
+    def height(self) -> int:
+        """[px]."""
+        return int(self.like.imagelength)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of a pixel in the file, in its order of bytes."""
+        return np.dtype(self.like.dtype).newbyteorder(self.like.parent.byteorder)
+
+    @property
+    def plain_offset(self) -> int:
+        """Where grey values of whole bytes lie, upright, one after the other and as they are; -1 if they do not."""
+        page, size = self.like, self.width * self.height * self.dtype.itemsize
+        grey = page.photometric == 1 and page.samplesperpixel == 1 and page.fillorder == 1
+        whole = page.bitspersample in (8, 16) and self.dtype.kind == "u"
+        if not (grey and whole) or page.compression != 1 or page.is_tiled or _orientation(page) != 1:
+            return -1
+        follow = all(a + n == b for a, n, b in zip(self.places, self.sizes, self.places[1:], strict=False))
+        one = len(self.places) == 1
+        return self.places[0] if one or (follow and sum(self.sizes) == size) else -1
+
+
+def pages_of(source: Source) -> Iterator[Page]:
+    """The pages of a file but for thumbnails. Raises RecordingError where they break off, or there is none."""
+    layouts: dict[str, tifffile.TiffPage] = {}
+    seen: set[int] = set()
+    try:
+        tiff = tifffile.TiffFile(io.BufferedReader(_Stream(source)), name=str(source.path))
+        for index in count():
+            try:
+                page = tiff.pages[index]
+            except IndexError:
+                break
+            if page.offset in seen:
+                raise RecordingError(f"{source.path}: the chain of pages turns back to byte {page.offset}.")
+            if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
+                raise TypeError("no page of its own")
+            seen.add(page.offset)
+            found = _page(page, layouts)
+            if not page.subfiletype & _REDUCED_IMAGE:
+                yield found
+        link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source.path))
+        if any(link):
+            raise RecordingError(f"{source.path}: the chain of pages breaks off, it is damaged. Copy it again.")
+    except (RecordingError, GeneratorExit):
+        raise
+    except Exception as error:  # whatever a damaged file makes of it
+        raise RecordingError(f"{source.path}: not a readable TIFF file, or damaged ({error}).") from error
+
+
+class _Stream(io.RawIOBase):
+    """A source as tifffile wants it; never more bytes at once than the file has."""
+
+    def __init__(self, source: Source) -> None:
+        self._source, self._at = source, 0
+
+    def seekable(self) -> bool:
+        return True
+
+    readable = seekable
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = max(offset + (0, self._at, self._source.size)[whence], 0)
+        return self._at
+
+    def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
+        size = max(min(len(buffer), self._source.size - self._at), 0)
+        buffer[:size] = self._source.bytes_at(self._at, size, str(self._source.path)) if size else b""
+        self._at += size
+        return size
+
+
+def _page(page: tifffile.TiffPage, layouts: dict[str, tifffile.TiffPage]) -> Page:
+    if int(page.imagewidth) < 0 or int(page.imagelength) < 0 or len(page.dataoffsets) != len(page.databytecounts):
+        raise RecordingError(f"the directory at byte {page.offset} is damaged")
+    layout = page.parent.byteorder + repr([page.tags.valueof(code) for code in _LAYOUT])
+    places, sizes = (tuple(map(int, numbers)) for numbers in (page.dataoffsets, page.databytecounts))
+    like = layouts.setdefault(layout, page)
+    return Page(page.offset, places, sizes, layout, like, page.description)
+
+
+def _orientation(page: tifffile.TiffPage) -> int:
+    return int(page.tags.valueof(274, default=1))
+
+
+def page_pixels(source: Source, page: Page, where: str) -> NDArray:
+    """Pixels of a page, (height, width) or (height, width, channels), upright and light is more; a palette looked up.
+
+    Raises RecordingError that begins with `where`.
+    """
+    try:
+        return np.ascontiguousarray(_decoded(page.like, _checked_pieces(source, page, where)))
+    except RecordingError:
+        raise
+    except Exception as error:  # whatever damaged numbers and pieces make of it
+        raise RecordingError(f"{where}: the page is damaged ({error}). Copy or export it again.") from error
+
+
+def _checked_pieces(source: Source, page: Page, where: str) -> list[bytes]:
+    """Compressed strips or tiles, of a page whose numbers fit each other and the file."""
+    like = page.like
+    check_frame_size(page.width, page.height, where)
+    if like.compression not in _COMPRESSIONS:
+        name = _OTHERS.get(like.compression, "unknown")
+        raise RecordingError(
+            f"{where}: its pixels are compressed by a method ({int(like.compression)}, {name}) that is not read; LZW "
+            "and deflate are. Export this image again."
+        )
+    check_claim(page.width, page.height, sum(page.sizes), where)
+    tile = int(like.tilewidth) * int(like.tilelength) * int(like.tiledepth) if like.is_tiled else 0
+    n = int(np.prod(like.chunked, dtype=float)) if like.dtype is not None and like.shaped[1] == 1 else -1
+    if n != len(page.places) or like.samplesperpixel > 4 or max(tile * n, sum(page.sizes)) > 4 * MOST_PIXELS:
+        raise RecordingError(
+            f"{where}: {len(page.places)} pieces of {sum(page.sizes)} bytes in all do not make up its {page.width} x "
+            f"{page.height} px; the page is damaged. Copy it again."
+        )
+    return [source.bytes_at(a, n, where) for a, n in zip(page.places, page.sizes, strict=True)]
+
+
+def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> NDArray:
+    pixels: NDArray = np.empty(page.shaped, page.dtype)  # separate samples, 1, height, width, samples
+    for index, piece in enumerate(pieces):
+        part, (sample, _, y, x, _), _ = page.decode(piece, index, jpegtables=page.jpegtables)
+        if part is None:
+            raise ValueError(f"nothing in piece {index}")
+        room = pixels[sample, 0, y : y + part.shape[1], x : x + part.shape[2]]
+        room[...] = part[0, : room.shape[0], : room.shape[1]]
+    image = pixels[0, 0] if len(pixels) == 1 else np.moveaxis(pixels[:, 0, :, :, 0], 0, -1)
+    image = image[..., 0] if image.shape[-1] == 1 else image
+    if page.photometric == _WHITE_IS_ZERO and image.dtype.kind == "u":
+        image = (2**page.bitspersample - 1) - image
+    if page.photometric == _PALETTE:
+        image = (np.asarray(page.colormap) >> 8).astype(np.uint8).T[image]
+    orientation = _orientation(page)
+    if orientation in (5, 6, 7, 8):  # the sides at which row 0 and column 0 lie (TIFF 6.0, section 8)
+        image = image.swapaxes(0, 1)
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    return image[::-1] if orientation in (3, 4, 7, 8) else image
