@@ -1,13 +1,13 @@
 """From synchronised views of a chessboard to a calibrated stereo rig with its uncertainty."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.chessboard import BoardNotFound, CornerView, find_corners
+from calibration.board.chessboard import BoardNotFound, CornerView
+from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import StereoRig
 from calibration.fit.lens_field import FieldFit
@@ -43,10 +43,7 @@ from calibration.kit.stuck_pixels import repaired_views
 from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
 
 CAMERA_NAMES = ("left", "right")
-SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
-Progress = Callable[[str, int, int], None]
-Finder = Callable[[NDArray, bool], CornerView | BoardNotFound]  # image, whether to search thoroughly
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,7 @@ class StereoCalibration(Brief):
 def calibrate_stereo(
     left_images: Sequence[NDArray],
     right_images: Sequence[NDArray],
-    board: Board,
+    board: Target,
     settings: CalibrationSettings | None = None,
     table_view: int | None = None,
     board_thickness: float = 0.0,
@@ -169,41 +166,10 @@ def calibrate_stereo(
     (left, note_left), (right, note_right) = (
         repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
     )
-    views = located(
-        [*left, *right],
-        lambda image, thorough: find_corners(image, board.inner_corners, thorough),
-        settings.threads,
-        progress,
-    )
+    views = located([*left, *right], board, settings.threads, progress)
     n = len(left_images)
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
     return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings))
-
-
-def located(
-    images: Sequence[NDArray], find: Finder, threads: int, progress: Progress | None = None
-) -> list[CornerView | BoardNotFound]:
-    """The board in every image. Where a sample over all of them shows none, the others are searched quickly first."""
-    views: dict[int, CornerView | BoardNotFound] = {}
-
-    def locate(index: int, thorough: bool) -> None:
-        try:
-            views[index] = find(images[index], thorough)
-        except ValueError as error:
-            views[index] = BoardNotFound(str(error))
-        if progress:
-            progress("corners", len(views), len(images))
-
-    sample = np.unique(np.linspace(0, len(images) - 1, min(SAMPLE, len(images))).astype(int)).tolist()
-    others = [index for index in range(len(images)) if index not in sample]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(locate, sample, [True] * len(sample)))
-        promising = any(isinstance(view, CornerView) for view in views.values())
-        list(pool.map(locate, others, [promising] * len(others)))
-        if not promising and any(isinstance(view, CornerView) for view in views.values()):
-            again = [index for index in others if isinstance(views[index], BoardNotFound)]
-            list(pool.map(locate, again, [True] * len(again)))
-    return [views[index] for index in range(len(images))]
 
 
 def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:

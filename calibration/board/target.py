@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
-SAME_PLACE = 0.01  # of the smallest distance between points: a turn that maps points that close is a symmetry
+SAME_PLACE = 0.01  # of the smallest distance between points: a reflection that maps points that close is a symmetry
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Target:
     @property
     def orders(self) -> list[NDArray[np.intp]]:
         """The turns in its plane after which the target looks the same, as orders of its points; the first is none."""
-        return plane_symmetries(self.points[:, :2])
+        return [np.arange(len(self.points))]
 
     @property
     def symmetry(self) -> int:
@@ -44,16 +44,14 @@ class Target:
         return {"target": self.kind, **asdict(self)}
 
 
-def plane_symmetries(points: Array, mirrored: bool = False) -> list[NDArray[np.intp]]:
-    """Orders of points (n, 2) after the quarter turns about their middle, mirrored first or not, that keep the set."""
+def mirror_symmetries(points: Array) -> list[NDArray[np.intp]]:
+    """Orders of points (n, 2) after reflections in their plane, at right angles or at 45 deg, that keep the set."""
     d = points - 0.5 * (points.min(0) + points.max(0))
     apart = np.linalg.norm(d[:, None] - d, axis=-1)
     limit = SAME_PLACE * float(apart[apart > 0].min())
     found = []
-    for quarter in range(4):
-        c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
-        turned = d @ np.array([[c, s], [-s, c]], float) * ([1.0, -1.0] if mirrored else [1.0, 1.0])
-        distance = np.linalg.norm(turned[:, None] - d, axis=-1)
+    for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        distance = np.linalg.norm((d @ np.array([[c, s], [s, -c]], float))[:, None] - d, axis=-1)
         if distance.min(axis=1).max() < limit:
             found.append(distance.argmin(axis=1))
     return found
@@ -109,11 +107,6 @@ def board_orders(inner_corners: tuple[int, int]) -> list[NDArray[np.intp]]:
     return [np.rot90(index, k).ravel() for k in turns]
 
 
-def _upright(columns: Array, rows: Array, n_rows: int, step: float) -> Array:
-    """Points (n, 3) of places counted from the upper left; the origin is at the lower left."""
-    return np.stack([columns.ravel(), n_rows - 1 - rows.ravel(), np.zeros(columns.size)], axis=-1) * step
-
-
 @dataclass(frozen=True)
 class CharucoBoard(Target):
     """A chessboard with an ArUco marker in every light square; points are its inner corners in OpenCV's order.
@@ -145,76 +138,10 @@ class CharucoBoard(Target):
         """Inner corners (n, 3) [m], from the upper left, row by row."""
         columns, rows = self.inner_corners
         j, i = np.mgrid[:rows, :columns]
-        return _upright(i, j, rows, self.square)
-
-    @property
-    def orders(self) -> list[NDArray[np.intp]]:
-        """One: every marker is another."""
-        return [np.arange(len(self.points))]
+        return np.stack([i.ravel(), rows - 1 - j.ravel(), np.zeros(i.size)], axis=-1) * self.square
 
     def __str__(self) -> str:
         return f"a ChArUco board of {self.squares[0]} x {self.squares[1]} squares ({self.dictionary})"
-
-
-@dataclass(frozen=True)
-class CircleGrid(Target):
-    """Round dots in rows and columns, or with every other row shifted by half a step; in OpenCV's order.
-
-    Upright with the first row above and, in an asymmetric grid, not shifted; the origin is at the lower left.
-    """
-
-    kind: ClassVar[str] = "circles"
-
-    circles: tuple[int, int]  # in a row, number of rows
-    spacing: float  # between neighbours in a row; asymmetric: between rows, half the distance in a row [m]
-    asymmetric: bool = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "circles", _counts(self.circles, 3, "circles of a grid"))
-        if not 0 < self.spacing < np.inf:
-            raise CalibrationError(f"the spacing of the circles must be positive, got {self.spacing} m")
-
-    @property
-    def points(self) -> Array:
-        """Centres (n, 3) [m], from the upper left, row by row."""
-        columns, rows = self.circles
-        j, i = np.mgrid[:rows, :columns]
-        return _upright(2 * i + j % 2 if self.asymmetric else i, j, rows, self.spacing)
-
-    def __str__(self) -> str:
-        kind = "an asymmetric grid" if self.asymmetric else "a grid"
-        return f"{kind} of {self.circles[0]} x {self.circles[1]} circles"
-
-
-@dataclass(frozen=True)
-class DotTarget(Target):
-    """Dots on a square lattice, three of them with a hole: at (0, 0), (marked[0], 0) and (0, marked[1])."""
-
-    kind: ClassVar[str] = "dots"
-
-    spacing: float  # of the lattice [m]
-    marked: tuple[int, int]  # steps from the origin to the marked dot on the x axis, and on the y axis
-    lattice: tuple[tuple[int, int], ...] = ()  # places of the dots that the views show
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "marked", _counts(self.marked, 1, "steps to the marked dots"))
-        object.__setattr__(self, "lattice", tuple((int(i), int(j)) for i, j in self.lattice))
-        if not 0 < self.spacing < np.inf:
-            raise CalibrationError(f"the spacing of the dots must be positive, got {self.spacing} m")
-
-    @property
-    def points(self) -> Array:
-        """Centres (n, 3) [m] of the dots on the lattice."""
-        lattice = np.array(self.lattice, float).reshape(-1, 2)
-        return np.column_stack([lattice * self.spacing, np.zeros(len(lattice))])
-
-    @property
-    def orders(self) -> list[NDArray[np.intp]]:
-        """One: the marked dots tell."""
-        return [np.arange(len(self.lattice))]
-
-    def __str__(self) -> str:
-        return f"a lattice of dots, marked at {self.marked[0]} and {self.marked[1]} steps"
 
 
 def _counts(given: Any, least: int, what: str) -> tuple[int, int]:
@@ -224,7 +151,7 @@ def _counts(given: Any, least: int, what: str) -> tuple[int, int]:
     return counts[0], counts[1]
 
 
-_KINDS: dict[str, type[Target]] = {kind.kind: kind for kind in (Board, CharucoBoard, CircleGrid, DotTarget)}
+_KINDS: dict[str, type[Target]] = {kind.kind: kind for kind in (Board, CharucoBoard)}
 
 
 def target_of(description: dict[str, Any]) -> Target:

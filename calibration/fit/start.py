@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import plane_symmetries
+from calibration.board.target import mirror_symmetries
 from calibration.cameras.camera import Camera, rotation_from_vector
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Mask
@@ -115,7 +115,7 @@ def agreeing(rotations: Array, translations: Array) -> Mask:
 
 def _refuse_mirrored(poses: Sequence[Mapping[int, tuple[Array, Array]]], nominal: Array, agree: Mask) -> None:
     """Raise CalibrationError where the pairs agree if one camera sees in a mirror, and else do not."""
-    orders = plane_symmetries(nominal[:, :2], mirrored=True)
+    orders = mirror_symmetries(nominal[:, :2])
     if 2 * agree.sum() >= len(agree) or not orders:
         return
     n = int(agreeing(*pairs_by_order(poses, nominal, orders, mirrored=True)).any(axis=1).sum())

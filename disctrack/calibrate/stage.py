@@ -11,10 +11,10 @@ import h5py
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.board import corner_fit
+from calibration.board.search import Progress
 from calibration.board.target import Board, Target
 from calibration.fit import normal_equations
 from calibration.rig_file import read_rig, write_rig
-from calibration.stereo import Progress
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input

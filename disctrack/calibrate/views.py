@@ -2,18 +2,16 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from numpy.typing import NDArray
 
-from calibration import CalibrationSettings, StereoCalibration, calibrate_from_corners
+from calibration import CalibrationSettings, StereoCalibration, calibrate_stereo
+from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.brief import Outline
-from calibration.kit.stuck_pixels import repaired_views
-from calibration.stereo import Progress, check_sizes
-from disctrack.calibrate.targets import find_target, other_board
-from disctrack.errors import CalibrationError, RecordingError
+from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording
 from disctrack.recording.readers import open_frames
@@ -169,23 +167,8 @@ def calibrate_views(
         images[1].append(right)
     names = [(str(views.left[i]), str(views.right[i])) for i in used]
     position = None if table_view is None else used.index(table_view)
-    check_sizes(*images, names)
-    (left_views, note_left), (right_views, note_right) = (
-        repaired_views(side, name) for side, name in zip(images, CAMERAS, strict=True)
-    )
-    settings = settings or CalibrationSettings()
-    target, seen_left, seen_right = find_target(left_views, right_views, target, settings.threads, progress)
-    try:
-        found = calibrate_from_corners(
-            seen_left, seen_right, target, settings, position, board_thickness, names, progress
-        )
-    except CalibrationError as error:
-        if other := other_board([*left_views, *right_views], [*seen_left, *seen_right], target):
-            raise CalibrationError(f"{str(error).rstrip('.')}. {other}") from error
-        raise
-    return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings)), tuple(
-        problems
-    )
+    found = calibrate_stereo(*images, target, settings, position, board_thickness, names, progress)
+    return found, tuple(problems)
 
 
 def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArray:

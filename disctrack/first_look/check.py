@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
+from calibration.board.search import evenly
 from calibration.kit.grey_levels import saturation_level
 from calibration.rig_file import read_rig
 from disctrack.analyse.declaration import contradictions, turned_board
-from disctrack.calibrate.targets import evenly
 from disctrack.calibrate.views import calibrate_views, declared_views
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.frames import CAMERAS, rotation_from_quaternion

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from calibration.board.target import Board, CharucoBoard, CircleGrid, DotTarget, Target
+from calibration.board.target import Board, CharucoBoard, Target
 from calibration.judge.tolerances import BoardTolerances
 from calibration.kit.brief import Outline
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
@@ -37,9 +37,6 @@ KEYS: dict[str, tuple[str, ...]] = {
         "squares",
         "marker_mm",
         "dictionary",
-        "circles",
-        "marked",
-        "spacing_mm",
         "rig",
         "square_tolerance_mm",
         "flatness_tolerance_mm",
@@ -53,9 +50,6 @@ KEYS: dict[str, tuple[str, ...]] = {
 TARGET_KEYS: dict[str, tuple[str, ...]] = {
     "chessboard": ("inner_corners", "square_mm"),
     "charuco": ("squares", "square_mm", "marker_mm", "dictionary"),
-    "circles": ("circles", "spacing_mm"),
-    "asymmetric_circles": ("circles", "spacing_mm"),
-    "dots": ("marked", "spacing_mm"),
 }
 
 # Keys that have a default, or belong to another target than a chessboard; a calibration is either views or a rig.
@@ -416,15 +410,9 @@ def _target(section: _Section, kind: str) -> Target:
         if kind == "chessboard":
             corners = section.get("inner_corners", _counts_of("inner corners along the long and the short side"))
             return Board(corners, section.get("square_mm", _positive) * 1e-3)
-        if kind == "charuco":
-            squares = section.get("squares", _counts_of("columns and rows of squares, dark and light"))
-            square, marker = (section.get(key, _positive) * 1e-3 for key in ("square_mm", "marker_mm"))
-            return CharucoBoard(squares, square, marker, section.get("dictionary", _text))
-        spacing = section.get("spacing_mm", _positive) * 1e-3
-        if kind == "dots":
-            return DotTarget(spacing, section.get("marked", _counts_of("steps to the marked dots along x and y")))
-        circles = section.get("circles", _counts_of("circles in a row, number of rows"))
-        return CircleGrid(circles, spacing, kind == "asymmetric_circles")
+        squares = section.get("squares", _counts_of("columns and rows of squares, dark and light"))
+        square, marker = (section.get(key, _positive) * 1e-3 for key in ("square_mm", "marker_mm"))
+        return CharucoBoard(squares, square, marker, section.get("dictionary", _text))
     except CalibrationError as error:
         raise section.error(str(error)) from error
 
@@ -433,9 +421,10 @@ def _tolerances(file: Path, declared: Mapping[str, Any]) -> BoardTolerances:
     """What is not declared takes its default."""
     given: dict[str, float] = {}
     calibration = _Section(file, declared, "calibration")
-    side = "square_mm" if "square_mm" in calibration else "spacing_mm"
-    if "square_tolerance_mm" in calibration and side in calibration:
-        given["square"] = calibration.get("square_tolerance_mm", _not_negative) / calibration.get(side, _positive)
+    if "square_tolerance_mm" in calibration and "square_mm" in calibration:
+        given["square"] = calibration.get("square_tolerance_mm", _not_negative) / calibration.get(
+            "square_mm", _positive
+        )
     if "flatness_tolerance_mm" in calibration:
         given["flatness"] = calibration.get("flatness_tolerance_mm", _not_negative) * 1e-3
     if "board_thickness_tolerance_mm" in declared.get("table", {}):

@@ -1,6 +1,6 @@
-"""ChArUco boards and grids of circles: located where an independent homography puts them, calibrated end to end.
+"""ChArUco boards: located where an independent homography puts them, calibrated end to end; and the search for boards.
 
-The prints are drawn by OpenCV (markers) or by the closed form of a disc's edge (circles), brought into the image by
+The prints are drawn by OpenCV, brought into the image by
 OpenCV's warp at six times the resolution, and averaged over the pixels; it shares no line with the code under test.
 """
 
@@ -13,20 +13,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import BoardNotFound, CalibrationError, CornerView
-from calibration.board import chessboard
+from calibration.board import chessboard, search
 from calibration.board.charuco import find_charuco
-from calibration.board.target import Board, CharucoBoard, CircleGrid, DotTarget, Target, target_of
+from calibration.board.search import board_size, located, other_board
+from calibration.board.target import Board, CharucoBoard, Target, target_of
 from calibration.cameras.camera import Camera
-from disctrack.calibrate import targets
-from disctrack.calibrate.circles import find_circles
 from disctrack.calibrate.stage import calibrate_recording
-from disctrack.calibrate.targets import board_size, other_board
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
 
 CHARUCO = CharucoBoard((9, 6), 12e-3, 8.5e-3, "DICT_4X4_50")
-SYMMETRIC = CircleGrid((7, 6), 15e-3)
-ASYMMETRIC = CircleGrid((4, 11), 8e-3, asymmetric=True)
 K = np.array([[620.0, 0.0, 201.0], [0.0, 615.0, 148.0], [0.0, 0.0, 1.0]])
 SIZE = (400, 300)
 FINE = 6  # samples of the warp per pixel, each way
@@ -42,25 +38,14 @@ class Print:
     board_from_pixel: np.ndarray  # (3, 3) homogeneous: x right, y up [m]
 
 
-def print_of(target: Target, diameter: float = 8e-3) -> Print:
-    if isinstance(target, CharucoBoard):
-        columns, rows = target.squares
-        side = round(target.square / PIXEL)
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-        board = cv2.aruco.CharucoBoard(target.squares, target.square, target.marker, dictionary)
-        image = np.pad(board.generateImage((columns * side, rows * side)), RIM, constant_values=255)
-        # the lower left inner corner lies between pixels, one square from the left, one from below
-        origin = np.array([RIM + side - 0.5, RIM + (rows - 1) * side - 0.5])
-    else:
-        low, high = target.points[:, :2].min(0), target.points[:, :2].max(0)
-        width, height = (int(n) for n in np.ceil((high - low) / PIXEL) + 2 * RIM)
-        origin = np.array([RIM, height - 1.0 - RIM])
-        image = np.full((height, width), 255, np.uint8)
-        for x, y in (target.points[:, :2] / PIXEL) * [1, -1] + origin:
-            x0, y0, half = round(x), round(y), round(0.6 * diameter / PIXEL)
-            v, u = np.mgrid[y0 - half : y0 + half + 1, x0 - half : x0 + half + 1]
-            ink = np.clip(0.5 + 0.5 * diameter / PIXEL - np.hypot(u - x, v - y), 0, 1)
-            image[v, u] = np.rint(255 * (1 - ink))
+def print_of(target: CharucoBoard) -> Print:
+    columns, rows = target.squares
+    side = round(target.square / PIXEL)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    board = cv2.aruco.CharucoBoard(target.squares, target.square, target.marker, dictionary)
+    image = np.pad(board.generateImage((columns * side, rows * side)), RIM, constant_values=255)
+    # the lower left inner corner lies between pixels, one square from the left, one from below
+    origin = np.array([RIM + side - 0.5, RIM + (rows - 1) * side - 0.5])
     return Print(image, np.array([[PIXEL, 0, -PIXEL * origin[0]], [0, -PIXEL, PIXEL * origin[1]], [0, 0, 1]]))
 
 
@@ -138,49 +123,8 @@ def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
         find_charuco(image, CharucoBoard((9, 6), 12e-3, 8.5e-3, "4X4"))
 
 
-@pytest.mark.statistical
-@pytest.mark.parametrize("light", [(25.0, 215.0), (215.0, 25.0)], ids=["dark", "light"])
-@pytest.mark.parametrize("grid", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
-def test_circles_are_located_where_their_centres_are_not_their_ellipses(grid, light, rng):
-    R, t = pose(grid, (38, 12, 20), distance=0.27)
-    image, truth = photograph(print_of(grid), R, t, rng=rng, light=light), pixels_of(grid, R, t)
-    view = find_circles(image, grid)
-    assert isinstance(view, CornerView), view
-    assert view.accepted.all()
-    assert_allclose(view.points, truth, atol=0.03)  # in the right order, from the printed side
-    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.008
-    assert np.mean(normalised_errors(view, truth)) / 2 < 2.5
-    # the ellipse's centre is off by radius^2 x tilt / distance: 0.08 px here, which OpenCV's grid finder returns
-    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    found, centres = cv2.findCirclesGrid(image if light[0] < light[1] else 255 - image, grid.circles, flags=kind)
-    assert found
-    nearest = np.linalg.norm(np.asarray(centres).reshape(-1, 1, 2) - truth, axis=-1).min(1)
-    assert np.sqrt(np.mean(nearest**2) / 2) > 0.03
-
-
-@pytest.mark.statistical
-def test_a_lens_that_bends_the_grid_does_not_shift_its_circles(rng):
-    """k1 = -0.25 over 30 deg: the circles' images are bent by what shifts a round template by 0.02 px."""
-    R, t = pose(SYMMETRIC, (10, -20, 0), distance=0.22)
-    camera, distortion = np.array([[450.0, 0, 201.0], [0, 450.0, 148.0], [0, 0, 1.0]]), np.array([-0.25, 0.08, 0, 0, 0])
-    S = 5
-    u = (np.stack(np.meshgrid(np.arange(SIZE[0] * S), np.arange(SIZE[1] * S)), axis=-1) + 0.5) / S - 0.5
-    until = (cv2.TERM_CRITERIA_COUNT, 30, 0.0)
-    ab = cv2.undistortPoints(u.reshape(-1, 1, 2), camera, distortion, criteria=until)
-    plane = np.column_stack([ab.reshape(-1, 2), np.ones(u.size // 2)]) @ np.linalg.inv(np.column_stack([R[:, :2], t])).T
-    place = plane[:, :2] / plane[:, 2:] / SYMMETRIC.spacing
-    number = np.clip(np.rint(place), 0, np.array(SYMMETRIC.circles) - 1)
-    ink = (np.linalg.norm(place - number, axis=1) * SYMMETRIC.spacing < 4.5e-3).reshape(SIZE[1], S, SIZE[0], S)
-    grey = cv2.GaussianBlur(215.0 - 190.0 * ink.mean((1, 3)), (0, 0), 0.7) + rng.normal(0, 1.0, SIZE[::-1])
-    view = find_circles(np.clip(np.rint(grey), 0, 255).astype(np.uint8), SYMMETRIC)
-    assert isinstance(view, CornerView), view
-    truth = cv2.projectPoints(SYMMETRIC.points, cv2.Rodrigues(R)[0], t, camera, distortion)[0].reshape(-1, 2)
-    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.01
-
-
-def test_a_page_without_the_grid_holds_none(rng):
+def test_a_page_without_the_board_holds_none(rng):
     blank = np.clip(rng.normal(128, 20, SIZE[::-1]), 0, 255).astype(np.uint8)
-    assert isinstance(find_circles(blank, ASYMMETRIC), BoardNotFound)
     assert isinstance(find_charuco(blank, CHARUCO), BoardNotFound)
 
 
@@ -191,11 +135,6 @@ def test_a_page_without_the_grid_holds_none(rng):
         (Board((9, 5), 8e-3), 2),
         (Board((6, 6), 8e-3), 4),
         (CHARUCO, 1),
-        (SYMMETRIC, 2),
-        (CircleGrid((6, 6), 1e-2), 4),
-        (ASYMMETRIC, 1),
-        (CircleGrid((4, 10), 1e-2, asymmetric=True), 2),
-        (DotTarget(3.5e-3, (5, 3), ((0, 0), (5, 0), (0, 3))), 1),
     ],
     ids=str,
 )
@@ -231,15 +170,11 @@ board_thickness_mm = 3.0
 g_m_s2 = 9.81
 """
 AS_CHARUCO = 'target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5\ndictionary = "DICT_4X4_50"'
-AS_CIRCLES = 'target = "asymmetric_circles"\ncircles = [4, 11]\nspacing_mm = 8.0'
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(
-    ("target", "declared"), [(CHARUCO, AS_CHARUCO), (ASYMMETRIC, AS_CIRCLES)], ids=["charuco", "circles"]
-)
-def test_a_recording_with_another_target_is_calibrated(target, declared, tmp_path, rng):
-    printed = print_of(target)
+def test_a_recording_with_a_charuco_board_is_calibrated(tmp_path, rng):
+    target, printed = CHARUCO, print_of(CHARUCO)
     R_pair = cv2.Rodrigues(np.array([0.0, -0.5, 0.0]))[0]
     meeting = np.array([0.0, 0.0, 0.33])
     t_pair = meeting - R_pair @ meeting
@@ -261,7 +196,7 @@ def test_a_recording_with_another_target_is_calibrated(target, declared, tmp_pat
         cv2.imwrite(str(tmp_path / f"views/left_{v}.png"), photograph(printed, R, t, rng=rng))
         right = photograph(printed, R_pair @ R, R_pair @ t + t_pair, rng=rng)
         cv2.imwrite(str(tmp_path / f"views/right_{v}.png"), right)
-    (tmp_path / "recording.toml").write_text(DECLARED % declared)
+    (tmp_path / "recording.toml").write_text(DECLARED % AS_CHARUCO)
     recording = read_recording(tmp_path)
     assert recording.chessboard is None
     found, problems = calibrate_recording(recording)
@@ -284,10 +219,8 @@ def test_a_recording_with_another_target_is_calibrated(target, declared, tmp_pat
         ('target = "checkers"\ninner_corners = [9, 6]\nsquare_mm = 8.0', 'one of "chessboard", "charuco"'),
         ('target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5', "dictionary is missing"),
         (AS_CHARUCO.replace("8.5", "12.5"), "does not fit into a square"),
-        ('target = "circles"\ncircles = [7, 6]\nsquare_mm = 12.0', "square_mm belongs to"),
-        ("circles = [7, 6]\nspacing_mm = 12.0", "circles belongs to"),
-        ('target = "circles"\ncircles = [7]\nspacing_mm = 12.0', "two whole numbers"),
-        ('target = "dots"\nmarked = [5, 3]', "spacing_mm is missing"),
+        ("squares = [9, 6]\nsquare_mm = 12.0", "squares belongs to"),
+        ('target = "circles"', 'one of "chessboard", "charuco"'),
     ],
 )
 def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(declared, said, tmp_path):
@@ -302,28 +235,40 @@ def searched(monkeypatch):
     shapes = []
     search = cv2.findChessboardCornersSBWithMeta
     monkeypatch.setattr(
-        targets.cv2,
+        search.cv2,
         "findChessboardCornersSBWithMeta",
         lambda image, *more: shapes.append(image.shape) or search(image, *more),
     )
     return shapes
 
 
-@pytest.mark.statistical
 def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_declared_one_is_not(board_drawer, searched):
     camera = Camera(2800.0, 2800.0, 500.0, 370.0, (0.0,) * 5, (1000, 750))
     board, R = Board((9, 6), 8e-3), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
     image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.36]), board, rng=np.random.default_rng(1))
-    found, refused = object(), BoardNotFound("no board of 10 x 7 inner corners")
-    told = other_board([image] * 12, [refused] * 12, Board((10, 7), 8e-3))
-    assert told == "Shown are 9 x 6 inner corners, in 4 of 4 images looked at: inner_corners = [9, 6]"
+    told = other_board([image] * 10, [True] * 10, Board((10, 7), 8e-3))
+    assert told == "10 of 10 images looked at show 9 x 6: inner_corners = [9, 6]"
     assert searched == [(600, 800)] * 4
     blank = np.random.default_rng(2).integers(0, 255, image.shape).astype(np.uint8)
-    # the images in which the declared board is are not looked at, and most of them having it is enough
-    assert not other_board([image] * 4 + [blank] * 5, [found] * 4 + [refused] * 5, Board((10, 7), 8e-3))
+    # the images in which the declared board is are not looked at, and half of them having it is enough
+    assert not other_board([image] * 4 + [blank] * 5, [False] * 4 + [True] * 5, Board((10, 7), 8e-3))
     assert len(searched) == 12  # four quickly, and again thoroughly
-    assert not other_board([image] * 12, [found] * 7 + [refused] * 5, Board((10, 7), 8e-3))
+    assert not other_board([image] * 10, [False] * 5 + [True] * 5, Board((10, 7), 8e-3))
     assert len(searched) == 12
+
+
+def test_images_of_another_board_are_not_searched_to_the_end(board_drawer, monkeypatch):
+    camera, R = Camera(700.0, 700.0, 160.0, 120.0, (0.0,) * 5, (320, 240)), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
+    image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((7, 5), 8e-3), rng=np.random.default_rng(1))
+    asked, find = [], search.find_target
+    monkeypatch.setattr(search, "find_target", lambda *what: asked.append(what) or find(*what))
+    views = located([image] * 16, Board((8, 5), 8e-3), 1)
+    assert len(asked) == search.SAMPLE
+    assert all("10 of 10 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)
+    # the board that is declared is there, though some images show another one
+    other = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((6, 4), 8e-3), rng=np.random.default_rng(1))
+    views = located([image] * 5 + [other] * 2, Board((7, 5), 8e-3), 1)
+    assert [isinstance(view, CornerView) for view in views] == [True] * 5 + [False] * 2
 
 
 @pytest.mark.parametrize(
@@ -337,10 +282,10 @@ def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_decl
 )
 def test_the_board_is_the_size_that_most_corners_are_on(monkeypatch, sizes, chosen):
     images = [np.full((4, 4), i, np.uint8) for i in range(len(sizes))]
-    monkeypatch.setattr(targets, "board_in", lambda grey, thorough: sizes[grey[0, 0]])
+    monkeypatch.setattr(search, "board_in", lambda grey, thorough: sizes[grey[0, 0]])
     refused = BoardNotFound("no board")
     shown = lambda grey, size: object() if sizes[grey[0, 0]] and size == chosen else refused  # noqa: E731
-    monkeypatch.setattr(targets, "find_corners", shown)
+    monkeypatch.setattr(search, "find_corners", shown)
     n = sum(size is not None for size in sizes) if chosen else 0
     assert board_size(images) == (chosen, n)
 

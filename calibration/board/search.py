@@ -1,0 +1,131 @@
+"""A calibration target in many images: the quick search first; and which other board they show where it is not."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.charuco import find_charuco
+from calibration.board.chessboard import (
+    SEARCH_SIZE,
+    BoardNotFound,
+    CornerView,
+    board_in,
+    find_corners,
+    grey_values,
+)
+from calibration.board.target import Board, CharucoBoard, Target
+
+TargetView = CornerView | BoardNotFound
+Progress = Callable[[str, int, int], None]
+SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
+LEAST_VIEWS = 2  # that must show the whole board
+SIZES_TRIED = 3  # of those that several images seem to show
+COMMON_SIZE = (9, 6)  # asked for where no size is seen: OpenCV's own board
+VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's
+REFUSED_TRIED = 4  # images without the declared board in which another is looked for, a quarter of a second each
+
+
+def find_target(image: NDArray, target: Target, thorough: bool = True) -> TargetView:
+    """The target's points in one image. Raises ValueError if it is no image."""
+    if isinstance(target, Board):
+        return find_corners(image, target.inner_corners, thorough)
+    if isinstance(target, CharucoBoard):
+        return find_charuco(image, target)
+    raise TypeError(f"no finder for {target}")
+
+
+def located(
+    images: Sequence[NDArray], target: Target, threads: int, progress: Progress | None = None
+) -> list[TargetView]:
+    """The target in every image.
+
+    A sample over all of them is searched first. Where most of it does not show the target to the quick search but
+    another board, that is reason enough not to search on; where the slow search finds none either, the others are
+    searched quickly.
+    """
+    views: dict[int, TargetView] = {}
+
+    def locate(index: int, thorough: bool) -> None:
+        try:
+            views[index] = find_target(images[index], target, thorough)
+        except ValueError as error:
+            views[index] = BoardNotFound(str(error))
+        if progress:
+            progress("corners", len(views), len(images))
+
+    def missing(among: Iterable[int]) -> list[int]:
+        return [index for index in among if not isinstance(views.get(index), CornerView)]
+
+    sample = evenly(len(images), SAMPLE)
+    others = sorted(set(range(len(images))) - set(sample))
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(locate, sample, [False] * len(sample)))
+        again = missing(sample)
+        if shown := other_board([images[i] for i in sample], [i in again for i in sample], target):
+            return [BoardNotFound(f"{target} is not in it. {shown}")] * len(images)
+        list(pool.map(locate, again, [True] * len(again)))
+        promising = missing(sample) != sample
+        list(pool.map(locate, others, [promising] * len(others)))
+        if not promising and missing(others) != others:
+            again = missing(range(len(images)))
+            list(pool.map(locate, again, [True] * len(again)))
+    return [views[index] for index in range(len(images))]
+
+
+def evenly(n: int, most: int) -> list[int]:
+    """Numbers of at most `most` of n things, evenly over them."""
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
+
+
+def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Target) -> str:
+    """The chessboard that most images show in place of the declared one, in words; "" if there is none.
+
+    refused : whether the declared one was not found in them; where it was, a rim may have passed for a line of it
+    """
+    without = [image for image, lost in zip(images, refused, strict=True) if lost]
+    if not isinstance(target, Board) or 2 * len(without) <= len(images):
+        return ""
+    size, _ = board_size([without[i] for i in evenly(len(without), REFUSED_TRIED)], SEARCH_SIZE // 2)
+    if size is None or size == target.inner_corners:
+        return ""
+    seen = sum(isinstance(find_corners(image, size, thorough=False), CornerView) for image in images)
+    if seen < max(LEAST_VIEWS, 2 * (len(images) - len(without)), len(images) / 3):
+        return ""
+    return f"{seen} of {len(images)} images looked at show {size[0]} x {size[1]}: inner_corners = {list(size)}"
+
+
+def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[tuple[int, int] | None, int]:
+    """Inner corners (long side, short side) that most images show, and how many of them show these; None if none.
+
+    largest : [px] larger images are reduced to that: OpenCV's search takes 0.3 s at 800 x 600, 5.5 s at 4000 x 3000
+    """
+    greys = [_reduced(grey_values(image)[0], largest) for image in images]
+    seen: dict[tuple[int, int], int] = {}
+    for thorough in (False, True):
+        sizes = [board_in(grey, thorough) for grey in greys]
+        counts = Counter(size for size in sizes if size)
+        often = [size for size, n in counts.most_common(SIZES_TRIED) if n >= LEAST_VIEWS] or list(counts)[:SIZES_TRIED]
+        # a shadow hides a line of the board, a rim passes for one more: the whole board is what most corners are on
+        seen |= {size: counts[size] + _found(size, greys, sizes) for size in often}
+        if 2 * max(seen.values(), default=0) >= len(images):
+            break
+    else:
+        seen.setdefault(COMMON_SIZE, _found(COMMON_SIZE, greys, sizes))
+    best = max(seen, key=lambda size: seen[size] * size[0] * size[1])
+    return (best, seen[best]) if seen[best] >= min(LEAST_VIEWS, len(images)) else (None, 0)
+
+
+def _found(size: tuple[int, int], greys: Sequence[NDArray], sizes: Sequence[tuple[int, int] | None]) -> int:
+    """How many images of another size, or of none, show a board of this one where it is asked for."""
+    others = [grey for grey, found in zip(greys, sizes, strict=True) if found != size]
+    return sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in others)
+
+
+def _reduced(grey: NDArray, largest: int) -> NDArray:
+    """Grey values (h, w), or a smaller image of them whose longer side has the largest size allowed [px]."""
+    scale = largest / max(grey.shape)
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey)
