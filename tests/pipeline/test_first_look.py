@@ -13,7 +13,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from calibration.board.chessboard import BoardNotFound, find_corners
-from disctrack.calibrate.targets import board_size
+from calibration.board.search import board_size
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
