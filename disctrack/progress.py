@@ -110,7 +110,7 @@ def compiling(what: str, seconds: int) -> Iterator[None]:
 
     seconds: of processor time that it took where it was measured.
     """
-    from calibration.compiled import when_compiling  # numba: those who call this have it, others need not wait
+    from calibration.kit.compiled import one_at_a_time  # numba: those who call this have it, others need not wait
 
     began = time.perf_counter()
     told = f"compiling the inner loops of {what}: once per installation, about {seconds} s of a free core"
@@ -121,7 +121,7 @@ def compiling(what: str, seconds: int) -> Iterator[None]:
             print(told, file=sys.stderr, flush=True)
         said.append(told)
 
-    with when_compiling(tell):
+    with one_at_a_time(tell):
         yield
     if said:
         _tell(began, f"inner loops of {what} compiled")

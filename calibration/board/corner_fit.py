@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration._corner_kernel import N_CORNER, fit_corners
+from calibration.board._corner_kernel import N_CORNER, fit_corners
 from calibration.board.robust_corners import LEAST_SIGMA, WINDOW, saddle_points, smooth_grid
 from calibration.kit.arrays import Array, Mask
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration._normal_kernel import N_COLUMNS, accumulate
+from calibration.fit._normal_kernel import N_COLUMNS, accumulate
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.priors import Prior, board_prior
 from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, moved

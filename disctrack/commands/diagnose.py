@@ -9,8 +9,9 @@ from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
-from disctrack.progress import stage, steps
+from disctrack.progress import compiling, stage, steps
 from disctrack.recording.readers.blocks import default_threads
+from disctrack.rolling import _assembly as assembly
 from disctrack.track import summary
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
@@ -31,6 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
         reused = f"{'reused':<13} {folder}: complete result of the same trajectory, model and version"
         print("\n".join([reused, *told]))
         return DONE
+    with compiling("the simulation of motions", 30):
+        assembly.prepare()
     with stage("diagnose"):
         outcome = run_diagnose(
             path,
@@ -52,6 +55,8 @@ def _together(arguments: argparse.Namespace) -> int:
     for path in arguments.trajectory:
         with contextlib.suppress(TrajectoryFileError):  # told of below
             outputs.tell_stale(path)
+    with compiling("the simulation of motions", 30):
+        assembly.prepare()
     with steps(f"diagnose {len(arguments.trajectory)} recordings together") as step:
         outcome = run_together(
             arguments.trajectory,

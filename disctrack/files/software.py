@@ -7,7 +7,7 @@ from pathlib import Path
 __version__ = "0.2.0"
 
 # Rooms beside the measurement: what they make is never reused, nor part of what is.
-_BESIDE = ("examples", "first_look", "render", "repeats", "validate")
+_BESIDE = ("examples", "first_look", "repeats", "validate")
 
 
 @cache
@@ -16,9 +16,11 @@ def software_version() -> str:
 
     The number is set by hand; code that changes results must not find those of other code, so the sources count.
     """
-    import calibration  # NumPy: the command line asks for the number alone, before it tells NumPy its threads
-    from calibration.sources import sources_sha256
-
-    home = Path(__file__).parents[1]
-    sources = sources_sha256(Path(str(calibration.__file__)).parent) + sources_sha256(home, _BESIDE)
-    return f"{__version__}+{sha256(sources.encode()).hexdigest()[:12]}"
+    home, sources = Path(__file__).parents[2], sha256()
+    for package in ("calibration", "disctrack"):
+        for file in sorted((home / package).rglob("*.py")):
+            name = file.relative_to(home)
+            if name.parts[1] not in _BESIDE:
+                content = file.read_bytes()
+                sources.update(f"{name.as_posix()} {len(content)}\n".encode() + content)
+    return f"{__version__}+{sources.hexdigest()[:12]}"

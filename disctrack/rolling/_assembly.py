@@ -6,21 +6,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disctrack.rolling import equations
+from disctrack.rolling import equations, integrate
 from disctrack.rolling._compiled import compile_law, compile_system
 from disctrack.rolling.effects.base import HELPERS, catalogue
-from disctrack.rolling.integrate import CompiledSystem
 from disctrack.rolling.model import Model, body_constants, effect_values
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
 
 
-def prepare(scalar: type) -> None:
-    """Compile the equations of motion and the catalogue's laws for real or complex states, or load them."""
-    for function in (equations.rates, equations.event_margins):
-        compile_system(function, scalar)
-    for kind in catalogue():
-        if kind.law is not None:
-            compile_law(kind.law, tuple(p.name for p in kind.parameters), HELPERS, scalar)
+def prepare() -> None:
+    """Compile integrator, equations of motion and the catalogue's laws for real and complex states, or load them."""
+    for scalar in (float, complex):
+        integrate.prepare(scalar)
+        for function in (equations.rates, equations.event_margins):
+            compile_system(function, scalar)
+        for kind in catalogue():
+            if kind.law is not None:
+                compile_law(kind.law, tuple(p.name for p in kind.parameters), HELPERS, scalar)
 
 
 class Assembly:
@@ -56,10 +57,10 @@ class Assembly:
         header = [regime, len(calls), self.kinematics.ctypes.data, self.wrench.ctypes.data]
         return np.array(header + [address for call in calls for address in call], np.int64)
 
-    def system(self, regime: int) -> CompiledSystem:
+    def system(self, regime: int) -> integrate.CompiledSystem:
         """Rates and margins in this regime."""
         pointers = [a.ctypes.data for a in (self._tables[regime], self.body, self.kinematics, self.wrench)]
-        return CompiledSystem(
+        return integrate.CompiledSystem(
             self._rates.address, self._margins.address, equations.N_EVENTS, np.array(pointers, np.int64)
         )
 

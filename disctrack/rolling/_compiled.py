@@ -1,9 +1,9 @@
 """Compiled functions that call each other by address.
 
-The integrator, the equations of motion and the law of every effect are compiled separately and cached separately (by
-their own source file), and meet only through addresses. So a new effect costs the compilation of one small function,
-never that of the integrator, and a cached integrator can never hold an outdated copy of a law. The records' field names
-are part of each signature: a changed layout recompiles what depends on it. A call by address costs about 3 ns.
+The integrator, the equations of motion and the law of every effect are compiled separately and cached separately, and
+meet only through addresses. So a new effect costs the compilation of one small function, never that of the integrator,
+and a cached integrator can never hold an outdated copy of a law. The records' field names are part of each signature: a
+changed layout recompiles what depends on it. A call by address costs about 3 ns.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import numpy as np
 from numba import from_dtype, types
 from numba.extending import register_jitable
 
-from calibration.compiled import cfunc
+from calibration.kit.compiled import cfunc, one_at_a_time
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
 
 
@@ -28,39 +28,24 @@ def _record(names: tuple[str, ...], scalar: type) -> types.Type:
 
 def _compile(function: Callable[..., None], signature: Any) -> Any:
     # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
-    try:
-        return cfunc(function, signature, error_model="numpy")
-    except RuntimeError:  # numba: "no locator available": typed at a prompt, there is no file to put a cache beside
-        return cfunc(function, signature, cache=False, error_model="numpy")
+    with one_at_a_time():
+        try:
+            return cfunc(signature, cache=True, error_model="numpy")(function)
+        except RuntimeError:  # numba: "no locator available": typed at a prompt, or a law by formula: in no file
+            return cfunc(signature, error_model="numpy")(function)
 
 
 @cache
 def compile_system(function: Callable[..., None], scalar: type) -> Any:
     """f(t, y, out, table, body, kinematics, wrench) as C function; keep the object: it owns the `address`."""
-    return _compile(function, system_types(scalar))
-
-
-def system_types(scalar: type) -> Any:
-    """What the C functions of the equations of motion take."""
     v = _pointer(scalar)
     records = [_record(names, scalar) for names in (BODY, KINEMATICS, WRENCH)]
-    return types.void(v, v, v, types.CPointer(types.int64), *records)
+    return _compile(function, types.void(v, v, v, types.CPointer(types.int64), *records))
 
 
 @lru_cache(maxsize=256)  # the catalogue several times over; whoever calls a law holds it himself
 def compile_law(function: Callable[..., None], parameters: tuple[str, ...], helpers: tuple, scalar: type) -> Any:
     """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call."""
-    may_call(function, helpers)
-    return _compile(function, law_types(parameters, scalar))
-
-
-def may_call(function: Callable[..., None], helpers: tuple) -> None:
-    """Let a compiled function call these Python functions; what is kept of it on disk depends on them, too."""
     for helper in helpers:
         register_jitable(helper)
-    function.compiled_with = helpers  # type: ignore[attr-defined]
-
-
-def law_types(parameters: tuple[str, ...], scalar: type) -> Any:
-    """What the C function of a law with parameters of these names takes."""
-    return types.void(*(_record(names, scalar) for names in (parameters, KINEMATICS, WRENCH)))
+    return _compile(function, types.void(*(_record(names, scalar) for names in (parameters, KINEMATICS, WRENCH))))

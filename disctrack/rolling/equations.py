@@ -41,7 +41,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 from disctrack.rolling._addresses import call_law
 
 _part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only

@@ -16,8 +16,8 @@ from numba import typeof
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
-from calibration.compiled import njit
 from calibration.kit.arrays import Array
+from calibration.kit.compiled import njit
 from disctrack.rolling._addresses import call_system
 
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)

@@ -11,8 +11,8 @@ from typing import Any
 
 from numba import types
 
-from calibration.compiled import njit
 from calibration.kit.arrays import Array, Array32
+from calibration.kit.compiled import njit
 
 Point = tuple[float, float, float]
 RAYS = types.Array(types.float64, 3, "C", readonly=True)  # `rays.corner_rays`

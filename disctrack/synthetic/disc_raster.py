@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from calibration.compiled import njit
 from calibration.kit.arrays import Array, Array32
+from calibration.kit.compiled import njit
 from disctrack.synthetic.areas import (
     RAYS,
     RULES,

@@ -5,8 +5,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import erf
 
-from calibration.compiled import njit
 from calibration.kit.arrays import Array, Array32
+from calibration.kit.compiled import njit
 from disctrack.synthetic.cameras import View
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.rays import table_points

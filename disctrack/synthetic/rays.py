@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from calibration.cameras.camera import Camera
-from calibration.compiled import njit
 from calibration.kit.arrays import Array
+from calibration.kit.compiled import njit
 from disctrack.errors import SceneError
 from disctrack.synthetic.cameras import View
 

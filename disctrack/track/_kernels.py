@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 
 # No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
 _RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}

@@ -6,8 +6,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
-from calibration._corner_kernel import fit_corners
 from calibration.board import corner_fit
+from calibration.board._corner_kernel import fit_corners
 from calibration.board.chessboard import grey_values
 from calibration.board.corner_fit import local_axes
 from calibration.cameras.camera import project, rotation_from_vector

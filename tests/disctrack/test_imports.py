@@ -167,12 +167,10 @@ def test_calibration_never_imports_disctrack():
 
 
 def test_rooms_of_the_calibration_ask_only_for_those_before_them():
-    modules = {file.stem for file in (ROOT / "calibration").glob("*.py")}
     for own, room in enumerate(ROOMS_OF_CALIBRATION):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             asked = {f"{name}.__init__".split(".")[1] for name in imported(file) if name.startswith("calibration")}
-            known = {name for name in modules if name.startswith("_")} | {"compiled"}
-            assert asked <= {*ROOMS_OF_CALIBRATION[: own + 1], *known}, file
+            assert asked <= {*ROOMS_OF_CALIBRATION[: own + 1]}, file
 
 
 def test_no_file_asks_for_one_that_asks_for_it():

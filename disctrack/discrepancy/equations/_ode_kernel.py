@@ -13,7 +13,7 @@ import numpy as np
 from numba import types
 from scipy.integrate import DOP853
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 
 _f, _v, _m, _cube = types.float64, types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in

@@ -10,8 +10,8 @@ import numpy as np
 import sympy
 from numba.core.types import CompileResultWAP
 
-from calibration.compiled import njit
 from calibration.kit.arrays import Array
+from calibration.kit.compiled import njit
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 from disctrack.recording.readers._inflate import inflated
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 
 
 @njit(nogil=True, cache=True)

@@ -9,8 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from calibration import sources
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 from disctrack import cli
 from disctrack.progress import compiling
 from disctrack.trajectory.file import read_trajectory
@@ -38,12 +37,10 @@ def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch,
 @pytest.mark.statistical
 def test_compiling_is_announced_and_slow_loading_is_not(capsys, tmp_path):
     file, told = tmp_path / "loops.py", []
-    for source in ("def twice(x):\n    return 2 * x\n", "def twice(x):\n    return x + x\n"):
+    for source in ("def twice(x):\n    return 2 * x\n", "def twice(x):\n    return x + x  # otherwise\n"):
         file.write_text(source)
-        sources._read.cache_clear()
         for _ in range(2):
             loops = runpy.run_path(str(file))
-            loops["twice"].compiled_with = ()  # as one of ours: by its sources
             with compiling("corners", 8):
                 assert njit(loops["twice"], cache=True)(2) == 4
                 time.sleep(1.2)  # a busy machine is no compiler
@@ -51,6 +48,30 @@ def test_compiling_is_announced_and_slow_loading_is_not(capsys, tmp_path):
     announced = "compiling the inner loops of corners: once per installation, about 8 s"
     assert [announced in text for text in told] == [True, False, True, False]
     assert told[1] == ""
+
+
+AT_ONCE = """
+from calibration.kit.compiled import njit, one_at_a_time
+
+@njit(cache=True)
+def twice(x):
+    return 2 * x
+
+told = []
+with one_at_a_time(lambda: told.append(1)):
+    twice(2)
+print(bool(told))
+"""
+
+
+def test_of_processes_that_begin_at_once_one_compiles_and_the_others_load(tmp_path):
+    file, home = tmp_path / "loop.py", os.path.dirname(os.path.dirname(cli.__file__))
+    file.write_text(AT_ONCE)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": home}
+    words = [sys.executable, str(file)]
+    begun = [subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert sorted(process.communicate()[0] for process in begun) == ["False\n", "True\n"]
+    assert [process.returncode for process in begun] == [0, 0]
 
 
 @pytest.mark.slow

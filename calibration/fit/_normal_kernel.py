@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 
 # Columns: nine intrinsics of the left camera, nine of the right, turn and shift between them, turn and shift of the
 # board, residual. A left observation has the first nine and the last seven, a right one all but the first nine.

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.compiled import njit
+from calibration.kit.compiled import njit
 
 N_CORNER = (
     9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]

@@ -1,0 +1,77 @@
+"""numba for both packages, and where its machine code is kept: compiled when first asked for, loaded from then on.
+
+numba looks at a function's own file alone to tell whether what it kept still holds. Some functions here call those of
+other files (the renderer's areas, the fit of poses, helpers of the effects' laws), so machine code lies in a folder
+that is named after the contents of every file with compiled functions: other sources, another folder.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numba
+from filelock import FileLock
+from numba.core import event
+
+njit: Any = numba.njit  # types of a decorated function say nothing of how it is called
+cfunc: Any = numba.cfunc
+config: Any = numba.config
+
+WITH_COMPILED = (
+    "calibration/**/_[a-z]*.py",
+    "disctrack/**/_[a-z]*.py",
+    "disctrack/rolling/**/*.py",
+    "disctrack/synthetic/*.py",
+)
+
+
+def _folder() -> Path:
+    """In the folder of NUMBA_CACHE_DIR, else beside the packages, else in the user's cache."""
+    home, sources = Path(__file__).parents[2], sha256()
+    for file in sorted({file for pattern in WITH_COMPILED for file in home.glob(pattern)}):
+        sources.update(file.read_bytes())
+    beside = Path(__file__).parent / "__pycache__"
+    if config.CACHE_DIR:
+        kept = Path(config.CACHE_DIR)
+    elif os.access(beside if beside.is_dir() else beside.parent, os.W_OK):
+        kept = beside
+    else:
+        kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "disctrack"
+    return kept / f"compiled-{sources.hexdigest()[:16]}"
+
+
+FOLDER = _folder()
+config.CACHE_DIR = str(FOLDER)
+
+
+class _BeforeCompiling(event.Listener):
+    def __init__(self, tell: Callable[[], None]):
+        self.tell = tell
+
+    def on_start(self, event: object) -> None:
+        self.tell()
+
+    def on_end(self, event: object) -> None:
+        pass
+
+
+@contextmanager
+def one_at_a_time(tell: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Hold a lock while functions are compiled or loaded: of many processes one compiles, the others load its code.
+
+    `tell` is called before whatever is compiled, and not where all is loaded.
+    """
+    lock = FileLock(FOLDER / "lock", is_singleton=True)
+    with suppress(OSError, NotImplementedError):  # a file system without locks: each compiles for itself
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    try:
+        with event.install_listener("numba:run_pass", _BeforeCompiling(tell)):
+            yield
+    finally:
+        lock.release()
