@@ -1,6 +1,7 @@
 """From synchronised views of a chessboard to a calibrated stereo rig with its uncertainty."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -186,6 +187,18 @@ def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequen
                 )
 
 
+@contextmanager
+def _determined() -> Iterator[None]:
+    """A singular problem is an error that says what to do."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(
+            "the views do not determine all parameters: add views with the board tilted in several directions"
+        ) from error
+
+
+@_determined()
 def calibrate_from_corners(
     left_views: Sequence[CornerView | BoardNotFound],
     right_views: Sequence[CornerView | BoardNotFound],

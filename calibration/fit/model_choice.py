@@ -63,7 +63,6 @@ def held_out(
     views = np.unique(used.view)
     weights = inverse_covariance(used.covariance, sigma**2)
     whole = replace(refinement.problem, observations=used, weights=weights, motion=motion)
-    at_minimum = whole.linearise(refinement.model)
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
         train = ~np.isin(used.view, left_out)
@@ -74,7 +73,6 @@ def held_out(
             iterations=8,
             tolerance=NEGLIGIBLE,
             damping=1e-7,
-            normal=at_minimum.of_views(np.setdiff1d(views, left_out)),
             rough=True,
         ).model
         tested = np.isin(everything.view, left_out)

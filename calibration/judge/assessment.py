@@ -7,11 +7,12 @@ import numpy as np
 from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN, StereoRig
 from calibration.cameras.causes import causes
 from calibration.fit.model_choice import TermsTried
-from calibration.fit.normal_equations import Problem, minimise, scaled_solve
+from calibration.fit.normal_equations import Problem, minimise
 from calibration.fit.refinement import Refinement
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
+from calibration.kit.least_squares import scaled_solve
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
@@ -75,7 +76,7 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     """
     problem = refinement.problem
     s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
-    shift, spread, inverse, by_common = refinement.normal.shifts_by_views(s1, common)
+    shift, spread, inverse, by_common = refinement.normal.shifts(s1, common)
     expected = inverse.T @ spread @ inverse
     values, vectors = np.linalg.eigh(expected)
     root = vectors * np.sqrt(np.maximum(values, 1e-12 * values.max()))  # expected = root root^T
@@ -89,11 +90,11 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
     at_minimum = inverse[:s1] + by_common
     share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)  # noise moves fewer than all
-    information = refinement.normal.view_information()[0]
-    scale = 1.0 / np.sqrt(np.diag(information.sum(0)))
+    prior = refinement.normal.prior
+    scale = 1.0 / np.sqrt(np.diag(refinement.normal.eliminated()[0]))
     by_prior = np.zeros((s1, s1))
     if problem.prior is not None:  # it was weighted as if it were one of views that disagree as much
-        told = max(problem.prior.weight - 1.0, 0.0) * information[-1] * scale[:, None] * scale
+        told = max(problem.prior.weight - 1.0, 0.0) * prior * scale[:, None] * scale
         by_prior = inverse.T @ told @ inverse
     result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result

@@ -15,10 +15,10 @@ import scipy
 from numpy.typing import NDArray
 
 from calibration.fit.board_motion import BoardMotion, motions, split
-from calibration.fit.normal_equations import Normal
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import predict
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import Normal
 
 FREE = BoardMotion(1e3, 1e3)  # as good as nothing known beforehand
 NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
@@ -49,9 +49,20 @@ def likely_motion(refinement: Refinement) -> LikelyMotion | None:
     model = split(refinement.model)
     normal = replace(problem, motion=FREE).linearise(model)
     # noise: what scatters within an image, about a pose of its own
-    pull = normal.pose_gradient[:n]
-    left = float(normal.costs[:n].sum() - np.sum(pull * np.linalg.solve(normal.pose[:n], pull[..., None])[..., 0]))
+    pull, own = normal.own_gradient, normal.own_held()
+    left = float(normal.costs.sum() - np.sum(pull * np.linalg.solve(own, pull[..., None])[..., 0]))
     noise = max(left, 1e-12) / max(2 * len(o) - 6 * len(np.unique(2 * o.view + o.camera)), 1)
+    s = problem.stereo_basis.shape[1]  # the board's shape is held: it is known far better than such motions move it
+    of_cameras = replace(
+        normal,
+        shared=normal.shared[:s, :s] / noise,
+        cross=normal.cross[:, :s] / noise,
+        own=own / noise,
+        gradient=normal.gradient[:, :s] / noise,
+        own_gradient=pull / noise,
+        prior=normal.prior[:s, :s] / noise,
+        prior_gradient=normal.prior_gradient[:s] / noise,
+    )
     by_poses = motions(model)[1]
     distance = float(np.median(np.linalg.norm(model.t_left_board[pairs], axis=1)))
 
@@ -60,16 +71,16 @@ def likely_motion(refinement: Refinement) -> LikelyMotion | None:
         return BoardMotion(float(turn), float(part) * distance).weights
 
     def unlikely(sizes: Array) -> float:
-        return _minus_twice_log_likelihood(normal, by_poses[pairs], pairs, noise, weights(sizes))
+        return _minus_twice_log_likelihood(of_cameras, by_poses[pairs], pairs, weights(sizes))
 
     # an attribute of `scipy` is imported when it is asked for: a measurement with a rig does not wait for it
     search = {"method": "Nelder-Mead", "options": {"xatol": ROUGH, "fatol": ROUGH}}
     tried = [scipy.optimize.minimize(unlikely, np.log(start), **search) for start in START]
     w = weights(min(tried, key=lambda one: float(one.fun)).x)
-    right = normal.pose[:n, 6:, 6:]
-    both = normal.pose[:n, :6, :6] + right
-    cross = normal.cross[:n, :, :6] + normal.cross[:n, :, 6:]
-    to_gradient = normal.cross[:n, :, 6:] - cross @ np.linalg.solve(both, right)
+    right = own[:, 6:, 6:]
+    both = own[:, :6, :6] + right
+    cross = normal.cross[:, :, :6] + normal.cross[:, :, 6:]
+    to_gradient = normal.cross[:, :, 6:] - cross @ np.linalg.solve(both, right)
     to_step = np.linalg.inv(by_poses[:, :, 6:]) / np.sqrt(w)
     into = to_gradient @ to_step
     into[~(seen[0] & seen[1])] = 0.0
@@ -82,23 +93,15 @@ def likely_motion(refinement: Refinement) -> LikelyMotion | None:
     )
 
 
-def _minus_twice_log_likelihood(
-    normal: Normal, by_poses: Array, pairs: NDArray[np.intp], noise: float, weights: Array
-) -> float:
+def _minus_twice_log_likelihood(normal: Normal, by_poses: Array, pairs: NDArray[np.intp], weights: Array) -> float:
     """Of motions with these inverse variances (6,), all else marginalised; a constant is left out.
 
     normal : with 12 numbers for the places of a board, whose two halves nothing holds together yet
-    noise : factor on the variance that the normal equations were weighted by
     """
-    pose = normal.pose / noise
-    pose[pairs] += np.swapaxes(by_poses, 1, 2) * weights @ by_poses
-    of_pose = normal.pose_gradient / noise
-    s = normal.stereo.shape[1]  # the board's shape is held: it is known far better than such motions move it
-    cross = np.swapaxes(normal.cross[:, :s], 1, 2) / noise
-    carried = np.linalg.solve(pose, cross)
-    own = np.linalg.solve(pose, of_pose[..., None])[..., 0]
-    information = normal.stereo.sum(0) / noise - cross.reshape(-1, s).T @ carried.reshape(-1, s)
-    gradient = normal.gradient[:, :s].sum(0) / noise - cross.reshape(-1, s).T @ own.reshape(-1)
+    own = normal.own.copy()
+    own[pairs] += np.swapaxes(by_poses, 1, 2) * weights @ by_poses
+    moving = replace(normal, own=own)
+    information = moving.eliminated()[0]
     if np.diag(information).min() <= 0.0:  # motions so large that nothing is left of how the cameras stand
         return np.inf
     scale = 1.0 / np.sqrt(np.diag(information))
@@ -106,6 +109,6 @@ def _minus_twice_log_likelihood(
     sign, volume = np.linalg.slogdet(information)
     if sign <= 0.0:
         return np.inf
-    gained = float((scale * gradient) @ np.linalg.solve(information, scale * gradient)) + float(np.sum(own * of_pose))
-    volume += float(np.linalg.slogdet(pose)[1].sum() - 2 * np.log(scale).sum())
+    gained = moving.gain(*moving.step())
+    volume += float(np.linalg.slogdet(own)[1].sum() - 2 * np.log(scale).sum())
     return float(volume) - gained - len(pairs) * float(np.log(weights).sum())

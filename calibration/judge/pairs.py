@@ -135,11 +135,11 @@ def _cost_of_one_place(
             motion=None,
         )
         normal = problem.linearise(model)
-        H, g = normal.view_information()
+        H, g = normal.told_by_each()
         lost = ~(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(g).all(axis=1))  # a pose behind a camera
         H[lost], g[lost] = 0.0, 0.0
-        parts.append((H, g, np.nan_to_num(normal.costs, posinf=1e12)))
-    (H_one, g_one, chi2_one), (H_two, g_two, chi2_two) = parts
+        parts.append((H, g, np.nan_to_num(normal.costs, posinf=1e12), normal))
+    (H_one, g_one, chi2_one, normal), (H_two, g_two, chi2_two, _) = parts
     n = len(together[1].R_left_board)
     pairs = np.array(both)
     tied, own = (
@@ -148,12 +148,13 @@ def _cost_of_one_place(
     )
     is_apart = np.array([v in apart for v in both])
     now = [np.where(is_apart.reshape(-1, *[1] * (one.ndim - 1)), two, one) for one, two in zip(tied, own, strict=True)]
-    rest = np.setdiff1d(np.arange(len(H_one)), pairs)  # views of one camera, and the prior
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(now[0].sum(0) + H_one[rest].sum(0)), 1e-300))
+    rest = np.setdiff1d(np.arange(len(H_one)), pairs)  # views of one camera
+    H_rest, g_rest = normal.prior + H_one[rest].sum(0), normal.prior_gradient + g_one[rest].sum(0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(now[0].sum(0) + H_rest), 1e-300))
     cost = np.zeros(len(both))
     for k, v in enumerate(both):
         others = np.delete(np.arange(len(both)), k)
-        H, g = now[0][others].sum(0) + H_one[rest].sum(0), now[1][others].sum(0) + g_one[rest].sum(0)
+        H, g = now[0][others].sum(0) + H_rest, now[1][others].sum(0) + g_rest
         gains = []
         for H_pair, g_pair in ((tied[0][k], tied[1][k]), (own[0][k], own[1][k])):
             matrix, gradient = (H + H_pair) * scale[:, None] * scale, (g + g_pair) * scale

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, Allowance, StereoRig
-from calibration.fit.normal_equations import scaled_solve
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import board_basis
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import scaled_solve
 
 ASSUMED_THICKNESS = 20e-6  # [m] standard deviation, a calliper's
 SIZE, FLATNESS, THICKNESS = "the board's size", "the board's flatness", "the board's thickness"
@@ -61,7 +61,7 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
     else:  # one step beyond the flat board, everything else free
         normal = problem.with_shape(nominal, basis).linearise(refinement.model)
         s1 = problem.stereo_basis.shape[1]
-        found = found + normal.solve(0.0)[0][s1:]
+        found = found + normal.step()[0][s1:]
         C = normal.covariances()[0][s1:, s1:]
     C = inflation * C
     left = (departure - B @ found).reshape(n, 3)[:, :2]
@@ -93,7 +93,7 @@ def shape_left_out(
     for board in boards[boards.index(refinement.terms.board) + 1 :]:
         basis = board_basis(nominal, board)
         normal = problem.with_shape(nominal, basis).linearise(refinement.model)
-        step, C = normal.solve(0.0)[0], inflation * normal.covariances()[0][s1:, s1:]
+        step, C = normal.step()[0], inflation * normal.covariances()[0][s1:, s1:]
         gain = float(step[s1:] @ scaled_solve(C, step[s1:])) - chi_square
         further = max(0.0, 1.0 - (basis.shape[-1] - n) / max(gain, 1e-300)) ** 0.5 * (step[:s1] - shift)
         left_out += np.outer(further, further)

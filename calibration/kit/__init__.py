@@ -1,1 +1,1 @@
-"""What every module here and in disctrack uses: array types, errors, short views of results, grey and stuck pixels."""
+"""What all modules of both packages use: array types, errors, least squares, short views, grey and stuck pixels."""

@@ -79,11 +79,11 @@ def test_a_prior_of_cameras_and_board_has_the_cost_it_says(scene_maker, rng):
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
     s = stereo_basis.shape[1] + basis.shape[-1]
     for direction in rng.normal(size=(6, s + 18)):
-        direction[:s] /= np.sqrt(np.diag(normal.shared))
-        direction[s:] /= np.sqrt(np.concatenate([np.diag(block) for block in normal.pose[:3]]))
+        direction[:s] /= np.sqrt(np.diag(normal.shared + normal.prior))
+        direction[s:] /= np.sqrt(np.concatenate([np.diag(block) for block in normal.own[:3]]))
         shared, poses = 1e-3 * direction[:s], 1e-3 * direction[s:].reshape(3, 6)
         there, back = (cost(problem.stepped(model, d * shared, d * poses)) for d in (1.0, -1.0))
-        gradient = shared @ normal.gradient.sum(0) + np.sum(poses * normal.pose_gradient[:3])
+        gradient = normal.gain(shared, poses)
         assert_allclose(-(there - back) / 4, gradient, rtol=5e-3, atol=1e-5 * np.linalg.norm(direction))
 
 

@@ -1,0 +1,319 @@
+"""Least squares with numbers that all data share, and numbers that each block of data has of its own.
+
+    chi-square(s, p_1, ..., p_n) = sum_b |r_b - C_b s - P_b p_b|^2 + priors
+
+The own numbers p_b are eliminated block by block (Schur's complement; Triggs et al. 2000, Bundle Adjustment: A Modern
+Synthesis, section 6), so that a problem costs as much as there are blocks, not as their third power. Two ways:
+
+- `Normal`: the normal equations of thousands of small blocks at once, and Levenberg-Marquardt on them (`minimise`).
+- `eliminate`: the rows of one block by QR, which does not square the condition and keeps what a block leaves open.
+
+Everywhere residuals are observed minus predicted, in standard deviations, and derivatives are those of the prediction.
+Robust weights are for whoever linearises: rows times the root of the weight, and the loss itself as the cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+import scipy
+
+from calibration.kit.arrays import Array
+
+# Of chi-square: a thousandth of a sigma. Rounding hides so much where no step is taken any more: chi-square is a sum of
+# squared differences of pixels that are a million times as large.
+ROUNDED_AWAY = 1e-6
+UNDETERMINED = 1e-12  # singular value over the largest, below which data do not determine a direction
+NEAR = 1e-3  # sigmas from a bound, within which a number stands at it
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of one linearisation: s shared numbers, and k own ones of each of n blocks.
+
+    An own number that no data of its block show stays where it is, as if it were known to one of its units.
+    """
+
+    shared: Array  # (s, s) of the data of all blocks, before the own numbers are eliminated
+    cross: Array  # (n, s, k)
+    own: Array  # (n, k, k)
+    gradient: Array  # (n, s)
+    own_gradient: Array  # (n, k)
+    costs: Array  # (n,) chi-square, or whatever loss takes its place; inf where there is no prediction
+    of_each: Callable[[], Array]  # (n, s, s) each block's part of `shared`: large, and seldom wanted
+    prior: Array  # (s, s) information
+    prior_gradient: Array  # (s,) towards the prior
+    prior_cost: float = 0.0
+
+    @property
+    def cost(self) -> float:
+        """Of all blocks and the prior; inf where a prediction failed."""
+        return float(self.costs.sum()) + self.prior_cost
+
+    def own_held(self, damping: float = 0.0) -> Array:
+        """(n, k, k) of the own numbers, with a one on the diagonal where no data show a number."""
+        diagonal = np.einsum("nii->ni", self.own)
+        held: Array = self.own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.own.shape[-1])
+        return held
+
+    def _carried(self, damping: float) -> tuple[Array, Array]:
+        """How the own numbers follow the shared ones, (n, k, s), and their step at fixed shared ones (n, k)."""
+        right = np.concatenate([np.swapaxes(self.cross, 1, 2), self.own_gradient[..., None]], axis=2)
+        solved = np.asarray(np.linalg.solve(self.own_held(damping), right), float)
+        return solved[..., :-1], solved[..., -1]
+
+    def _without_own(self, carried: Array, step: Array, damping: float = 0.0) -> tuple[Array, Array]:
+        n, s, k = self.cross.shape
+        cross = np.swapaxes(self.cross, 1, 2).reshape(n * k, s).T
+        total = self.shared + self.prior
+        matrix = total + damping * np.diag(np.diag(total)) - cross @ carried.reshape(n * k, s)
+        return matrix, self.gradient.sum(0) + self.prior_gradient - cross @ step.reshape(-1)
+
+    def eliminated(self) -> tuple[Array, Array]:
+        """Normal matrix (s, s) and gradient (s,) of the shared numbers with the prior, the own ones at their best."""
+        return self._without_own(*self._carried(0.0))
+
+    def step(self, damping: float = 0.0) -> tuple[Array, Array]:
+        """Damped step of the shared numbers (s,) and of the own ones (n, k)."""
+        carried, own = self._carried(damping)
+        step = scaled_solve(*self._without_own(carried, own, damping))
+        return step, own - carried @ step
+
+    def gain(self, shared: Array, own: Array) -> float:
+        """What an undamped step promises to take from the cost."""
+        return float(shared @ (self.gradient.sum(0) + self.prior_gradient) + np.sum(own * self.own_gradient))
+
+    def covariances(self) -> tuple[Array, Array, Array]:
+        """Of the shared numbers (s, s), of each block's own (n, k, k), and between shared and own (n, s, k)."""
+        carried, own = self._carried(0.0)
+        information, _ = self._without_own(carried, own)
+        shared = scaled_solve(information, np.eye(len(information)))
+        cross = -shared @ np.swapaxes(carried, 1, 2)
+        return shared, np.linalg.inv(self.own_held()) - carried @ cross, cross
+
+    def told_by_each(self) -> tuple[Array, Array]:
+        """What each block, its own numbers eliminated, says of the shared ones: (n, s, s) and gradient (n, s)."""
+        carried, own = self._carried(0.0)
+        return self.of_each() - self.cross @ carried, self.gradient - np.einsum("nsk,nk->ns", self.cross, own)
+
+    def shifts(self, first: int, common: Array | None = None) -> tuple[Array, Array, Array, Array]:
+        """What each block, left out in turn, says of the `first` shared numbers, each in units of a `scale`.
+
+        To first order the shift is H^-1 g_b with g_b the block's gradient at the common minimum; noise alone gives
+        E[g_b g_b^T] = H_b - H_b H^-1 H_b. The prior is no block, and part of H alone.
+
+        common : (n, s, s) covariance of what else the blocks' gradients contain, apart from their data's noise
+        returns : shifts (n, first), the sum of the expected g_b g_b^T (s, s), H^-1 (s, first), and the covariance
+            (first, first) by `common`
+        """
+        information, gradient = self.told_by_each()
+        total = information.sum(0) + self.prior
+        scale = 1.0 / np.sqrt(np.diag(total))  # the numbers' units differ by 10^6
+        information, gradient = information * scale[:, None] * scale, gradient * scale
+        inverse = np.linalg.inv(total * scale[:, None] * scale)
+        expected = (information - information @ inverse @ information).sum(0)
+        covariance: Array = inverse[:, :first]
+        by_common = np.zeros((first, first))
+        if common is not None:
+            common = common * scale[:, None] * scale
+            total, part = common.sum(0), information @ inverse
+            left = common - part @ common - np.swapaxes(part @ common, 1, 2)
+            expected = expected + (left + part @ total @ np.swapaxes(part, 1, 2)).sum(0)
+            by_common = covariance.T @ total @ covariance
+        return gradient @ covariance, expected, covariance, by_common
+
+    def disagreement(self, first: int) -> float:
+        """Variance of the `first` shared numbers as the blocks disagree about them, over what noise predicts."""
+        shift, spread, covariance, _ = self.shifts(first)
+        metric = np.linalg.inv(covariance[:first])  # the others are nuisance: the shifts of the first ones only
+        seen = float(np.einsum("ni,ij,nj->", shift, metric, shift))
+        expected = float(np.sum(metric * (covariance.T @ spread @ covariance)))
+        return seen / expected if expected > 0 else float("nan")
+
+
+def normal_of_rows(rows: Array, k: int) -> Normal:
+    """Normal equations of rows (n, m, k + s + 1): [own | shared | residual], zero where a block has fewer."""
+    products = np.swapaxes(rows, 1, 2) @ rows
+    of_each = products[:, k:-1, k:-1]
+    return Normal(
+        shared=of_each.sum(0),
+        cross=products[:, k:-1, :k],
+        own=products[:, :k, :k],
+        gradient=products[:, k:-1, -1],
+        own_gradient=products[:, :k, -1],
+        costs=products[:, -1, -1],
+        of_each=lambda: of_each,
+        prior=np.zeros(of_each.shape[1:]),
+        prior_gradient=np.zeros(of_each.shape[1]),
+    )
+
+
+def scaled_solve(A: Array, b: Array) -> Array:
+    """Solve A x = b after scaling A to a unit diagonal: the numbers' units differ by 10^6. LinAlgError if singular."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+    columns = scale if b.ndim == 1 else scale[:, None]
+    return np.linalg.solve(A * scale[:, None] * scale, b * columns) * columns
+
+
+Model = TypeVar("Model")
+
+
+@dataclass(frozen=True)
+class Minimum(Generic[Model]):
+    """Where Levenberg-Marquardt ended."""
+
+    model: Model
+    normal: Normal
+    iterations: int  # 0 where the start has no prediction
+    converged: bool
+
+
+def minimise(
+    linearise: Callable[[Model], Normal],
+    stepped: Callable[[Model, Array, Array], Model],
+    start: Model,
+    iterations: int = 60,
+    tolerance: float = 1e-10,
+    damping: float = 1e-3,
+    rough: bool = False,
+) -> Minimum[Model]:
+    """Levenberg-Marquardt; converged when the cost to be gained by a full step is below tolerance x cost.
+
+    The predicted gain g^T H^-1 g is free of the numbers' units, and a vanishing gradient is what it says.
+
+    stepped : the model after a step of the shared numbers (s,) and of the own ones (n, k)
+    rough : a step that gains less than the tolerance is taken unseen, and `normal` is the one before it: for those who
+        want the model alone
+    """
+    model, normal = start, linearise(start)
+    to_gain = np.inf  # by the last step that was hardly damped
+    if not np.isfinite(normal.cost):
+        return Minimum(model, normal, 0, False)
+    for iteration in range(1, iterations + 1):
+        shared, own = normal.step(damping)
+        gain = normal.gain(shared, own)
+        to_gain = gain if damping < 1e-2 else to_gain
+        trial = stepped(model, shared, own)
+        small = gain <= tolerance * max(normal.cost, 1.0)
+        if rough and small and damping < 1e-4:
+            return Minimum(trial, normal, iteration, True)
+        trial_normal = linearise(trial)
+        if trial_normal.cost <= normal.cost * (1 + 1e-14):
+            model, normal, damping = trial, trial_normal, max(damping * 0.1, 1e-12)
+            if damping < 1e-4 and small:
+                return Minimum(model, normal, iteration, True)
+        else:
+            if small:
+                return Minimum(model, normal, iteration, damping < 1e-2 or to_gain <= ROUNDED_AWAY)
+            damping *= 10.0
+            if damping > 1e10:
+                break
+    return Minimum(model, normal, iterations, to_gain <= ROUNDED_AWAY)
+
+
+def triangle(matrix: Array) -> Array:
+    """R of the QR decomposition of a tall matrix (m, k), in pieces of rows that stay in the processor's cache."""
+    m, k = matrix.shape
+    piece = 8 * max(k, 1)
+    whole = m // piece
+    if whole < 2:
+        return np.asarray(np.linalg.qr(matrix, mode="r"), float)
+    parts = np.asarray(np.linalg.qr(matrix[: whole * piece].reshape(whole, piece, k), mode="r")).reshape(-1, k)
+    return triangle(np.vstack([parts, matrix[whole * piece :]]))
+
+
+@dataclass(frozen=True)
+class OwnNumbers:
+    """The own numbers (k) of one block, at the shared ones (s)."""
+
+    root: Array  # (k, r): root @ root.T is their covariance at given shared ones
+    open: Array  # (k, k - r) directions that nothing determines: no step goes along them
+    by_shared: Array  # (k, s) how their best values move with the shared ones
+    step: Array  # (k,) to their best values ...
+    gain: float  # ... by which chi-square falls
+
+
+def eliminate(rows: Array, k: int) -> tuple[OwnNumbers, Array]:
+    """Own numbers of a block of rows (m, k + s + 1), [own | shared | residual], and the rows [shared | residual] left.
+
+    What is left is what the block says of the shared numbers at its best own ones, in k + s + 1 rows at most.
+    """
+    R = triangle(rows)
+    head = R[:k, :k]
+    length = np.linalg.norm(head, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    U, singular, V = np.linalg.svd(head / length)
+    r = int(np.sum(singular > UNDETERMINED * max(singular.max(initial=0.0), 1e-100)))
+    taken = U.T @ R[: len(U), k:]
+    directions = V.T / length[:, None]
+    root, along = directions[:, :r] / singular[:r], taken[:r, -1]
+    own = OwnNumbers(root, directions[:, r:], -root @ taken[:r, :-1], root @ along, float(along @ along))
+    return own, np.concatenate([taken[r:], R[len(U) :, k:]])
+
+
+def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Array:
+    """Argmin |right - matrix x| with lower <= x <= upper; where directions are undetermined, the shortest x."""
+    length = np.linalg.norm(matrix, axis=0)
+    if length.size == 0:
+        return np.zeros(0)
+    scale = np.where(length > 0, 1.0 / np.where(length > 0, length, 1.0), 1.0)
+    scaled = matrix * scale
+    x = np.asarray(np.linalg.lstsq(scaled, right, rcond=UNDETERMINED)[0] * scale, float)
+    if bool(np.all((x >= lower) & (x <= upper))):
+        return x
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
+        bounds = (lower / scale, upper / scale)
+        inside = scipy.optimize.lsq_linear(scaled, right, bounds, tol=1e-12)
+        found = np.asarray(inside.x * scale, float)
+    if not np.isfinite(found).all():
+        return np.clip(x, lower, upper)
+    return np.where(inside.active_mask < 0, lower, np.where(inside.active_mask > 0, upper, found))
+
+
+def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper: Array) -> Array:
+    """Covariance of numbers about x, some of which stand at a bound; zero rows for those that nothing shows.
+
+    A number at a bound is not known to lie there: the data allow what a normal distribution leaves inside the bound
+    (its second moment about the bound), and whatever moves together with it is uncertain by that much more.
+    """
+    k = len(x)
+    covariance = np.zeros((k, k))
+    if len(matrix) == 0 or k == 0:
+        return covariance
+    free = _covariance(matrix)
+    sigma = np.sqrt(np.maximum(np.diag(free), 0.0))
+    outwards = np.where(x - lower <= NEAR * sigma, -1.0, np.where(upper - x <= NEAR * sigma, 1.0, 0.0))
+    held = np.flatnonzero(outwards)
+    if held.size == 0:
+        return free
+    others = np.flatnonzero(outwards == 0)
+    covariance[np.ix_(others, others)] = _covariance(matrix[:, others])
+    held = held[sigma[held] > 0]
+    if held.size == 0:
+        return covariance
+    beyond = outwards[held] * (free @ (matrix.T @ right))[held] / sigma[held]
+    share = np.array([_within_bound(float(t)) for t in beyond])
+    across = np.zeros((k, held.size))
+    correlation = free[np.ix_(held, held)] / np.outer(sigma[held], sigma[held])
+    across[others] = free[np.ix_(others, held)] / sigma[held] @ np.linalg.pinv(correlation, rcond=1e-10) / sigma[held]
+    across[held, np.arange(held.size)] = 1.0
+    inside = correlation * np.outer(share * sigma[held], share * sigma[held])
+    return np.asarray(covariance + across @ inside @ across.T, float)
+
+
+def _within_bound(beyond: float) -> float:
+    """Rms distance from a bound, of a normal number with mean `beyond` sigmas outside of it and known to lie inside."""
+    t = max(beyond, 0.0)
+    if t > 8.0:  # the exponential tail
+        return float(np.sqrt(2.0) / t)
+    hazard = np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi) / scipy.special.ndtr(-t)
+    return float(np.sqrt(max(1.0 + t * t - t * hazard, 0.0)))
+
+
+def _covariance(matrix: Array) -> Array:
+    """Inverse of the normal matrix of rows (m, k); directions that are not determined get no variance."""
+    known = eliminate(np.column_stack([matrix, np.zeros(len(matrix))]), matrix.shape[1])[0]
+    return np.asarray(known.root @ known.root.T, float)
