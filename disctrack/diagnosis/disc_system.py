@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.faults import Sight, faults_of, measurement_candidates, predict, setup_of
 from disctrack.diagnosis.motion import (
     SLIP,
@@ -25,7 +26,6 @@ from disctrack.diagnosis.motion_start import STRETCHES, start_values
 from disctrack.diagnosis.sought import sought
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
-from disctrack.discrepancy.fit import triangle
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate

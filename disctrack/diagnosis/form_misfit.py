@@ -20,10 +20,11 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import THETA_END, DiscSystem
 from disctrack.diagnosis.learned_law import WIDTH, LearnedLaw, _Blocks, probe
 from disctrack.diagnosis.motion import state_of
-from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_wrench, kinematics

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import THETA_END, DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.law_library import Family, families
 from disctrack.diagnosis.left_over import left_over
 from disctrack.diagnosis.motion import STATE_SCALES, state_of
-from disctrack.discrepancy.fit import Fit, fit, prior_rows, triangle
+from disctrack.discrepancy.fit import Fit, fit, prior_rows
 from disctrack.discrepancy.nuisances import is_linear, projection
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.significance import as_sigmas, price_of_a_number

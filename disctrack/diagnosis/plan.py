@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.disc import Disc
-from disctrack.discrepancy.fit import Fit, triangle
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.reduction import Reduction
 from disctrack.discrepancy.joint.sharing import LAWS
 from disctrack.discrepancy.score import Linearisation, cleared, score, span

@@ -4,18 +4,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import special
-from scipy.optimize import lsq_linear
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
+from calibration.kit.least_squares import OwnNumbers, covariance_within, solve_bounded, triangle
 from disctrack.discrepancy.nuisances import Projection, is_linear, projection
-from disctrack.discrepancy.own import Head, Own
+from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.system import Quantity, System, Values
 
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less, over what is left per datum
-NEAR = 1e-3  # sigmas from a bound, within which a quantity stands at it
 CRAWLING, CRAWLED = 1e-3, 3  # share of chi-square that a halved step gains at most, so many times in a row
 _HALVINGS = 8
 NO_DERIVATIVE = np.zeros(0)
@@ -34,7 +32,7 @@ class Fit(Outline):
     converged: bool
     n_iterations: int
     promised: float = 0.0  # chi-square that one more full step would lower, were the prediction linear
-    heads: tuple[Head, ...] = ()  # of the quantities that blocks of rows have of their own
+    heads: tuple[OwnNumbers, ...] = ()  # of the quantities that blocks of rows have of their own
     # of them by name: root (r,), and how it moves with the shared ones (k,); its variance is their sum's
     own: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -91,17 +89,6 @@ def compress(residual: Array, derivative: Array, common: Projection | None = Non
     return R[:, -1], R[:, :-1]
 
 
-def triangle(matrix: Array) -> Array:
-    """R of the QR decomposition of a tall matrix (m, k), in blocks of rows that stay in the processor's cache."""
-    m, k = matrix.shape
-    block = 8 * max(k, 1)
-    whole = m // block
-    if whole < 2:
-        return np.asarray(np.linalg.qr(matrix, mode="r"), float)
-    parts = np.asarray(np.linalg.qr(matrix[: whole * block].reshape(whole, block, k), mode="r")).reshape(-1, k)
-    return triangle(np.vstack([parts, matrix[whole * block :]]))
-
-
 def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, Array]:
     """Rows that priors add to a least-squares problem: (right side (p,), matrix (p, k))."""
     with_prior = [i for i, q in enumerate(quantities) if np.isfinite(q.prior_sigma)]
@@ -114,25 +101,6 @@ def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, A
 def prior_residual(quantities: Sequence[Quantity], values: Values) -> Array:
     """(p,) null minus value, over its standard deviation, of those with a prior."""
     return np.array([(q.null - values[q.name]) / q.prior_sigma for q in quantities if np.isfinite(q.prior_sigma)])
-
-
-def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Array:
-    """Argmin |right - matrix x| with lower <= x <= upper; where directions are undetermined, the shortest x."""
-    length = np.linalg.norm(matrix, axis=0)
-    if length.size == 0:
-        return np.zeros(0)
-    scale = np.where(length > 0, 1.0 / np.where(length > 0, length, 1.0), 1.0)
-    scaled = matrix * scale
-    x = np.asarray(np.linalg.lstsq(scaled, right, rcond=1e-12)[0] * scale, float)
-    if bool(np.all((x >= lower) & (x <= upper))):
-        return x
-    with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
-        bounds = (lower / scale, upper / scale)
-        inside = lsq_linear(scaled, right, bounds, tol=1e-12)
-        found = np.asarray(inside.x * scale, float)
-    if not np.isfinite(found).all():
-        return np.clip(x, lower, upper)
-    return np.where(inside.active_mask < 0, lower, np.where(inside.active_mask > 0, upper, found))
 
 
 def fit(
@@ -166,7 +134,7 @@ def fit(
     converged, iteration, crawled = False, 0, 0
     expected = float("inf")
     matrix, right = np.zeros((0, len(names))), np.zeros(0)
-    heads: tuple[Head, ...] = ()
+    heads: tuple[OwnNumbers, ...] = ()
     while np.isfinite(cost) and iteration < max_iterations:
         iteration += 1
         if local:
@@ -246,55 +214,3 @@ def _cost(residual: Array, prior: Array, derivative: Array, common: Projection) 
         cost = float(np.sum(common.cleared(residual.reshape(-1, 1)) ** 2) + prior @ prior)
         usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
     return cost if usable else np.inf
-
-
-def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper: Array) -> Array:
-    """Covariance of quantities about x, some of which stand at a bound; zero rows for those that nothing shows.
-
-    A quantity at a bound is not known to lie there: the data allow what a normal distribution leaves inside the bound
-    (its second moment about the bound), and whatever moves together with it is uncertain by that much more.
-    """
-    k = len(x)
-    covariance = np.zeros((k, k))
-    if len(matrix) == 0 or k == 0:
-        return covariance
-    free = _inverse(matrix)
-    sigma = np.sqrt(np.maximum(np.diag(free), 0.0))
-    outwards = np.where(x - lower <= NEAR * sigma, -1.0, np.where(upper - x <= NEAR * sigma, 1.0, 0.0))
-    held = np.flatnonzero(outwards)
-    if held.size == 0:
-        return free
-    others = np.flatnonzero(outwards == 0)
-    covariance[np.ix_(others, others)] = _inverse(matrix[:, others])
-    held = held[sigma[held] > 0]
-    if held.size == 0:
-        return covariance
-    beyond = outwards[held] * (free @ (matrix.T @ right))[held] / sigma[held]
-    share = np.array([_within_bound(float(t)) for t in beyond])
-    across = np.zeros((k, held.size))
-    correlation = free[np.ix_(held, held)] / np.outer(sigma[held], sigma[held])
-    across[others] = free[np.ix_(others, held)] / sigma[held] @ np.linalg.pinv(correlation, rcond=1e-10) / sigma[held]
-    across[held, np.arange(held.size)] = 1.0
-    inside = correlation * np.outer(share * sigma[held], share * sigma[held])
-    return np.asarray(covariance + across @ inside @ across.T, float)
-
-
-def _within_bound(beyond: float) -> float:
-    """Rms distance from a bound, of a normal number with mean `beyond` sigmas outside of it and known to lie inside."""
-    t = max(beyond, 0.0)
-    if t > 8.0:  # the exponential tail
-        return float(np.sqrt(2.0) / t)
-    hazard = np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi) / special.ndtr(-t)
-    return float(np.sqrt(max(1.0 + t * t - t * hazard, 0.0)))
-
-
-def _inverse(matrix: Array) -> Array:
-    """Inverse of the normal matrix; directions that are not determined get no variance."""
-    length = np.linalg.norm(matrix, axis=0)
-    length = np.where(length > 0, length, 1.0)
-    if matrix.shape[1] == 0:
-        return np.zeros((0, 0))
-    _, singular, V = np.linalg.svd(matrix / length, full_matrices=False)
-    floor = 1e-12 * max(float(singular[0]), 1e-100)
-    weight = np.where(singular > floor, 1.0 / np.maximum(singular, floor) ** 2, 0.0)
-    return np.asarray((V.T * weight) @ V / np.outer(length, length), float)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array, Mask
-from disctrack.discrepancy.fit import Fit, fit, triangle
-from disctrack.discrepancy.own import Head, Own
+from calibration.kit.least_squares import OwnNumbers, triangle
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.score import INVISIBLE, cleared, span
 from disctrack.discrepancy.system import Quantity, Subset, System, Values
 
@@ -88,7 +89,7 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     return HeldOut(train, test, float(np.sum(everything[:, k] ** 2)), expected, float(log_density), n_data)
 
 
-def _beside_own(part: Array, J: Array, head: Head) -> tuple[Array, Array, Array, int]:
+def _beside_own(part: Array, J: Array, head: OwnNumbers) -> tuple[Array, Array, Array, int]:
     """Rows (m, k + 1) of a block without what its own quantities may be; R of them beside the own ones; these; number.
 
     J : (m, p) by the own quantities. What nothing that was fitted determines (all of a run that is kept back) may be

@@ -11,7 +11,8 @@ from itertools import combinations
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import Fit, compress, prior_rows, solve_bounded
+from calibration.kit.least_squares import solve_bounded
+from disctrack.discrepancy.fit import Fit, compress, prior_rows
 from disctrack.discrepancy.nuisances import is_linear, projection
 from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.system import Candidate, Quantity, System

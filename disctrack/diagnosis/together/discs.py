@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.model_file import PAPER
 from disctrack.diagnosis.plan import Plan, Question
 from disctrack.diagnosis.together.recordings import Item, Recorded, Say, build, in_common, labels_of
-from disctrack.discrepancy.fit import triangle
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
 from disctrack.discrepancy.search import Settings

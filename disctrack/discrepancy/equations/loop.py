@@ -11,6 +11,7 @@ from scipy import stats
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import solve_bounded
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.expressions import Formula
@@ -26,7 +27,7 @@ from disctrack.discrepancy.equations.noise import (
 )
 from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, turn
 from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
-from disctrack.discrepancy.fit import Fit, fit, solve_bounded
+from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.search import (

@@ -14,7 +14,8 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import Fit, prior_rows, triangle
+from calibration.kit.least_squares import triangle
+from disctrack.discrepancy.fit import Fit, prior_rows
 from disctrack.discrepancy.joint.joint_system import JointSystem
 from disctrack.discrepancy.system import Candidate
 

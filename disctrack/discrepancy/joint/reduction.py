@@ -1,19 +1,17 @@
 """One recording of several: its own quantities take their best values, and what is left speaks of the shared ones.
 
-An initial state matters to nobody else. Of a linearisation, [own | shared | residual] = Q R, the lower right block of R
-is the least-squares problem in the shared quantities alone, at the best own values (Schur's complement of the normal
-equations, without squaring the condition): a few dozen rows, however long the recording. Its minimum is followed as
-the shared quantities move.
+An initial state matters to nobody else. What is left once it is eliminated is the least-squares problem in the shared
+quantities alone: a few dozen rows, however long the recording. Its minimum is followed as the shared quantities move.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import prior_rows, triangle
+from calibration.kit.least_squares import OwnNumbers, eliminate
+from disctrack.discrepancy.fit import prior_rows
 from disctrack.discrepancy.nuisances import Projection, is_linear, projection
 from disctrack.discrepancy.system import Quantity, System, Values
 
@@ -21,6 +19,7 @@ NEAR = 0.3  # of chi-square, that a further step of the own quantities may promi
 STEPS = 12
 HALVINGS = 6
 ANCHORS = 30  # points that are remembered, to start from the nearest
+Eliminated = tuple[OwnNumbers, Array]  # and the rows [shared | residual] that are left
 
 
 @dataclass(frozen=True)
@@ -72,37 +71,35 @@ class Reduction:
         """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
         own = self._guess(shared)
         common = projection(self.system, self.linear, {**shared, **self._named(own)})
-        R = self._triangle(shared, own, names, common)
+        found = self._eliminated(shared, own, names, common)
         for _ in range(STEPS):
-            if R is None:
+            if found is None:
                 break
-            k = len(own)
-            head, gain = R[:k, :k], float(R[:k, -1] @ R[:k, -1])
-            if gain < NEAR:
-                return self._remembered(shared, own, names, R)
-            step = _solved(head, R[:k, -1])
-            R, own, moved = self._stepped(shared, own, step, names, common, float(R[:, -1] @ R[:, -1]))
-            if not moved:  # rounding, or a kink: this is as far as it goes
-                return self._remembered(shared, own, names, R) if R is not None and gain < 100 * NEAR else None
-        if R is not None or len(self._anchors) == 1:
+            numbers = found[0]
+            if numbers.gain < NEAR:
+                return self._remembered(shared, own, names, found)
+            further = self._stepped(shared, own, names, common, found)
+            if further is None:  # rounding, or a kink: this is as far as it goes
+                return self._remembered(shared, own, names, found) if numbers.gain < 100 * NEAR else None
+            found, own = further
+        if found is not None or len(self._anchors) == 1:
             return None
         self._anchors = self._anchors[:1]  # the point that was followed led nowhere: from the beginning, once
         return self.reduce(shared, names)
 
     def _stepped(
-        self, shared: Values, own: Array, step: Array, names: Sequence[str], common: Projection, cost: float
-    ) -> tuple[Array | None, Array, bool]:
-        before = None
+        self, shared: Values, own: Array, names: Sequence[str], common: Projection, found: Eliminated
+    ) -> tuple[Eliminated, Array] | None:
+        """The same further down, and where; None where no step leads down."""
         for halving in range(HALVINGS):
-            trial = own + 0.5**halving * step
-            R = self._triangle(shared, trial, names, common)
-            if R is not None and float(R[:, -1] @ R[:, -1]) < cost:
-                return R, trial, True
-            before = before if R is None else R
-        return self._triangle(shared, own, names, common), own, False
+            trial = own + 0.5**halving * found[0].step
+            there = self._eliminated(shared, trial, names, common)
+            if there is not None and _cost(there) < _cost(found):
+                return there, trial
+        return None
 
-    def _triangle(self, shared: Values, own: Array, names: Sequence[str], common: Projection) -> Array | None:
-        """R of [own | names | residual], with rows of priors; its last column is as long as chi-square is large."""
+    def _eliminated(self, shared: Values, own: Array, names: Sequence[str], common: Projection) -> Eliminated | None:
+        """Own quantities and the rows [names | residual] that they leave; None where there is no prediction."""
         values = {**shared, **self._named(own)}
         values |= dict(zip(common.names, common.null.tolist(), strict=True))
         all_names = [*(q.name for q in self.own), *names]
@@ -113,11 +110,7 @@ class Reduction:
         prior, prior_matrix = prior_rows(self.own, values)
         rows = np.zeros((len(prior), stacked.shape[1]))
         rows[:, : len(own)], rows[:, -1] = prior_matrix, prior
-        whole = np.concatenate([common.cleared(stacked), rows])
-        width = whole.shape[1]
-        if len(whole) < width:
-            whole = np.concatenate([whole, np.zeros((width - len(whole), width))])
-        return triangle(whole)
+        return eliminate(np.concatenate([common.cleared(stacked), rows]), len(own))
 
     def _named(self, own: Array) -> dict[str, float]:
         return dict(zip((q.name for q in self.own), own.tolist(), strict=True))
@@ -131,19 +124,14 @@ class Reduction:
         names = {*a, *b} & self._scales.keys()
         return float(sum(((a.get(n, 0.0) - b.get(n, 0.0)) / self._scales[n]) ** 2 for n in sorted(names)))
 
-    def _remembered(self, shared: Values, own: Array, names: Sequence[str], R: Array) -> Reduced:
-        k = len(own)
-        best = own + _solved(R[:k, :k], R[:k, -1])
-        by_shared = -_solved(R[:k, :k], R[:k, k:-1])
+    def _remembered(self, shared: Values, own: Array, names: Sequence[str], found: Eliminated) -> Reduced:
+        numbers, left = found
         if not any(self._distance(a.shared, shared) == 0.0 and set(names) <= set(a.names) for a in self._anchors):
             self._anchors = [*self._anchors[:1], *self._anchors[1:][-ANCHORS:]]
-            self._anchors.append(_Anchor(dict(shared), best, tuple(names), by_shared))
-        return Reduced(R[k:, -1], R[k:, k:-1])
+            self._anchors.append(_Anchor(dict(shared), own + numbers.step, tuple(names), numbers.by_shared))
+        return Reduced(left[:, -1], left[:, :-1])
 
 
-def _solved(head: Array, right: Array) -> Array:
-    """Solution of the triangular system, zero in directions that the data do not determine."""
-    size = np.abs(np.diag(head))
-    if size.size and size.min() > 1e-13 * size.max():
-        return np.asarray(solve_triangular(head, right), float)
-    return np.asarray(np.linalg.lstsq(head, right, rcond=1e-13)[0], float)
+def _cost(found: Eliminated) -> float:
+    """Chi-square with priors, before the step of the own quantities."""
+    return found[0].gain + float(found[1][:, -1] @ found[1][:, -1])

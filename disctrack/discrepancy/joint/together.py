@@ -14,7 +14,8 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import Fit, triangle
+from calibration.kit.least_squares import triangle
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, FitsIn, apart

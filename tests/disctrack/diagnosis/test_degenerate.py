@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
+from calibration.kit.least_squares import covariance_within
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
-from disctrack.discrepancy.fit import covariance_within, fit
+from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.system import Quantity
 from disctrack.synthetic.description import Faults

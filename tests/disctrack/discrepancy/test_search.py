@@ -10,7 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from disctrack.discrepancy.fit import compress, fit, solve_bounded, triangle
+from calibration.kit.least_squares import solve_bounded, triangle
+from disctrack.discrepancy.fit import compress, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
 from disctrack.discrepancy.search import Settings, _Search, diagnose
