@@ -234,17 +234,30 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
         "--recordings",
         type=_positive,
         metavar="N",
-        help="recordings, each with its own cameras and chessboards (default: 3)",
+        help="rendered recordings, each with its own cameras and chessboards (default: 3)",
     )
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("validation"), help="folder for tables and pictures (%(default)s)"
-    )
-    parser.add_argument("--quick", action="store_true", help="small images and few of everything: about a minute")
+    parser.add_argument("--quick", action="store_true", help="small images and few of everything: half a minute")
     parser.add_argument(
         "--imperfect", type=_positive, metavar="N", default=0, help="instead: N recordings of an imperfect laboratory"
     )
+    parser.add_argument(
+        "--diagnosis",
+        nargs="*",
+        metavar="EFFECT[=SIZE]",
+        help="instead: hide each of these effects (default: all known; nothing, prints, laboratory: none) and diagnose",
+    )
+    parser.add_argument("--seeds", type=_positive, default=6, help="recordings for each hidden effect (%(default)s)")
+    parser.add_argument("--pairs", type=_positive, default=0, metavar="N", help="hide N pairs of effects instead")
+    parser.add_argument(
+        "--frame-rate", type=_positive_number, default=1000.0, help="of recordings to diagnose, in Hz (%(default)s)"
+    )
     parser.add_argument("--seed", type=_seed, help="of the first recording; the others count up from it")
-    parser.add_argument("--quiet", action="store_true", help="do not tell of every step")
+    parser.add_argument("-j", "--jobs", type=_positive, default=1, help="processes (%(default)s)")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("validation"), help="folder for tables and pictures (%(default)s)"
+    )
+    parser.add_argument("--write", type=Path, metavar="FILE", help="also put the tables into this Markdown page")
+    parser.add_argument("--quiet", action="store_true", help="do not tell of every recording")
 
 
 def _trajectory(text: str) -> Path:

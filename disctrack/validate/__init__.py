@@ -1,22 +1,7 @@
-"""The accuracy claim of 0.005 mm and 0.05 deg put to the test: render -> measure -> compare with the truth.
+"""Plant, measure, compare: how good are poses and diagnosis where the truth is known?
 
-poses (what is asked) -> trial (one recording: render, calibrate, measure) -> comparison (errors and their statistics);
-bound, efficiency (how well any method could do), stress (how much it bears), controls (planted faults) -> summary,
-tables, plots -> run. Only the truth and the reported numbers enter a judgement, never how the measurement is done.
+A case is a recording with something planted and a seed: rendered (`rendered`) or as points (`points`, with effects of
+`hidden`). It is measured (`render_and_measure`; `hide`), compared with the truth (`errors`, `accuracy`; `diagnoses`),
+and summed up in a `Validation` of tables, for which there is one writer (`tables`). Only the truth and the reported
+numbers enter a judgement, never how the measurement is done.
 """
-
-from disctrack.validate.run import QUICK, ValidationPlan, run_validate, scene_of, validate, write_validation
-from disctrack.validate.summary import Summary, complaints, summarise, verdict
-
-__all__ = [
-    "QUICK",
-    "Summary",
-    "ValidationPlan",
-    "complaints",
-    "run_validate",
-    "scene_of",
-    "summarise",
-    "validate",
-    "verdict",
-    "write_validation",
-]

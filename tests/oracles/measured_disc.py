@@ -1,12 +1,12 @@
-"""Measured trajectories of a disc without rendering, for tests: see disctrack.diagnosis.trials.recordings."""
+"""Measured trajectories of a disc without rendering, with what is planted as keywords (disctrack.validate.points)."""
 
-from disctrack.diagnosis.trials.recordings import (
-    CORNER_SIGMA_PX,
-    K_M,
-    SIGMA_PX,
-    Unseen,
-    measured,
-    rig_covariance,
-)
+from disctrack.validate import points
+from disctrack.validate.points import K_M, SIGMA_PX, Filmed, Laboratory, Planted
 
-__all__ = ["CORNER_SIGMA_PX", "K_M", "SIGMA_PX", "Unseen", "measured", "rig_covariance"]
+__all__ = ["K_M", "SIGMA_PX", "Laboratory", "measured"]
+
+
+def measured(effects=None, *, faults=None, laboratory=None, motion=None, laws=(), disc=None, **filmed):
+    """`filmed` : fields of `Filmed`; the others as in `Planted` and `points.measured`."""
+    planted = Planted({}, effects or {}, vars(faults) if faults else {}, laboratory=laboratory or Laboratory())
+    return points.measured(planted, Filmed(**filmed), motion=motion, laws=laws, disc=disc)

@@ -16,18 +16,18 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stage import _doubtful
 from disctrack.diagnosis.stretch import at_rest
 from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
-from disctrack.diagnosis.trials.imperfect import ORDINARY, Laboratory
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.memory import inflation, long_run_variance
 from disctrack.discrepancy.system import Quantity
 from disctrack.synthetic.description import CameraFault, Faults
-from tests.oracles.measured_disc import Unseen, measured
+from disctrack.validate.points import ORDINARY, Laboratory
+from tests.oracles.measured_disc import measured
 
 
 def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
     """As a tracking states it whose covariances cover all that the dots show."""
     trajectory = measured(
-        effects, faults=faults, unseen=Unseen(laboratory=laboratory), seed=seed, n=n, declared_rate=500.0, theta_deg=9.0
+        effects, faults=faults, laboratory=laboratory, seed=seed, n=n, declared_rate=500.0, theta_deg=9.0
     )
     inflated = max(1.0, float(np.median(trajectory.reduced_chi_square)))
     return replace(

@@ -12,7 +12,7 @@ from disctrack.synthetic.cameras import rig_after_faults
 from disctrack.synthetic.description import CameraFault, Faults, Scene
 from disctrack.trajectory import Trajectory
 from tests.disctrack.diagnosis.test_imperfect import recording
-from tests.oracles.measured_disc import Unseen, measured
+from tests.oracles.measured_disc import measured
 
 TURN_DEG, SHIFT_MM = (0.6, -0.7, 0.4), (1.2, -1.4, 0.8)
 TURNED = {f"right_turned.rotation_{a}": float(np.radians(v)) for a, v in zip("xyz", TURN_DEG, strict=True)}
@@ -45,7 +45,7 @@ def test_poses_with_the_fault_agree_again():
 
 @pytest.mark.statistical
 def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
-    result = diagnose_trajectory(measured(unseen=Unseen(clock=1.0), seed=1, n=200), separate=False)
+    result = diagnose_trajectory(measured(faults=Faults(frame_rate_hz=2000.0), seed=1, n=200), separate=False)
     (found,) = result.diagnosis.found
     assert found.candidate.name == "frame_rate"
     after = result.diagnosis.after

@@ -26,7 +26,8 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.rolling.effects import effect_from_formulas
-from tests.oracles.measured_disc import Unseen, measured
+from disctrack.synthetic.description import Faults
+from tests.oracles.measured_disc import measured
 from tests.oracles.unknown_laws import recording
 
 
@@ -219,7 +220,12 @@ def test_a_law_that_a_found_effect_describes_alone_is_that_effect(monkeypatch, a
     Control: where no found effect is fitted alone, the law takes the tilt's place.
     """
     made = measured(
-        {"table_tilt.tilt_x": 2e-3}, unseen=Unseen(clock=1e-4), seed=3, n=250, theta_deg=11.0, declared_rate=500.0
+        {"table_tilt.tilt_x": 2e-3},
+        faults=Faults(frame_rate_hz=500.05),
+        declared_rate=500.0,
+        seed=3,
+        n=250,
+        theta_deg=11.0,
     )
     if not asked:
         monkeypatch.setattr(stage, "_one_alone_does", lambda *_: False)

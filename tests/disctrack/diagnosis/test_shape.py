@@ -1,20 +1,18 @@
 """The exponent or scale of a law that was found is measured where the recording determines it, and only there."""
 
-import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose, diagnose_trajectory
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
-from disctrack.diagnosis.trials.hidden_effects import hidden_effect
-from disctrack.diagnosis.trials.rates import draw, together, trajectory_of
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.shape import profiled, refine_shapes
+from disctrack.validate.diagnoses import HiddenCase, plant
 from tests.oracles.measured_disc import measured
 
 
 def test_an_exponent_is_measured_along_its_profile():
-    trajectory = measured({"rolling_power.k": 4e-4, "rolling_power.p": 1.0}, base={}, seed=72, n=250, theta_deg=5.0)
+    trajectory = measured({"rolling_power.k": 4e-4, "rolling_power.p": 1.0}, k_m=0.0, seed=72, n=250, theta_deg=5.0)
     model = declared_model(trajectory, "none").model
     system = DiscSystem(trajectory, model)
     (power,) = [c for c in system.candidates if c.name == "rolling_power"]
@@ -65,9 +63,7 @@ def test_the_pivoting_rate_at_which_creep_begins_is_measured():
 @pytest.mark.slow
 def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
     """The flat's place has to be looked for, and only an effect that stands in for it is met by the search."""
-    rng = np.random.default_rng([2014, 32])
-    planted = together([hidden_effect("rim_flat").plant(1e-5, rng), hidden_effect("distortion").plant(0.05, rng)])
-    trajectory = trajectory_of(draw(2014, planted, 500.0), planted)
+    _, trajectory = plant(HiddenCase({"rim_flat": 1e-5, "distortion": 0.05}, seed=2014, rate=500.0))
     model = declared_model(trajectory).model
     every = {c.name: c for c in DiscSystem(trajectory, model).candidates}
 

@@ -5,8 +5,8 @@ import pytest
 
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import PAPER, declared_model
-from disctrack.diagnosis.trials.recordings import measured
 from disctrack.discrepancy.fit import fit
+from tests.oracles.measured_disc import measured
 
 
 def fitted(name, effects, n=150):

@@ -11,10 +11,10 @@ from disctrack.diagnosis import diagnose_trajectory
 from disctrack.diagnosis.plan import Planner, Proposal
 from disctrack.diagnosis.together.discs import diagnose_together
 from disctrack.diagnosis.together.recordings import Recorded
-from disctrack.diagnosis.trials.recordings import K_M, measured
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles import newton_euler
+from tests.oracles.measured_disc import K_M, measured
 
 RIG = 5
 RATE = 400.0

@@ -8,13 +8,13 @@ from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import N_RIG
 from disctrack.diagnosis.stage import diagnose_trajectory
-from disctrack.diagnosis.trials.recordings import Unseen
 from disctrack.frames import (
     euler_from_rotation,
     quaternion_from_rotation,
     rotation_from_quaternion,
     unwrap_euler,
 )
+from disctrack.synthetic.description import Faults
 from disctrack.track import table_contact
 from disctrack.track.as_printed import motions_of_pattern
 from disctrack.track.doubts import off_the_table_in_words
@@ -27,7 +27,7 @@ TURN, HEIGHT = (6e-4, -4e-4), 60e-6
 
 @pytest.fixture(scope="module")
 def leaning():
-    return measured(unseen=Unseen(table_turn=TURN, table_height=HEIGHT), n=200)
+    return measured(faults=Faults(table_turn_deg=tuple(np.degrees(TURN)), table_height_mm=1e3 * HEIGHT), n=200)
 
 
 def poses_of(trajectory, lift=0.0):

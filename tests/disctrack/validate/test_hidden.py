@@ -1,21 +1,28 @@
 """What the rates of the diagnosis rest on: what is planted is what the diagnosis means by the name of the effect."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
-from disctrack.diagnosis.trials.hidden_effects import HIDDEN_EFFECTS, Planted, hidden_effect
-from disctrack.diagnosis.trials.power import power
-from disctrack.diagnosis.trials.rates import draw, trajectory_of, trial
 from disctrack.discrepancy.fit import fit
+from disctrack.errors import DiscTrackError
+from disctrack.validate.diagnoses import (
+    HiddenCase,
+    diagnosis_validation,
+    draw,
+    found_from,
+    hidden_cases,
+    hide,
+    what_was_wrong,
+)
+from disctrack.validate.hidden import HIDDEN_EFFECTS, hidden_effect
+from disctrack.validate.points import measured
 
 # whose planting takes another way than the prediction: through the renderer's faults, instants, frames, areas
 MEASUREMENT = {e.name for e in HIDDEN_EFFECTS if e.visible and not e.plant(e.size, np.random.default_rng(1)).effects}
-
-
-def candidate_of(system, truth):
-    return next(c for c in system.candidates if set(truth) <= set(c.names))
 
 
 @pytest.mark.parametrize(
@@ -30,10 +37,9 @@ def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
     effect = hidden_effect(name)
     planted = effect.plant(effect.size, np.random.default_rng(7))
-    recording = draw(5, planted)
-    trajectory = trajectory_of(recording, planted, n=150)
+    trajectory = measured(planted, replace(draw(5, planted), n=150))
     system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
-    candidate = candidate_of(system, planted.truth)
+    candidate = next(c for c in system.candidates if set(planted.truth) <= set(c.names))
     base = tuple(q for q in system.base if q.name not in candidate.names)
     of_shape = {k: v for k, v in planted.effects.items() if k not in planted.truth}
     found = fit(system, (*base, *candidate.quantities), system.start() | of_shape)
@@ -45,59 +51,62 @@ def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
 
 
 @pytest.mark.statistical
-def test_a_trial_tells_what_became_of_the_hidden_effect():
-    verdict = trial([hidden_effect("time_offset")], [1e-4], seed=3)
+def test_a_verdict_tells_what_became_of_the_hidden_effect():
+    verdict = hide(HiddenCase({"time_offset": 1e-4}, seed=3))
     assert verdict.named
     assert verdict.within
     assert verdict.at_noise
     assert verdict.extra == 0
-    assert verdict.free_run_before > 1.2
+    assert verdict.free_run[0] > 1.2
     assert verdict.can_be_told
+    assert what_was_wrong(verdict) == ""
     # by itself it gains what it stands out by; scatter of a normal number
     assert verdict.stands_out == pytest.approx(np.sqrt(verdict.gain), abs=4)
+    # and of the size that it is found from it gains what a claim takes, within the same scatter
+    faint = hide(replace(verdict.case, hidden={"time_offset": found_from(verdict)}))
+    assert faint.stands_out == pytest.approx(faint.needed, rel=0.2)
 
 
 @pytest.mark.statistical
 def test_an_effect_below_its_sigma_is_not_asked_for():
     """A hundredth of what is found leaves a bound; two that the recording cannot tell apart do so, however large."""
-    faint = trial([hidden_effect("time_offset")], [1e-7], seed=3)
+    faint = hide(HiddenCase({"time_offset": 1e-7}, seed=3))
     assert not faint.named
     assert not faint.can_be_told
-    alike = trial([hidden_effect("frame_rate"), hidden_effect("gravity")], [0.012, 0.05], seed=3)
+    alike = hide(HiddenCase({"frame_rate": 0.012, "gravity": 0.05}, seed=3))
     assert alike.gain > 1e4
     assert not alike.can_be_told
 
 
 @pytest.mark.statistical
-def test_a_trial_without_an_effect_finds_nothing():
-    verdict = trial([], [], seed=4)
+def test_nothing_is_found_where_nothing_is_hidden_and_the_table_says_so():
+    verdict = hide(HiddenCase({"nothing": 1.0}, seed=4))
     assert verdict.verdict == "nothing missing"
     assert verdict.found == ()
+    validation = diagnosis_validation([verdict])
+    assert validation.headline == "Something claimed in 0 of 1 recordings in which nothing is hidden."
+    assert 0 < verdict.p_value < 1
+    assert f"{verdict.p_value < 0.5:d} of 1 |" in validation.markdown()
 
 
-@pytest.mark.statistical
-def test_an_effect_stands_out_by_what_its_refit_gains():
-    """The power curve's prediction, of a linearisation without the effect, is the gain of a fit with it."""
-    effect, seed = hidden_effect("table_tilt"), 6
-    (predicted,) = power([effect], [seed], rate=500.0)
-    size = 20.0 / predicted.standing_out[0] * effect.size
-    planted = effect.plant(size, np.random.default_rng([seed, 34]))
-    trajectory = trajectory_of(draw(seed, Planted({}), 500.0), planted)
-    system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
-    base = fit(system, system.base, system.start())
-    more = fit(system, (*base.quantities, *candidate_of(system, planted.truth).quantities), base.values)
-    # noncentral chi-square of two degrees at 20^2: 402 +- 40
-    assert base.cost - more.cost == pytest.approx(402, abs=4 * 40)
-    assert predicted.probability(size) > 0.999
-    assert predicted.probability(0.01 * size) < 0.01
-    assert 0 < predicted.smallest(0.5) < predicted.smallest(0.9) < size
+def test_cases_are_told_by_name_and_size_and_pairs_are_drawn_anew_for_each_seed():
+    assert len(list(hidden_cases([], range(1, 3)))) == 102
+    (case,) = hidden_cases(["kz=1e-7"], [5])
+    assert (dict(case.hidden), case.seed) == ({"kz": 1e-7}, 5)
+    first, second = hidden_cases([], [7], pairs=2)
+    assert (len(first.hidden), first.seed, second.seed) == (2, 7, 8)
+    assert first.hidden.keys() != second.hidden.keys()
+    with pytest.raises(DiscTrackError, match="there is no effect 'kx' to hide"):
+        list(hidden_cases(["kx"], [1]))
+    with pytest.raises(DiscTrackError, match="size in m"):
+        list(hidden_cases(["kz=much"], [1]))
 
 
 @pytest.mark.slow
 def test_beside_an_effect_that_was_looked_for_another_of_the_catalogue_is_tried_before_a_law_outside_of_it():
     """A shaken table and a dot 20 um off: the shaking alone left chi-square 1.006, but no noise."""
-    effects = [hidden_effect(name) for name in ("table_shaken", "misprint")]
-    verdict = trial(effects, [e.size for e in effects], 10, 500.0)
+    sizes = {name: hidden_effect(name).size for name in ("table_shaken", "misprint")}
+    verdict = hide(HiddenCase(sizes, seed=10, rate=500.0))
     assert verdict.named
     assert verdict.within
     assert verdict.verdict == "found"

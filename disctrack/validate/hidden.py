@@ -1,31 +1,22 @@
 """Effects to hide, one by one, in measured trajectories: what is planted, and what the diagnosis should then say.
 
-Every size is that of the issue at hand or one that a careful experimenter would still overlook; directions and signs
-are drawn, passive effects keep theirs.
+Every size is one that a careful experimenter would still overlook; directions and signs are drawn, passive effects keep
+theirs. `CONTROLS` hide nothing that may be claimed.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
 
-from disctrack.diagnosis.trials.recordings import STATION, Unseen
+from disctrack.diagnosis.systematic import DOT_SIGMA
 from disctrack.errors import DiscTrackError
 from disctrack.rolling import CATALOGUE
-from disctrack.synthetic.description import CameraFault, Faults, Triple
+from disctrack.synthetic.description import CameraFault
+from disctrack.validate.points import ORDINARY, STATION, Laboratory, Planted
 
 N_DOTS = 6
-
-
-@dataclass(frozen=True)
-class Planted:
-    """What goes into the data, and the values of the diagnosis' quantities that are true then."""
-
-    truth: Mapping[str, float]
-    effects: Mapping[str, float] = field(default_factory=dict)  # of the motion
-    faults: Faults = field(default_factory=Faults)
-    unseen: Unseen = field(default_factory=Unseen)
 
 
 @dataclass(frozen=True)
@@ -88,14 +79,9 @@ def _shaken(size: float, rng: Generator) -> Planted:
     return Planted(truth, effects=effects)
 
 
-def _delay(size: float, rng: Generator) -> Planted:
-    value = size * _sign(rng)
-    return Planted({"time_offset.delay": value}, faults=Faults(right_delay_s=value))
-
-
 def _clock(size: float, rng: Generator) -> Planted:
     value = size * _sign(rng)
-    return Planted({"frame_rate.change": value}, unseen=Unseen(clock=value))
+    return Planted({"frame_rate.change": value}, clock=value)
 
 
 def _camera(keys: tuple[str, ...], fault: Callable[[tuple[float, ...]], CameraFault]) -> Callable[..., Planted]:
@@ -105,13 +91,12 @@ def _camera(keys: tuple[str, ...], fault: Callable[[tuple[float, ...]], CameraFa
         which = "left" if rng.random() < 0.5 else "right"
         numbers = _direction(size, rng, len(keys))
         truth = {f"{which}_{k}": v for k, v in zip(keys, numbers, strict=True)}
-        broken = fault(numbers)
-        return Planted(truth, faults=Faults(left=broken) if which == "left" else Faults(right=broken))
+        return Planted(truth, faults={which: fault(numbers)})
 
     return plant
 
 
-def _triple(numbers: tuple[float, ...], factor: float) -> Triple:
+def _triple(numbers: tuple[float, ...], factor: float) -> tuple[float, float, float]:
     x, y, z = numbers
     return factor * x, factor * y, factor * z
 
@@ -121,34 +106,27 @@ def _misprint(size: float, rng: Generator) -> Planted:
     x, y = _direction(size, rng, 2)
     places = [(0.0, 0.0)] * N_DOTS
     places[which] = (1e3 * x, 1e3 * y)
-    return Planted({f"misprint_{which}.x": x, f"misprint_{which}.y": y}, faults=Faults(misprint_mm=tuple(places)))
+    return Planted({f"misprint_{which}.x": x, f"misprint_{which}.y": y}, faults={"misprint_mm": tuple(places)})
 
 
-def _pattern(size: float, rng: Generator) -> Planted:
-    x, y = _direction(size, rng, 2)
-    offset = (1e3 * x, 1e3 * y)
-    return Planted({"pattern_offset.x": x, "pattern_offset.y": y}, faults=Faults(pattern_offset_mm=offset))
+def _plane(keys: tuple[str, str], fault: str, factor: float) -> Callable[..., Planted]:
+    """A fault with a direction in a plane; `factor` from the diagnosis' unit to that of the scene's key."""
 
-
-def _table(size: float, rng: Generator) -> Planted:
-    x, y = _direction(size, rng, 2)
-    return Planted({"table_plane.tilt_x": x, "table_plane.tilt_y": y}, unseen=Unseen(table_turn=(x, y)))
-
-
-def _one(key: str, unseen: Callable[[float], Unseen], signed: bool = True) -> Callable[..., Planted]:
     def plant(size: float, rng: Generator) -> Planted:
-        value = size * (_sign(rng) if signed else 1.0)
-        return Planted({key: value}, unseen=unseen(value))
+        x, y = _direction(size, rng, 2)
+        return Planted(dict(zip(keys, (x, y), strict=True)), faults={fault: (factor * x, factor * y)})
 
     return plant
 
 
-def _exposure(size: float, rng: Generator) -> Planted:
-    return Planted({"exposure_blur.T2": size**2}, unseen=Unseen(exposure=size))
+def _one(key: str, fault: str, factor: float = 1.0, null: float = 0.0) -> Callable[..., Planted]:
+    """A fault of one number with a sign."""
 
+    def plant(size: float, rng: Generator) -> Planted:
+        value = size * _sign(rng)
+        return Planted({key: value}, faults={fault: null + factor * value})
 
-def _centres(size: float, rng: Generator) -> Planted:
-    return Planted({"ellipse_centre.share": 1.0}, unseen=Unseen(image_centres=True))
+    return plant
 
 
 _TURN, _SHIFT = ("rotation_x", "rotation_y", "rotation_z"), ("translation_x", "translation_y", "translation_z")
@@ -190,7 +168,8 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _law("edge_radius", "rounded edge", "rho", 1e-4, "m"),
     _law("inertia_diametral", "J1 wrong", "e", 0.005, "1", signed=True),
     _vector("inertia_product", "product of inertia", ("inertia_product.J_13", "inertia_product.J_23"), 1e-8, "kg m^2"),
-    HiddenEffect("time_offset", "one camera late", 1e-4, "s", _delay),
+    HiddenEffect("time_offset", "one camera late", 1e-4, "s", _one(
+        "time_offset.delay", "right_delay_s")),
     HiddenEffect("turned", "camera turned", 2e-4, "rad", _camera(
         tuple(f"turned.{k}" for k in _TURN), lambda v: CameraFault(rotation_deg=_triple(v, 180 / np.pi)))),
     HiddenEffect("shifted", "camera shifted", 2e-4, "m", _camera(
@@ -202,25 +181,45 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     HiddenEffect("distortion", "distortion", 0.05, "1", _camera(
         ("distortion.k1",), lambda v: CameraFault(k1_change=v[0]))),
     HiddenEffect("misprint", "one dot misprinted", 2e-5, "m", _misprint),
-    HiddenEffect("pattern_offset", "pattern off centre", 2e-5, "m", _pattern),
+    HiddenEffect("pattern_offset", "pattern off centre", 2e-5, "m", _plane(
+        ("pattern_offset.x", "pattern_offset.y"), "pattern_offset_mm", 1e3)),
     HiddenEffect("pattern_rotation", "pattern turned", 1e-3, "rad", _one(
-        "pattern_rotation.angle", lambda v: Unseen(pattern_turn=v)), visible=False),
+        "pattern_rotation.angle", "pattern_turn_deg", 180 / np.pi), visible=False),
     HiddenEffect("pattern_scale", "pattern too large", 1e-3, "1", _one(
-        "pattern_scale.change", lambda v: Unseen(pattern_scale=v))),
+        "pattern_scale.change", "pattern_scale", null=1.0)),
     HiddenEffect("pattern_height", "pattern too high", 5e-5, "m", _one(
-        "pattern_height.offset", lambda v: Unseen(pattern_height=v))),
-    HiddenEffect("table_plane", "table not parallel to its view", 2e-4, "rad", _table),
+        "pattern_height.offset", "pattern_height_mm", 1e3)),
+    HiddenEffect("table_plane", "table not parallel to its view", 2e-4, "rad", _plane(
+        ("table_plane.tilt_x", "table_plane.tilt_y"), "table_turn_deg", 180 / np.pi)),
     HiddenEffect("table_height", "table not at the height of its view", 5e-5, "m", _one(
-        "table_height.offset", lambda v: Unseen(table_height=v))),
-    HiddenEffect("exposure_blur", "exposure", 2e-3, "s", _exposure),
-    HiddenEffect("ellipse_centre", "bias of the ellipse centre", 1.0, "1", _centres),
+        "table_height.offset", "table_height_mm", 1e3)),
+    HiddenEffect("exposure_blur", "exposure", 2e-3, "s", lambda size, _: Planted(
+        {"exposure_blur.T2": size**2}, faults={"exposure_s": size})),
+    HiddenEffect("ellipse_centre", "bias of the ellipse centre", 1.0, "1", lambda size, _: Planted(
+        {"ellipse_centre.share": size}, faults={"ellipse_centre_share": size})),
+)  # fmt: skip
+CONTROLS: tuple[HiddenEffect, ...] = (
+    HiddenEffect("nothing", "nothing at all", 1.0, "1", lambda size, _: Planted()),
+    HiddenEffect("prints", "small errors of the dots' places, as every diagnosis allows for", DOT_SIGMA, "m",
+                 lambda size, _: Planted(laboratory=Laboratory(print_m=size))),
+    HiddenEffect("laboratory", "an imperfect laboratory", 1.0, "1", lambda size, _: Planted(laboratory=ORDINARY)),
 )  # fmt: skip
 
 
 def hidden_effect(name: str) -> HiddenEffect:
     """By its name. Raises DiscTrackError."""
-    for effect in HIDDEN_EFFECTS:
+    for effect in (*HIDDEN_EFFECTS, *CONTROLS):
         if effect.name == name:
             return effect
-    known = ", ".join(e.name for e in HIDDEN_EFFECTS)
+    known = ", ".join(e.name for e in (*HIDDEN_EFFECTS, *CONTROLS))
     raise DiscTrackError(f"there is no effect '{name}' to hide; there are {known}")
+
+
+def together(planted: Sequence[Planted]) -> Planted:
+    """Several at once; of faults that exclude each other the last one holds."""
+    truth, effects, faults = (
+        {k: v for p in planted for k, v in getattr(p, kind).items()} for kind in ("truth", "effects", "faults")
+    )
+    clock = next((p.clock for p in reversed(planted) if p.clock), 0.0)
+    laboratory = next((p.laboratory for p in reversed(planted) if p.laboratory != Laboratory()), Laboratory())
+    return Planted(truth, effects, faults, clock, laboratory)

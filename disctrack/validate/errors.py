@@ -113,32 +113,54 @@ class Consistency:
     n: int  # poses, or rigs, that are independent
 
 
-def noise_consistency(comparison: PoseErrors) -> Consistency:
-    """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
-    ok = comparison.usable
-    e, C = comparison.error[ok], comparison.covariance[ok]
-    n = len(e)
-    if n == 0:
-        return Consistency(float("nan"), float("nan"), 0)
-    value = np.einsum("ni,ni->n", e, np.linalg.solve(C, e[..., None])[..., 0]).mean() / 6
-    return Consistency(float(value), float(np.sqrt(2 / (6 * n))), n)
-
-
-def calibration_consistency(own: Sequence[PoseErrors], true: Sequence[PoseErrors]) -> Consistency:
-    """Squared calibration error over its reported variance, from the same images measured through two rigs.
-
-    own[k], true[k] : poses of recording k through its own calibration and through the true cameras. The image noise is
-    in both, so that their difference is the calibration's share alone. It is common to a recording: each one counts
-    once, as the mean over its poses of d^T C^-1 d / 6.
-    """
-    values = []
-    for a, b in zip(own, true, strict=True):
-        ok = a.usable & b.usable
-        if not ok.any():
-            continue
-        d, C = (a.error - b.error)[ok], a.calibration_covariance[ok]
-        values.append(np.mean(np.einsum("ni,ni->n", d, np.linalg.solve(C, d[..., None])[..., 0])) / 6)
+def _consistency(values: Sequence[Array] | Sequence[float]) -> Consistency:
     n = len(values)
     if n == 0:
         return Consistency(float("nan"), float("nan"), 0)
     return Consistency(float(np.mean(values)), float(np.sqrt(2 / (6 * n))), n)
+
+
+def _normalised(errors: Array, covariance: Array) -> Array:
+    """(n,) e^T C^-1 e / 6."""
+    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0]) / 6
+
+
+def noise_consistency(comparison: PoseErrors) -> Consistency:
+    """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
+    ok = comparison.usable
+    return _consistency(list(_normalised(comparison.error[ok], comparison.covariance[ok])))
+
+
+def calibration_consistency(pairs: Sequence[tuple[PoseErrors, PoseErrors]]) -> Consistency:
+    """Squared calibration error over its reported variance, from the same images measured through two rigs.
+
+    pairs : poses of each recording through its own calibration and through the true cameras. The image noise is in
+    both, so that their difference is the calibration's share alone. It is common to a recording: each one counts once,
+    as the mean over its poses of d^T C^-1 d / 6.
+    """
+    values = []
+    for own, true in pairs:
+        ok = own.usable & true.usable
+        if ok.any():
+            values.append(float(_normalised((own.error - true.error)[ok], own.calibration_covariance[ok]).mean()))
+    return _consistency(values)
+
+
+@dataclass(frozen=True)
+class MeanErrors:
+    """What frames of one recording have in common, by POSE_COMPONENTS [m, rad]."""
+
+    error: Array  # (6,) mean over the frames
+    sigma: Array  # (6,) stated for it: what frames share
+    scatter: Array  # (6,) about the mean
+    noise_ratio: float  # squared scatter from frame to frame over its stated variance, mean of the components
+
+
+def mean_errors(errors: PoseErrors) -> MeanErrors:
+    """Of the frames of one smooth motion, in their order."""
+    ok = errors.usable
+    error, variance = errors.error[ok], np.diagonal(errors.covariance[ok], axis1=1, axis2=2)
+    shared = np.diagonal(errors.calibration_covariance[ok], axis1=1, axis2=2)
+    bends = np.diff(error, 2, axis=0) ** 2 / 6.0
+    sigma = np.sqrt(np.median(shared, axis=0))
+    return MeanErrors(error.mean(axis=0), sigma, error.std(axis=0), float(np.mean(bends / variance[1:-1])))

@@ -1,0 +1,300 @@
+"""The accuracy claim of 0.005 mm and 0.05 deg put to the test: the numbers, and the sentence that follows from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.kit.arrays import Array
+from disctrack.frames import POSE_COMPONENTS
+from disctrack.validate.errors import (
+    QUANTITIES,
+    Consistency,
+    ErrorStatistics,
+    PoseErrors,
+    calibration_consistency,
+    joined,
+    mean_errors,
+    noise_consistency,
+    spread,
+)
+from disctrack.validate.rendered import EXPOSURE, IMPERFECT, STATIC, STRATA_DEG, RenderedOutcome
+from disctrack.validate.tables import Table, Validation
+
+CLAIM_POSITION = 5e-6  # [m] and
+CLAIM_ROTATION = np.radians(0.05)  # Ma et al. 2014, end of section 3
+REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta) is all there is to see
+LAW_DEG = 20.0  # at larger nutation the cameras' directions matter more than 1/sin(theta)
+CONSISTENT = (0.8, 1.25)
+_UM, _MDEG = 1e6, 180e3 / np.pi
+
+Pair = tuple[PoseErrors, PoseErrors]  # through the own calibration, through the true cameras
+
+
+@dataclass(frozen=True)
+class AccuracyRow:
+    """Errors of one quantity: everything, and its two shares measured on the same images."""
+
+    quantity: str
+    total: ErrorStatistics  # through the recordings' own calibrations
+    noise: ErrorStatistics  # through the true cameras
+    calibration: ErrorStatistics  # the difference of the two
+
+    @property
+    def unit(self) -> tuple[float, str]:
+        """Factor and name of the unit on a page."""
+        return (_UM, "um") if self.quantity in "xyz" else (_MDEG, "mdeg")
+
+    @property
+    def claim(self) -> float:
+        """What 95 % of the errors should lie within [m or rad]."""
+        return CLAIM_POSITION if self.quantity in "xyz" else CLAIM_ROTATION
+
+    @property
+    def holds(self) -> bool:
+        """95 % of the errors lie within the claim."""
+        return self.total.within_95 <= self.claim
+
+
+@dataclass(frozen=True)
+class SightCount:
+    """Static poses by the number of cameras that can see the upper face."""
+
+    cameras: int
+    n: int
+    found: int
+    gross: int  # found, but another pose altogether
+    position: float  # [m] rms per axis
+    rotation: float  # [rad] rms per axis
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """All that recordings with static poses showed."""
+
+    recordings: int
+    corners_px: tuple[float, ...]
+    rows: dict[str, tuple[AccuracyRow, ...]]  # by part of the recordings
+    sights: tuple[SightCount, ...]
+    consistency: dict[str, Consistency]  # of the noise in each part, and of the calibration
+    law: float  # [rad] c of sigma(psi) = c / sin(theta)
+    warnings: tuple[str, ...]
+
+    def law_limit_deg(self, sigmas: float) -> float:
+        """Nutation [deg] below which so many sigmas of psi and of phi exceed the claim."""
+        return float(np.degrees(np.arcsin(min(1.0, sigmas * self.law / CLAIM_ROTATION))))
+
+
+def sum_up(outcomes: Sequence[RenderedOutcome]) -> Accuracy:
+    """Of recordings that have static poses; errors count where both cameras see the face."""
+    parts = _parts(outcomes)
+    static = [outcome.parts[STATIC] for outcome in outcomes]
+    law = joined([true for _, true in parts[STATIC]])
+    law = law.part(law.usable & (law.q[:, 4] < np.radians(LAW_DEG)))
+    consistency = {
+        f"noise, {name} (true cameras)": noise_consistency(joined([true for _, true in pairs]))
+        for name, pairs in parts.items()
+    }
+    by_calibration = {"calibration (own - true cameras, same images)": calibration_consistency(parts[STATIC])}
+    return Accuracy(
+        len(outcomes),
+        tuple(outcome.corners_px for outcome in outcomes),
+        {name: _rows(pairs) for name, pairs in parts.items()},
+        tuple(_sight(joined([m.own.part(m.cameras == n) for m in static]), n) for n in (2, 1, 0)),
+        consistency | by_calibration,
+        _rms(law.angles[:, [0, 2]] * np.sin(law.q[:, 4])[:, None]),
+        tuple(sorted({w for outcome in outcomes for m in outcome.parts.values() for w in m.warnings})),
+    )
+
+
+def _parts(outcomes: Sequence[RenderedOutcome]) -> dict[str, list[Pair]]:
+    return {name: [outcome.parts[name].seen_by_both for outcome in outcomes] for name in outcomes[0].parts}
+
+
+def _rows(pairs: Sequence[Pair]) -> tuple[AccuracyRow, ...]:
+    own, true = (joined(errors) for errors in zip(*pairs, strict=True))
+    both = own.usable & true.usable
+    regular = both & (own.q[:, 4] > np.radians(REGULAR_DEG))
+    rows = []
+    for name in QUANTITIES:
+        at = regular if name in ("psi", "phi") and regular.any() else both
+        e, f = own.part(at).of(name), true.part(at).of(name)
+        difference = e - f if name in "xyz" else np.angle(np.exp(1j * (e - f)))
+        rows.append(AccuracyRow(name, spread(e), spread(f), spread(difference)))
+    return tuple(rows)
+
+
+def _sight(own: PoseErrors, cameras: int) -> SightCount:
+    error = own.error[own.usable]
+    found, gross = int(own.found.sum()), int(own.gross.sum())
+    return SightCount(cameras, len(own.q), found, gross, _rms(error[:, :3]), _rms(error[:, 3:]))
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else float("nan")
+
+
+def verdict(accuracy: Accuracy) -> str:
+    """Where the claim holds, where it cannot, and by which factor it is beaten; all from the numbers."""
+    rows = {row.quantity: row for row in accuracy.rows[STATIC]}
+    position = max(rows[name].total.within_95 for name in "xyz")
+    rotation = rows["rotation"].total.within_95
+    two, one, _ = accuracy.sights
+    missed = two.n - two.found + two.gross
+    held = {position <= CLAIM_POSITION, rotation <= CLAIM_ROTATION}
+    name = "holds" if held == {True} else "does not hold" if held == {False} else "holds in part"
+    factors = ", ".join(
+        f"{what} is {'beaten' if factor >= 1 else 'missed'} by a factor of {max(factor, 1 / factor):.1f}"
+        for what, factor in (
+            ("0.005 mm", CLAIM_POSITION / position),
+            ("0.05 deg for the rotation as a whole", CLAIM_ROTATION / rotation),
+        )
+    )
+    text = (
+        f"Where both cameras see the face, the claim of 0.005 mm / 0.05 deg {name}: 95 % of {two.n} poses lie within "
+        f"{1e3 * position:.5f} mm per axis and {np.degrees(rotation):.4f} deg per rotation axis, calibration included "
+        f"({factors}{f'; {missed} poses not found or wrong' if missed else ''}); it cannot hold for psi and phi alone "
+        f"at small nutation, because each scatters by {_MDEG * accuracy.law:.2f} mdeg / sin(theta): beyond 0.05 deg "
+        f"below {accuracy.law_limit_deg(1):.1f} deg (rms) or {accuracy.law_limit_deg(2):.1f} deg (95 %)"
+    )
+    if one.found:
+        beyond = "beyond the claim" if one.position > CLAIM_POSITION else "within the claim"
+        text += f"; seen by one camera only, positions are good to {1e3 * one.position:.4f} mm (rms), {beyond}"
+    return text + "."
+
+
+def complaints(accuracy: Accuracy) -> tuple[str, ...]:
+    """What a validation must not show; empty when all is well."""
+    found = [f"{s.gross} of {s.n} poses seen by {s.cameras} cameras are wrong" for s in accuracy.sights if s.gross]
+    two = accuracy.sights[0]
+    if two.found < two.n:
+        found.append(f"{two.n - two.found} of {two.n} poses seen by both cameras were not found")
+    for kind, rows in accuracy.rows.items():
+        for row in rows:
+            if not row.holds and row.quantity not in ("psi", "phi"):
+                found.append(f"{kind}: 95 % of {row.quantity} lie beyond the claim")
+    for name, value in accuracy.consistency.items():
+        slack = 3 * value.uncertainty  # with few poses or rigs chance alone leaves the band
+        if value.n and not CONSISTENT[0] - slack <= value.value <= CONSISTENT[1] + slack:
+            found.append(
+                f"{name}: squared error over predicted variance is {value.value:.2f} +- {value.uncertainty:.2f}"
+            )
+    return tuple(found)
+
+
+def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
+    """All tables of recordings with static poses, with the verdict on top."""
+    accuracy, parts = sum_up(outcomes), _parts(outcomes)
+    tables = [_accuracy_table(kind, rows) for kind, rows in accuracy.rows.items()]
+    tables += [_strata_table(accuracy.law, parts[STATIC]), _sight_table(accuracy), _consistency_table(accuracy)]
+    picture, bad = error_figure(parts, accuracy.law), complaints(accuracy)
+    return Validation("validation", verdict(accuracy), tables, [accuracy], bad, accuracy.warnings, picture)
+
+
+def _cells(*values: float) -> list[str]:
+    return [f"{value:.2f}" if np.isfinite(value) else "-" for value in values]
+
+
+def _accuracy_table(kind: str, rows: Sequence[AccuracyRow]) -> Table:
+    head = ["quantity", "unit", "n", "bias", "scatter", "95 %", "max", "noise rms (true cameras)",
+            "calibration rms", "claim", "claim / 95 %"]  # fmt: skip
+    lines = []
+    for row in rows:
+        (k, unit), t = row.unit, row.total
+        figures = _cells(
+            *(k * v for v in (t.bias, t.scatter, t.within_95, t.largest, row.noise.rms, row.calibration.rms))
+        )
+        lines.append([row.quantity, unit, str(t.n), *figures, f"{k * row.claim:.0f}", f"{row.claim / t.within_95:.1f}"])
+    note = "Rotation: the rotation vector between measured and true attitude."
+    by_name = {row.quantity: row for row in rows}
+    if by_name["psi"].total.n < by_name["theta"].total.n:
+        note = f"psi and phi from {REGULAR_DEG:.0f} deg of nutation on. {note}"
+    if kind != STATIC:
+        note += (
+            f" Exposure {1e3 * EXPOSURE:g} ms: an image shows the mean attitude of the exposure, so that theta appears "
+            "smaller by sin(theta) (psidot exposure)^2 / 24, which no covariance of the noise contains."
+        )
+    return Table(f"{kind[0].upper()}{kind[1:]}, face seen by both cameras", head, lines, note)
+
+
+def _strata_table(law: float, static: Sequence[Pair]) -> Table:
+    own, true = (joined(errors) for errors in zip(*static, strict=True))
+    theta, angles = np.degrees(own.q[:, 4]), ("rotation", "theta", "psi", "phi")
+    lines = []
+    for low, high in STRATA_DEG:
+        at = (theta >= low) & (theta < high)
+        seen = own.part(at)
+        position = _UM * _rms(seen.error[seen.usable, :3])
+        rms = [_MDEG * _rms(seen.of(name)) for name in angles]
+        expected = _MDEG * law / np.sin(np.radians(np.sqrt(low * high)))
+        cells = _cells(position, *rms, _MDEG * _rms(true.part(at).of("psi")), expected)
+        lines.append([f"{low:g}-{high:g}", str(int(at.sum())), *cells])
+    head = ["theta [deg]", "n", "position rms [um]", *(f"{name} rms [mdeg]" for name in angles),
+            "psi noise rms [mdeg]", f"law {_MDEG * law:.2f} / sin(theta) [mdeg]"]  # fmt: skip
+    return Table("As a function of nutation (static poses, both cameras)", head, lines)
+
+
+def _sight_table(accuracy: Accuracy) -> Table:
+    lines = [
+        [*map(str, (s.cameras, s.n, s.found, s.gross)), *_cells(_UM * s.position, _MDEG * s.rotation)]
+        for s in accuracy.sights
+    ]
+    head = ["cameras", "poses", "found", "wrong", "position rms [um]", "rotation rms [mdeg]"]
+    note = "A pose that no camera can see is rightly without an answer; it does not count as a failure."
+    return Table("Who sees the face (static poses)", head, lines, note)
+
+
+def _consistency_table(accuracy: Accuracy) -> Table:
+    lines = [[name, *_cells(c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
+    head = ["squared error over predicted variance", "value", "standard error by chance", "poses or rigs"]
+    corners = ", ".join(f"{rms:.4f}" for rms in accuracy.corners_px)
+    note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]}. Corner residuals of the calibrations: {corners} px."
+    return Table("Honesty of the reported covariance", head, lines, note)
+
+
+def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
+    """Mean errors of recordings of an imperfect laboratory, with what is stated for them."""
+    unit = np.array(3 * [_UM] + 3 * [_MDEG])
+    found = [mean_errors(outcome.parts[IMPERFECT].own) for outcome in outcomes]
+    lines = []
+    for outcome, m in zip(outcomes, found, strict=True):
+        means = [f"{e:.2f} +- {s:.2f}" for e, s in zip(m.error * unit, m.sigma * unit, strict=True)]
+        left, right = outcome.parts[IMPERFECT].systematic_px
+        lines.append([str(outcome.seed), *means, f"{m.noise_ratio:.2f}", f"{left:.4f}, {right:.4f}"])
+        lines.append(["", *_cells(*m.scatter * unit), "", ""])
+    honest = np.mean([(m.error / m.sigma) ** 2 for m in found], axis=0)
+    lines.append(["squared error over variance", *_cells(*honest), "", ""])
+    head = ["seed", *POSE_COMPONENTS, "frame to frame, squared over stated", "repeating, px"]
+    note = "Mean error +- what is stated for it, in um and mdeg; scatter about the mean below."
+    headline = f"Mean errors in {len(outcomes)} recordings of an imperfect laboratory."
+    return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note)], found)
+
+
+def error_figure(parts: dict[str, list[Pair]], law: float) -> Figure:
+    """|error| of every pose seen by both cameras against nutation, with the claim and the law of psi and phi."""
+    from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED
+
+    chart = Figure(figsize=(13, 4.6), layout="constrained")
+    panels = chart.subplots(1, 3, sharex=True)
+    names = (("x", "y", "z"), ("rotation x", "y", "z"), ("psi", "theta", "phi"))
+    colours = ((BLUE, AMBER, RED), (BLUE, AMBER, RED), (PURPLE, MUTED, GREEN))
+    for k, panel in enumerate(panels):
+        scale, claim = (_UM, CLAIM_POSITION) if k == 0 else (180 / np.pi, CLAIM_ROTATION)
+        for part, pairs in parts.items():
+            own = joined([own for own, _ in pairs])
+            own = own.part(own.usable)
+            size = scale * np.abs(own.angles if k == 2 else own.error[:, 3 * k : 3 * k + 3])
+            for values, colour, name in zip(size.T, colours[k], names[k], strict=True):
+                label = name if part == STATIC else None
+                panel.plot(np.degrees(own.q[:, 4]), values, "o" if part == STATIC else ".", color=colour, label=label)
+        panel.axhline(scale * claim, color=INK, ls="--", label="claim")
+        panel.set(
+            xscale="log", yscale="log", xlabel="nutation (deg)", ylabel="|error| (µm)" if k == 0 else "|error| (deg)"
+        )
+    theta = np.geomspace(0.45, 90, 200)
+    panels[2].plot(theta, np.degrees(law) / np.sin(np.radians(theta)), color=INK, label="1 / sin(theta)")
+    for panel in panels:
+        panel.legend(fontsize=8)
+    chart.suptitle("Errors through the recordings' own calibrations (circles: static, dots: rolling)")
+    return chart

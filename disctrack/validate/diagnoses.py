@@ -1,0 +1,306 @@
+"""How often does the diagnosis find, name and size what is hidden, how small may it be, and does it cry wolf?
+
+Every case draws a motion, a rig with a calibration error of its own, and the noise of the dots; plants effects
+(`hidden`); and hands the measured trajectory, which does not tell of them, to the diagnosis.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from scipy import stats
+
+from disctrack.diagnosis import DiscDiagnosis, diagnose_trajectory
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.significance import wald
+from disctrack.errors import DiscTrackError
+from disctrack.rolling import Model, simulate, steady_precession
+from disctrack.synthetic.description import Scene
+from disctrack.trajectory import Trajectory
+from disctrack.validate.hidden import HIDDEN_EFFECTS, hidden_effect, together
+from disctrack.validate.points import Filmed, Planted, measured
+from disctrack.validate.tables import Table, Validation, figure
+
+FRAME_RATE = 1000.0  # [Hz] of the reference recordings
+DURATION = (0.4, 0.9)  # [s]
+THETA_DEG = (3.0, 15.0)
+NUTATION_SHARE = (0.02, 0.1)  # of the nutation angle
+OMEGA3 = (-2.0, 3.0)  # [rad/s]
+K_M_DRAWN = (0.2e-7, 0.5e-7)  # [m s^2]
+FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
+DRAWS = 200
+ENOUGH = 3.0  # [sigma] a coefficient may be off
+AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
+LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
+
+
+@dataclass(frozen=True)
+class HiddenCase:
+    """What is hidden, effect -> size, in the recording of a seed; controls hide nothing that may be claimed."""
+
+    hidden: Mapping[str, float]
+    seed: int
+    rate: float = FRAME_RATE  # [Hz]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one case."""
+
+    case: HiddenCase
+    n: int  # frames
+    verdict: str
+    sentence: str
+    found: tuple[str, ...]  # every effect claimed, its class after it in brackets
+    named: bool  # every hidden effect is among those claimed, or in the class of one
+    pull: float  # largest error of a coefficient in its sigmas; NaN where it is not named
+    extra: int  # claims beyond those hidden
+    chi_square: tuple[float, float]  # reduced, before and after
+    free_run: tuple[float, float]  # over its floor, before and after
+    gain: float  # of chi-square by all effects claimed
+    p_value: float  # that noise alone would let some effect gain as much as the best one does; NaN: not known
+    seconds: float
+    stands_out: float  # of the hidden effects the least, in sigmas, with all others fitted beside it; NaN: not known
+    needed: float  # sigmas that a claim takes
+
+    @property
+    def can_be_told(self) -> bool:
+        """Does the recording determine every hidden effect beside the others, so that it may be asked for?
+
+        What stands out by less than a claim takes leaves a bound only, whoever looks.
+        """
+        return not self.stands_out < self.needed
+
+    @property
+    def at_noise(self) -> bool:
+        """Is what is left noise, in the fit and in the free run?"""
+        return self.chi_square[1] <= AT_NOISE and self.free_run[1] <= HELD_OUT
+
+    @property
+    def within(self) -> bool:
+        """Are the coefficients right within three sigma?"""
+        return self.named and abs(self.pull) <= ENOUGH
+
+
+def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Filmed:
+    """A motion that lasts as long as it is filmed, whatever is planted in it."""
+    rng = np.random.default_rng([seed, 31])
+    disc = Scene().declared_disc
+    for _ in range(DRAWS):
+        theta = float(rng.uniform(*THETA_DEG))
+        n = int(rate * rng.uniform(*DURATION))
+        nutation = theta * float(rng.uniform(*NUTATION_SHARE))
+        filmed = Filmed(
+            seed, n, theta, nutation, float(rng.uniform(*OMEGA3)), float(rng.uniform(*K_M_DRAWN)), declared_rate=rate
+        )
+        model = Model(disc).with_values({"km.k_m": filmed.k_m} | dict(planted.effects))
+        try:
+            start = steady_precession(
+                np.radians(theta), disc, omega3=filmed.omega3, nutation_amplitude=np.radians(nutation)
+            )
+            motion = simulate(model, start, duration=1.03 * n / rate + 0.01, rate=rate)
+        except DiscTrackError:  # no such precession
+            continue
+        if len(motion) > 1.02 * n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
+            return filmed
+    raise DiscTrackError(f"no motion of {DURATION[0]} s among {DRAWS} drawn: what is planted stops the disc at once")
+
+
+def plant(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
+    """What is planted, one by one, and the recording with all of it."""
+    rng = np.random.default_rng([case.seed, 32])
+    parts = [hidden_effect(name).plant(size, rng) for name, size in case.hidden.items()]
+    planted = together(parts)
+    return [p for p in parts if p.truth], measured(planted, draw(case.seed, planted, case.rate))
+
+
+def hide(case: HiddenCase) -> Verdict:
+    """Plant, diagnose, compare."""
+    parts, trajectory = plant(case)
+    began = perf_counter()
+    result = diagnose_trajectory(trajectory, separate=False)
+    seconds = perf_counter() - began
+    pulls = [_pull_of(result, p) for p in parts]
+    d, nan = result.diagnosis, float("nan")
+    errors = [e for e in (result.before, result.after) if e]
+    reduced, free = [e.reduced_chi_square for e in errors], [e.ratio_to_floor for e in errors]
+    return Verdict(
+        case,
+        len(trajectory),
+        d.verdict,
+        result.sentence,
+        tuple(_with_class(f.candidate.name, [r.candidate.name for r in f.cannot_be_told_from]) for f in d.found),
+        named=None not in pulls,
+        pull=max((p for p in pulls if p is not None), default=nan),
+        extra=max(len(d.found) - len(parts), 0),
+        chi_square=(reduced[0], reduced[-1]) if errors else (nan, nan),
+        free_run=(free[0], free[-1]) if errors else (nan, nan),
+        gain=(d.before.cost - d.after.cost) / d.noise,
+        p_value=d.chance.p_value if d.chance else nan,
+        seconds=seconds,
+        **_standing_out(result, parts),
+    )
+
+
+def _with_class(name: str, others: Sequence[str]) -> str:
+    return f"{name} ({', '.join(others)})" if others else name
+
+
+def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> dict[str, float]:
+    """By how many sigmas the least of the planted effects stands out of the joint model, and how many a claim takes.
+
+    Fisher's information at the truth: the gain is a' C^-1 a for amounts a with covariance C, all else fitted along, the
+    other planted effects, too. NaN where the joint model has no fit, or the catalogue no such numbers.
+    """
+    system, d = result.system, result.diagnosis
+    unknown = {"stands_out": float("nan"), "needed": float("nan")}
+    meant = [next((c for c in system.candidates if set(p.truth) <= set(c.names)), None) for p in parts]
+    own = [c for c in meant if c is not None]
+    if not parts or not d.before.converged or len(own) < len(parts):
+        return unknown
+    quantities = {q.name: q for q in system.base} | {q.name: q for c in own for q in c.quantities}
+    truth = {k: v for p in parts for k, v in (*p.effects.items(), *p.truth.items())}
+    joint = fit(system, tuple(quantities.values()), d.before.values | truth)
+    if not joint.converged:
+        return unknown
+    found = []
+    for part, candidate in zip(parts, own, strict=True):
+        index = [joint.names.index(n) for n in candidate.names]
+        amount = np.array([part.truth.get(q.name, q.null) - q.null for q in candidate.quantities])
+        sigmas = float(np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise))
+        needed = stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index))
+        found.append({"stands_out": sigmas, "needed": float(np.sqrt(needed))})
+    return min(found, key=lambda one: one["stands_out"] / one["needed"])
+
+
+def _pull_of(result: DiscDiagnosis, planted: Planted) -> float | None:
+    """Largest pull of the planted values where the effect, or a class that holds it, is claimed; None: it is not."""
+    claims, rivals = [], []
+    for found in result.diagnosis.found:
+        if set(planted.truth) <= set(found.candidate.names):
+            claims.append(_pull(result.diagnosis.after, planted.truth))
+        for rival in found.cannot_be_told_from:
+            if set(planted.truth) <= set(rival.candidate.names):
+                rivals.append(_pull(rival.fit, planted.truth))
+    # two claims may have it in their classes: it is in the place of one of them that it fits
+    return min(claims or rivals, default=None)
+
+
+def _pull(fit: Fit, truth: Mapping[str, float]) -> float:
+    return max(abs(fit.values[k] - v) / max(fit.sigma(k), 1e-300) for k, v in truth.items())
+
+
+def hidden_cases(
+    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = FRAME_RATE
+) -> Iterator[HiddenCase]:
+    """Each effect ("NAME" or "NAME=SIZE"; none: all) with each seed; or pairs drawn at random, a seed each."""
+    hidden = [_sized(name) for name in names] or [(e.name, e.size) for e in HIDDEN_EFFECTS]
+    if not pairs:
+        yield from (HiddenCase({name: size}, seed, rate) for name, size in hidden for seed in seeds)
+        return
+    visible = [(name, size) for name, size in hidden if hidden_effect(name).visible]
+    rng = np.random.default_rng([seeds[0], 33])
+    for number in range(pairs):
+        two = rng.choice(len(visible), 2, replace=False)
+        yield HiddenCase(dict(visible[int(k)] for k in two), seeds[0] + number, rate)
+
+
+def _sized(text: str) -> tuple[str, float]:
+    name, _, size = text.partition("=")
+    effect = hidden_effect(name)
+    try:
+        return name, float(size) if size else effect.size
+    except ValueError:
+        raise DiscTrackError(f"{text}: expected EFFECT=SIZE with the size in {effect.unit}") from None
+
+
+def _asked(case: HiddenCase) -> bool:
+    """Is there something that the diagnosis should name?"""
+    return any(_truth_at(name, size) for name, size in case.hidden.items())
+
+
+def _truth_at(name: str, size: float) -> float:
+    """Largest of the diagnosis' numbers that an effect of this size means; 0 for a control."""
+    truth = hidden_effect(name).plant(size, np.random.default_rng(0)).truth
+    return max((abs(v) for v in truth.values()), default=0.0)
+
+
+def what_was_wrong(v: Verdict) -> str:
+    """One line on a case that did not come out as it should; empty where it did."""
+    right = v.within and v.at_noise if _asked(v.case) else v.verdict == "nothing missing"
+    if right and not v.extra:
+        return ""
+    return (
+        f"{' + '.join(v.case.hidden)}, seed {v.case.seed}: {v.verdict}; {'; '.join(v.found) or '-'}; "
+        f"pull {v.pull:.1f}, chi2 {v.chi_square[0]:.3f} -> {v.chi_square[1]:.3f}, free run {v.free_run[0]:.2f} -> "
+        f"{v.free_run[1]:.2f}, stands out by {v.stands_out:.1f} sigma of {v.needed:.1f}"
+    )
+
+
+def found_from(v: Verdict) -> float:
+    """Size from which a single effect would stand out by what a claim takes in this recording: found in half."""
+    (name, size), *others = v.case.hidden.items()
+    if others or not _asked(v.case):
+        return float("nan")
+    power = np.log2(_truth_at(name, size) / _truth_at(name, size / 2))  # of the size, in what the dots see of it
+    return float(size * (v.needed / v.stands_out) ** (1 / power))
+
+
+def diagnosis_validation(verdicts: Sequence[Verdict]) -> Validation:
+    """How often what was hidden was named and sized, and how often something was claimed where nothing was hidden."""
+    asked = [v for v in verdicts if _asked(v.case)]
+    controls = [v for v in verdicts if not _asked(v.case)]
+    told = [v for v in asked if v.can_be_told]
+    claimed = [v for v in controls if v.verdict != "nothing missing"]
+    headline = []
+    if asked:
+        headline.append(
+            f"Named {sum(v.named for v in asked)} of {len(asked)}; {sum(v.named for v in told)} of {len(told)} that "
+            f"their recordings determine; something claimed besides in {sum(v.extra > 0 for v in asked)}."
+        )
+    if controls:
+        headline.append(
+            f"Something claimed in {len(claimed)} of {len(controls)} recordings in which nothing is hidden."
+        )
+    tables = [_rates_table(verdicts)]
+    if controls:
+        tables.append(_levels_table([v.p_value for v in controls]))
+    wrong = tuple(filter(None, map(what_was_wrong, verdicts)))
+    return Validation("diagnosis", " ".join(headline), tuple(tables), verdicts, remarks=wrong)
+
+
+def _rates_table(verdicts: Sequence[Verdict]) -> Table:
+    groups: dict[tuple[tuple[str, float], ...], list[Verdict]] = {}
+    for v in verdicts:
+        groups.setdefault(tuple(v.case.hidden.items()), []).append(v)
+    rows = []
+    for hidden, group in groups.items():
+        counts = ([v.can_be_told, v.named, v.within, v.at_noise, v.extra > 0] for v in group)
+        shares = [f"{sum(column)}/{len(group)}" for column in zip(*counts, strict=True)]
+        medians = [np.median([f(v) for v in group]) for f in (_stands_out, found_from, _seconds)]
+        names, sizes = zip(*hidden, strict=True)
+        rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *map(figure, medians)])
+    head = ["hidden", "size", "can be told", "named", "within 3 sigma", "noise left", "claim too many",
+            "stands out by, sigma", "found from", "time, s"]  # fmt: skip
+    return Table("What was hidden, and what became of it", head, rows, "Sizes in SI units; the last three are medians.")
+
+
+def _stands_out(v: Verdict) -> float:
+    return v.stands_out
+
+
+def _seconds(v: Verdict) -> float:
+    return v.seconds
+
+
+def _levels_table(p_values: Sequence[float]) -> Table:
+    """Are the stated probabilities true where nothing is hidden? With exact intervals (Clopper and Pearson 1934)."""
+    p = np.asarray(p_values)[np.isfinite(p_values)]
+    rows = []
+    for level in LEVELS if len(p) else ():
+        seen = stats.binomtest(int(np.sum(p < level)), len(p))
+        interval = seen.proportion_ci(0.95, "exact")
+        rows.append([f"{level:g}", f"{seen.k} of {len(p)}", f"{interval.low:.4f} to {interval.high:.4f}"])
+    head = ["stated probability below", "recordings in which nothing is hidden", "95 % interval of the rate"]
+    return Table("Stated probabilities of chance", head, rows)

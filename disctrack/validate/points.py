@@ -1,0 +1,265 @@
+"""Measured recordings of a disc without images: true motion, true cameras, noise on the dots, poses fitted.
+
+What is planted goes through other formulas than those of the diagnosis: cameras, table and dots through the renderer's
+`faults`, clocks through the instants at which the motion is simulated, exposures through a mean over instants. The rig
+that the trajectory carries differs from the true one by an error drawn from its covariance. A laboratory's residual
+lens field is a sum of plane waves with random directions and phases; glare moves each dot in its own way; the board
+that the table was taken from was bowed.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from calibration.cameras.camera import N_RIG, StereoRig
+from calibration.kit.arrays import Array
+from disctrack.disc import Disc
+from disctrack.frames import (
+    continuous_quaternions,
+    euler_from_rotation,
+    quaternion_from_rotation,
+    rotation_from_euler,
+    unwrap_euler,
+)
+from disctrack.rolling import Effect, Model, simulate, steady_precession
+from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
+from disctrack.synthetic.description import Faults, Scene
+from disctrack.track.pose import fit_poses
+from disctrack.trajectory import Trajectory
+
+Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
+
+SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
+CORNER_SIGMA_PX = 0.01
+K_M = 0.381e-7  # [m s^2]
+STATION = 0.002  # [s] after the motion's first instant at which the first frame is taken
+_WAVES = 14
+_WAVELENGTHS = (0.4, 1.5)  # of the image's width
+_RADII, _ANGLES = 4, 16  # points of a dot over which the centre of its image is taken
+_INSTANTS = 4  # of an exposure: Gauss-Legendre, exact to the seventh power of time
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """What is wrong with every laboratory; all off by default."""
+
+    lens_px: float = 0.0  # rms of each camera's smooth residual field, per coordinate
+    glare_px: float = 0.0  # rms of a field of its own for each dot and camera
+    print_m: float = 0.0  # rms of the dots' places, per coordinate
+    board_bow_m: float = 0.0  # height of the table in the calibrated axes is off by about this ...
+    board_tilt: float = 0.0  # ... and its plane is turned by about this [rad]
+    board_scale: float = 0.0  # relative error of the squares
+
+
+# A lens with 0.02 px, a board bowed by 60 um with squares 0.02 % too long, a printer, glare and gradients of light.
+ORDINARY = Laboratory(0.02, 0.004, 3e-6, 40e-6, 1.2e-4, 1e-4)
+
+
+@dataclass(frozen=True)
+class Planted:
+    """What goes into the data, and the values of the diagnosis' quantities that are true then."""
+
+    truth: Mapping[str, float] = field(default_factory=dict)
+    effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
+    faults: Mapping[str, Any] = field(default_factory=dict)  # of the measurement: fields of a scene's `Faults`
+    clock: float = 0.0  # relative change of the frame rate
+    laboratory: Laboratory = field(default_factory=Laboratory)
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """What is filmed, before anything is planted."""
+
+    seed: int = 1
+    n: int = 500
+    theta_deg: float = 14.0
+    nutation_deg: float = 0.5
+    omega3: float = 1.0  # [rad/s]
+    k_m: float = K_M  # [m s^2] known of to every diagnosis
+    declared_rate: float = 1000.0  # [Hz]
+    sigma_px: float = SIGMA_PX
+    rig_seed: int | None = None  # of the errors of calibration and laboratory, equal for recordings of one day
+
+
+def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
+    """(30, 30) from the corners of the scene's chessboard views, the first of which defines the world."""
+    board = scene.board
+    nx, ny = board.inner_corners
+    corners = np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), -1).reshape(-1, 2) * board.square_mm * 1e-3
+    corners = np.column_stack([corners, np.zeros(len(corners))])
+    normal = np.zeros((N_RIG, N_RIG))
+    for number, (R, t) in enumerate(zip(*board_poses(scene, rig), strict=True)):
+        arm = corners @ R.T
+        _, by_point, by_rig = rig.project_with_jacobians(arm + t)
+        D = by_rig.reshape(-1, N_RIG)
+        normal += D.T @ D
+        if number:  # pose of this view is unknown
+            by_pose = np.concatenate([by_point, np.cross(arm[:, None], by_point)], axis=-1).reshape(-1, 6)
+            cross = by_pose.T @ D
+            normal -= cross.T @ np.linalg.solve(by_pose.T @ by_pose, cross)
+    scale = np.sqrt(np.diag(normal))
+    return np.asarray(CORNER_SIGMA_PX**2 * np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale))
+
+
+def measured(
+    planted: Planted,
+    filmed: Filmed,
+    *,
+    motion: Motion | None = None,
+    laws: Sequence[type[Effect]] = (),
+    disc: Disc | None = None,
+) -> Trajectory:
+    """Trajectory of a disc that rolls down, with what is planted; the trajectory does not tell of it.
+
+    motion : in place of the rolling model's   laws : by formula, that `planted` may name   disc : not the scene's
+    """
+    rng = np.random.default_rng([20261121, filmed.seed])
+    faults = Faults(**planted.faults)
+    rate = faults.frame_rate_hz or filmed.declared_rate * (1.0 + planted.clock)
+    scene = Scene(seed=filmed.seed if filmed.rig_seed is None else filmed.rig_seed, faults=faults)
+    disc = disc or scene.declared_disc
+    believed_rig = rig_of(scene)
+    covariance = rig_covariance(believed_rig, scene)
+    # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them
+    sigma = np.sqrt(np.diag(covariance))
+    of_rig = rng if filmed.rig_seed is None else np.random.default_rng([20261122, filmed.rig_seed])
+    error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
+    scene, prints = _in_the_laboratory(scene, planted.laboratory, of_rig)
+    true_rig = rig_after_faults(believed_rig.perturbed(error), scene)
+    believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
+    if motion is None:
+        model = Model(disc, laws=tuple(laws)).with_values({"km.k_m": filmed.k_m} | dict(planted.effects))
+        motion = _rolling(model, filmed, rng)
+    times = np.arange(filmed.n) / rate + STATION
+    off_place = true_disc_of(scene).disc.marker_centres_body - scene.declared_disc.marker_centres_body
+    centres = disc.marker_centres_body + off_place + prints
+    views = [
+        _exposed(motion, times + delay, scene.faults, true_rig, centres, disc)[:, camera]
+        for camera, delay in enumerate((0.0, faults.right_delay_s))
+    ]
+    pixels = np.stack(views, axis=1)
+    if planted.laboratory != Laboratory():
+        pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size[0], planted.laboratory)
+    pixels = pixels + filmed.sigma_px * rng.standard_normal(pixels.shape)
+    dots = np.broadcast_to(filmed.sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
+    return _tracked(pixels, dots, motion(times), believed_rig, disc, filmed.declared_rate)
+
+
+def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> tuple[Scene, Array]:
+    """The scene with the board's errors among its faults, and the errors (m, 3) of the dots' places [m]."""
+    shift = np.zeros((scene.declared_disc.n_markers, 3))
+    if lab == Laboratory():
+        return scene, shift
+    height, scale, x, y = rng.standard_normal(4)
+    shift[:, :2] = lab.print_m * rng.standard_normal((len(shift), 2))
+    f, tilt = scene.faults, np.degrees(lab.board_tilt)
+    faults = replace(
+        f,
+        table_height_mm=f.table_height_mm + 1e3 * lab.board_bow_m * height,
+        table_turn_deg=(f.table_turn_deg[0] + tilt * x, f.table_turn_deg[1] + tilt * y),
+        pattern_scale=f.pattern_scale + lab.board_scale * scale,
+    )
+    return replace(scene, faults=faults), shift
+
+
+def _shifted_dots(rng: np.random.Generator, pixels: Array, width_px: float, laboratory: Laboratory) -> Array:
+    """Centres (n, 2, m, 2) as such a laboratory finds them."""
+    found = pixels.copy()
+    for camera in range(2):
+        found[:, camera] += plane_waves(rng, pixels[:, camera], width_px, laboratory.lens_px)
+        for dot in range(pixels.shape[2]):
+            found[:, camera, dot] += plane_waves(rng, pixels[:, camera, dot], width_px, laboratory.glare_px)
+    return found
+
+
+def plane_waves(rng: np.random.Generator, places_px: Array, width_px: float, rms_px: float) -> Array:
+    """Random smooth vector field (..., 2) [px] at places (..., 2) of an image."""
+    found = np.zeros_like(places_px)
+    for axis in range(2):
+        length = width_px * np.exp(rng.uniform(np.log(_WAVELENGTHS[0]), np.log(_WAVELENGTHS[1]), _WAVES))
+        angle, phase = rng.uniform(0, 2 * np.pi, (2, _WAVES))
+        wave = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        amplitude = rng.standard_normal(_WAVES)
+        amplitude *= rms_px * np.sqrt(2.0) / np.linalg.norm(amplitude)
+        found[..., axis] = np.cos(places_px @ wave.T + phase) @ amplitude
+    return found
+
+
+def _rolling(model: Model, filmed: Filmed, rng: np.random.Generator) -> Motion:
+    start = steady_precession(
+        np.radians(filmed.theta_deg),
+        model.disc,
+        omega3=filmed.omega3,
+        nutation_amplitude=np.radians(filmed.nutation_deg),
+        psi=rng.uniform(-3, 3),
+        phi=rng.uniform(-3, 3),
+        x=0.032,
+        y=0.020,
+    )
+    return lambda times: simulate(model, start, times=np.r_[0.0, times]).q[1:]
+
+
+def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, centres: Array, disc: Disc) -> Array:
+    """Images of the dots (n, 2, m, 2), averaged over the exposure."""
+    exposure, share = faults.exposure_s, faults.ellipse_centre_share
+    nodes, weights = np.polynomial.legendre.leggauss(_INSTANTS) if exposure else (np.zeros(1), np.array([2.0]))
+    images = 0.0
+    for node, weight in zip(nodes, weights, strict=True):
+        q = motion(times + 0.5 * node * exposure)
+        R, t = rotation_from_euler(*q[:, 3:].T), q[:, :3]
+        seen = np.moveaxis(rig.project(centres @ np.swapaxes(R, 1, 2) + t[:, None]), -3, 1)
+        if share:
+            seen = (1 - share) * seen + share * _image_centres(R, t, rig, centres, disc)
+        images = images + 0.5 * weight * seen
+    return np.asarray(images)
+
+
+def _image_centres(R: Array, t: Array, rig: StereoRig, centres: Array, disc: Disc) -> Array:
+    """Centres of the areas that the dots' images cover (n, 2, m, 2), by quadrature over the dots."""
+    nodes, weights = np.polynomial.legendre.leggauss(_RADII)
+    radii, angles = 0.25 * disc.marker_diameter * (1 + nodes), 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    r, a = (grid.ravel() for grid in np.meshgrid(radii, angles, indexing="ij"))
+    weight = np.repeat(weights * radii, _ANGLES)
+    found = []
+    for centre in centres:
+        body = centre + np.stack([r * np.cos(a), r * np.sin(a), np.zeros(r.size)], axis=-1)
+        pixels, by_point, _ = rig.project_with_jacobians(body @ np.swapaxes(R, 1, 2) + t[:, None])
+        area = np.abs(np.linalg.det(by_point @ R[:, None, None, :, :2])) * weight  # (n, 2, points)
+        found.append(np.sum(pixels * area[..., None], axis=2) / np.sum(area, axis=2)[..., None])
+    return np.stack(found, axis=2)
+
+
+def _tracked(pixels: Array, dots: Array, q: Array, rig: StereoRig, disc: Disc, rate: float) -> Trajectory:
+    n = len(pixels)
+    fits = fit_poses(
+        pixels,
+        dots,
+        rig,
+        disc.marker_centres_body,
+        rotation_from_euler(*q[:, 3:].T),
+        q[:, :3],
+        reject_outliers=False,
+    )
+    angles = unwrap_euler(euler_from_rotation(fits.R_world_body))
+    return Trajectory(
+        time=np.arange(n) / rate,
+        frame=np.arange(n),
+        q=np.column_stack([fits.t_world_body, angles]),
+        pose_covariance=fits.covariance,
+        calibration_sensitivity=fits.sensitivity,
+        systematic_covariance=np.zeros((len(fits.covariance), 6, 6)),
+        quaternion=continuous_quaternions(quaternion_from_rotation(fits.R_world_body)),
+        frame_status=np.zeros(n, np.uint8),
+        reprojection_rms_px=np.sqrt(np.nanmean(fits.residuals_px**2, axis=(2, 3))),
+        reduced_chi_square=fits.reduced_chi_square,
+        markers_px=pixels,
+        markers_covariance_px2=dots,
+        markers_residual_px=fits.residuals_px,
+        marker_status=np.zeros((n, 2, disc.n_markers), np.uint8),
+        disc=disc,
+        rig=rig,
+        frame_rate=rate,
+        gravity=9.81,
+    )

@@ -1,0 +1,309 @@
+"""Recordings that are rendered, measured and compared with their truth: each with its own rig and chessboards.
+
+A case says what is filmed; the recording is a folder like any other and passes through the readers, the calibration and
+the tracking as the user's would. Only the truth and the reported numbers enter a comparison.
+"""
+
+import itertools
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array, Image
+from disctrack.calibrate.stage import calibrate_recording
+from disctrack.disc import Disc
+from disctrack.errors import SceneError
+from disctrack.frames import CAMERAS, rotation_from_euler
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.blocks import PairBlock, Unreadable, iter_pair_blocks
+from disctrack.synthetic import rig_of, write_recording
+from disctrack.synthetic.description import (
+    BoardSettings,
+    CameraSettings,
+    GlareSettings,
+    ImperfectionSettings,
+    MotionSettings,
+    RigSettings,
+    RollingMotion,
+    Scene,
+)
+from disctrack.synthetic.motion import SceneMotion, motion_of
+from disctrack.track.tracking import Tracking, TrackingSettings, track
+from disctrack.trajectory import part
+from disctrack.validate.errors import PoseErrors, compare
+
+STATIC = "static poses"
+ROLLING = "rolling at 8 to 12 deg"
+FINAL = "rolling to rest at 0.5 deg"
+IMPERFECT = "rolling in an imperfect laboratory"
+EXPOSURE = 0.5e-3  # [s] half the time between frames: rolling at 10 deg smears the outer dots over 0.6 px
+K_M = 0.381e-7  # friction coefficient of Ma et al. 2014, equation (5.3), alone: the disc then comes to rest by
+TO_REST = (7.93, 1.5)  # (5.11): theta [deg] this time [s] before the end, and theta goes as time^(2/3)
+# Nutation [deg]: the error of psi and phi goes as 1/sin(theta), so the strata are about even in log(theta).
+STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, 85.0))
+FIELD_RADIUS = 25e-3  # [m] of the disc's centre about the middle of the field, where the dots stay in both images
+BORDER_PX = 14  # a dot's window needs some pixels around it
+SMALLEST_SEMI_MINOR_PX = 3.2  # a dot seen flatter than this is all edge: its blurred middle shows no black
+FEWEST_DOTS = 3  # two numbers each, six unknowns
+ORDINARY_IMPERFECTIONS = ImperfectionSettings(
+    lens_field_px=0.02,
+    board_bow_mm=0.06,
+    board_stretch=2e-4,
+    pixel_gain=0.01,
+    column_offset_dn=0.3,
+    response_curve=0.03,
+)
+VIGNETTING, GLARE_DN = 0.15, 12.0
+
+
+@dataclass(frozen=True)
+class RenderedCase:
+    """A recording to be rendered and measured: poses at rest, each without a prior, then stretches of rolling.
+
+    Whatever the scene plants (faults, imperfections, light) is in all of its images.
+    """
+
+    scene: Scene
+    q_static: Array  # (n, 6)
+    stretches: dict[str, Scene]  # by name: the same scene with a motion
+
+
+@dataclass(frozen=True)
+class MeasuredTwice:
+    """The same images measured twice: through the recording's own calibration, and through the true cameras."""
+
+    own: PoseErrors
+    true: PoseErrors
+    cameras: NDArray[np.int64]  # (n,) that see the upper face
+    systematic_px: tuple[float, float]  # of each camera, that repeats from frame to frame
+    warnings: tuple[str, ...]
+
+    @property
+    def seen_by_both(self) -> tuple[PoseErrors, PoseErrors]:
+        """Through the own calibration and through the true cameras, where both see the face."""
+        return self.own.part(self.cameras == 2), self.true.part(self.cameras == 2)
+
+
+@dataclass(frozen=True)
+class RenderedOutcome:
+    """What one recording showed: STATIC first, where it has such poses, then its stretches."""
+
+    seed: int
+    corners_px: float  # rms residual of the calibration
+    parts: dict[str, MeasuredTwice]
+
+
+def scene_of(seed: int, quick: bool = False) -> Scene:
+    """The scene of one recording: the paper's format; quick: a quarter of the pixels and fewer chessboard views."""
+    scene = Scene(name=f"validation {seed}", seed=seed)
+    if not quick:
+        return scene
+    return replace(
+        scene,
+        cameras=CameraSettings(image_size=(272, 272)),
+        rig=RigSettings(mm_per_px=0.42),
+        board=BoardSettings(n_views=12, square_mm=6.0, shift_mm=15.0),
+    )
+
+
+def ideal_case(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> RenderedCase:
+    """Static poses of every attitude, and two stretches of rolling (0 frames: none)."""
+    rng = np.random.default_rng([scene.seed, 8])
+    q = static_poses(n_static, rig_of(scene), scene.declared_disc, scene.rig.target_mm[:2], rng)
+    start = rng.uniform(8, 12)
+    stretches: dict[str, Scene] = {}
+    if n_rolling:
+        stretches[ROLLING] = rolling_scene(scene, start, n_rolling, rng)
+    if n_final:
+        last = theta_before_rest_deg(n_final, scene.cameras.frame_rate_hz)
+        stretches[FINAL] = rolling_scene(scene, last, n_final, rng)
+    return RenderedCase(scene, q, stretches)
+
+
+def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
+    """Rolling in a laboratory with what every one has and nobody declares; every second board is bowed downwards."""
+    rng = np.random.default_rng([scene.seed, 11])
+    bow = (1 if scene.seed % 2 else -1) * ORDINARY_IMPERFECTIONS.board_bow_mm
+    width, height = scene.cameras.image_size
+    spots = tuple(
+        GlareSettings(name, (rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height), 0.18 * width, GLARE_DN)
+        for name in CAMERAS
+    )
+    scene = replace(
+        scene,
+        imperfections=replace(ORDINARY_IMPERFECTIONS, board_bow_mm=bow),
+        optics=replace(scene.optics, vignetting=VIGNETTING),
+        light=replace(scene.light, glare=spots),
+    )
+    rolling = rolling_scene(scene, rng.uniform(8, 16), frames, rng)
+    return RenderedCase(scene, np.empty((0, 6)), {IMPERFECT: rolling})
+
+
+def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
+    """The scene with n frames of rolling from `theta_deg` on, starting at random psi and phi."""
+    x, y = scene.rig.target_mm[:2]
+    start = RollingMotion(
+        theta_deg=theta_deg,
+        psi_deg=rng.uniform(-180, 180),
+        phi_deg=rng.uniform(-180, 180),
+        centre_mm=(x, y),
+        effects={"km": {"k_m": K_M}},
+    )
+    return replace(
+        scene,
+        cameras=replace(scene.cameras, n_frames=n, exposure_s=EXPOSURE),
+        motion=MotionSettings(kind="rolling", rolling=start),
+    )
+
+
+def theta_before_rest_deg(n: int, frame_rate: float) -> float:
+    """Nutation [deg] from which the disc takes n frames down to 0.5 deg, by (5.11)."""
+    theta, time = TO_REST
+    left = time * (0.5 / theta) ** 1.5 + n / frame_rate
+    return float(theta * (left / time) ** (2 / 3))
+
+
+def one_after_the_other(parts: Sequence[SceneMotion], rate: float) -> SceneMotion:
+    """Motions in one recording: frame i of part k is frame i + (all frames of the parts before)."""
+    starts = np.concatenate([[0], np.cumsum([part.n_frames for part in parts])])
+
+    def joined(name: str, time: Array) -> Array:
+        time = np.atleast_1d(np.asarray(time, float))
+        part_of = np.searchsorted(starts[1:-1], np.rint(time * rate), side="right")
+        q = np.empty((len(time), 6))
+        for k in np.unique(part_of):
+            rows = part_of == k
+            q[rows] = getattr(parts[k], name)(time[rows] - starts[k] / rate)
+        return q
+
+    return SceneMotion(partial(joined, "pose"), partial(joined, "rates"), int(starts[-1]))
+
+
+def render_and_measure(case: RenderedCase) -> RenderedOutcome:
+    """Render the recording, calibrate from its own chessboards, measure it twice; nothing is left on the disk."""
+    scene, rate = case.scene, case.scene.cameras.frame_rate_hz
+    q, n = case.q_static, len(case.q_static)
+    at_rest = SceneMotion(
+        lambda time: q[np.rint(np.asarray(time) * rate).astype(int).clip(0, n - 1)],
+        lambda time: np.zeros((len(time), 6)),
+        n,
+    )
+    motions = ({STATIC: at_rest} if n else {}) | {name: motion_of(part) for name, part in case.stretches.items()}
+    filmed = replace(scene, motion=MotionSettings(kind="rolling"), cameras=replace(scene.cameras, exposure_s=EXPOSURE))
+    edges = np.cumsum([0, *(motion.n_frames for motion in motions.values())])
+    with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
+        truth = write_recording(Path(folder) / "recording", filmed, one_after_the_other([*motions.values()], rate))
+        recording = read_recording(Path(folder) / "recording")
+        calibration, _ = calibrate_recording(recording)
+        parts = {
+            name: measure_twice(
+                read_images(recording, int(a), int(b)),
+                truth.q[a:b],
+                recording.disc,
+                (calibration.rig, truth.rig),
+                rate,
+                apart=name == STATIC,
+            )
+            for name, (a, b) in zip(motions, itertools.pairwise(edges), strict=True)
+        }
+    return RenderedOutcome(scene.seed, calibration.rms_px, parts)
+
+
+def read_images(recording: Recording, start: int, stop: int) -> Image:
+    """(n, 2, height, width) pairs start ... stop-1 of a recording."""
+    left, right = (
+        open_frames(pattern, recording.folder, camera)
+        for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
+    )
+    return np.concatenate([block.images.copy() for block in iter_pair_blocks(left, right, start, stop)])
+
+
+def measure_twice(
+    images: Image, q_true: Array, disc: Disc, rigs: tuple[StereoRig, StereoRig], rate: float, *, apart: bool
+) -> MeasuredTwice:
+    """Errors of images (n, 2, height, width) through two rigs, the own and the true one; `apart` as in `locate`."""
+    step = 2 if apart else 1
+    found = [locate(images, rig, disc, rate, apart=apart) for rig in rigs]
+    own, true = (compare(part(tracking.trajectory, slice(None, None, step)), q_true) for tracking in found)
+    seen = cameras_in_sight(q_true, rigs[1], disc)
+    return MeasuredTwice(own, true, seen, found[0].systematic_px, found[0].warnings)
+
+
+def locate(images: Image, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
+    """Track pairs in memory. apart: an unreadable pair follows each one, so that each is found without a prior."""
+    step = 2 if apart else 1
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        block = 32
+        for first in range(start, stop, block):
+            frames = np.arange(first, min(first + block, stop))
+            real = frames % step == 0
+            pairs = np.zeros((len(frames), *images.shape[1:]), images.dtype)
+            pairs[real] = images[frames[real] // step]
+            none = tuple(Unreadable(int(i), camera, "") for i in frames[~real] for camera in (0, 1))
+            yield PairBlock(frames, pairs, none)
+
+    settings = TrackingSettings(search_always=apart)
+    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate, settings=settings)
+
+
+def static_poses(n: int, rig: StereoRig, disc: Disc, middle_mm: tuple[float, float], rng: np.random.Generator) -> Array:
+    """(n, 6) poses q on the table, by increasing nutation: strata in turn, all psi and phi, anywhere in the field.
+
+    middle_mm : (x, y) of the field. Places where a dot would leave an image are drawn again; at large nutation the
+    disc looks away from the cameras for half of all psi, and such poses stay in.
+    Raises SceneError where the field has no room for the disc.
+    """
+    return np.array(sorted((_pose(i, rig, disc, middle_mm, rng) for i in range(n)), key=lambda q: q[4])).reshape(n, 6)
+
+
+def _pose(i: int, rig: StereoRig, disc: Disc, middle_mm: tuple[float, float], rng: np.random.Generator) -> Array:
+    low, high = np.radians(STRATA_DEG[i % len(STRATA_DEG)])
+    for attempt in range(400):
+        psi, phi, direction = rng.uniform(-np.pi, np.pi, 3)
+        theta = np.exp(rng.uniform(np.log(low), np.log(high)))
+        # the field shrinks slowly, for small images and long strides of the rim
+        reach = FIELD_RADIUS * np.sqrt(rng.uniform()) * (1 - attempt / 500)
+        x, y = np.array(middle_mm) * 1e-3 + reach * np.array([np.cos(direction), np.sin(direction)])
+        q = np.array([x, y, disc.resting_height(theta), psi, theta, phi])
+        if _inside(q, rig, disc):
+            return q
+    raise SceneError(
+        "validation: no place found where all dots lie in both images; widen the field (rig.mm_per_px, image_size)"
+    )
+
+
+def _inside(q: Array, rig: StereoRig, disc: Disc) -> bool:
+    R = rotation_from_euler(*q[3:])
+    pixels = rig.project(disc.marker_centres_body @ R.T + q[:3])
+    size = np.array([camera.image_size for camera in rig.cameras])[:, None]
+    return bool(np.all((pixels > BORDER_PX) & (pixels < size - 1 - BORDER_PX)))
+
+
+def dots_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
+    """(n, 2 cameras) number of dots that geometry lets a camera resolve in the poses q (n, 6).
+
+    The upper face must be turned to the camera, and the dot's image, an ellipse of semi-minor axis
+    f R cos(gamma) / distance, must not be flatter than SMALLEST_SEMI_MINOR_PX.
+    """
+    R = rotation_from_euler(q[:, 3], q[:, 4], q[:, 5])
+    dots = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]
+    counts = []
+    for camera, (R_cw, t_cw) in zip(rig.cameras, rig.camera_poses(), strict=True):
+        ray = -R_cw.T @ t_cw - dots
+        distance = np.linalg.norm(ray, axis=-1)
+        cosine = np.einsum("nmi,ni->nm", ray, R[:, :, 2]) / distance
+        counts.append(np.sum(camera.fx * disc.marker_diameter / 2 * cosine / distance > SMALLEST_SEMI_MINOR_PX, axis=1))
+    return np.stack(counts, axis=1)
+
+
+def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
+    """(n,) cameras that see enough dots for a pose of their own: 2, 1 or 0."""
+    return np.sum(dots_in_sight(q, rig, disc) >= FEWEST_DOTS, axis=1)
