@@ -1,9 +1,11 @@
 """The columns of the summary."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from disctrack.frames import CAMERAS, COORDINATES
+
+Row = dict[str, Any]  # column -> value of JSON's types, None where it is not known
 
 UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
 
@@ -15,6 +17,7 @@ FALSE_DISCOVERY = 0.05  # share of false ones among the recordings in which some
 COLUMNS: dict[str, str] = {
     "recording": "folder below the batch's, with slashes",
     "name": "as recording.toml says",
+    "repeats": "what recordings that repeat one experiment have in common: case, surface and disc as declared",
     "status": "measured, skipped (done already), failed, or not measured",
     "reason": "why it failed, or what is missing although it was measured",
     "pairs": "image pairs that were to be measured, without the rest before and after the motion",
@@ -62,7 +65,7 @@ COLUMNS: dict[str, str] = {
 }
 
 
-def copies(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def copies(rows: Sequence[Row]) -> list[str]:
     """Names of recordings of the same images and rig, "a, b" each: in means and repeats one counts as several."""
     alike: dict[str, list[str]] = {}
     for row in rows:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
+from disctrack.files.text import printable
 from disctrack.recording.declaration import FILE_NAME
 from disctrack.recording.readers.base import CINE_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, VIDEO_SUFFIXES
 from disctrack.recording.readers.files import natural_key
@@ -25,9 +26,9 @@ class FoundRecordings:
     undeclared: tuple[Path, ...] = ()  # that hold two folders of images or two films, and no recording.toml
 
     def name(self, recording: Path) -> str:
-        """The recording's place below `base`, with slashes: unique, and the same on every machine."""
+        """The recording's place below `base`, with slashes: unique, printable, and the same on every machine."""
         relative = Path(os.path.relpath(recording, self.base)).as_posix()
-        return recording.name if relative == "." and len(self.recordings) == 1 else relative
+        return printable(recording.name if relative == "." and len(self.recordings) == 1 else relative)
 
 
 def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> FoundRecordings:

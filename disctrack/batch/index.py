@@ -1,91 +1,88 @@
 """The page that links the single reports and compares the recordings."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
-from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING, copies
-from disctrack.batch.reasons import reason_of
+from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING, Row, copies
 from disctrack.batch.records import SKIPPED
-from disctrack.batch.together import FOLDER
-from disctrack.files.whole import write_whole
+from disctrack.files.text import printable
 from disctrack.pages.html import Markup, page, paragraph, section, table, text, warning
 
-Row = dict[str, Any]
 SAID = {SKIPPED: "measured before"}  # on a page, which is read long after the batch that found it done
+_FITTED = {
+    "k_m_m_s2": "k_m from the dots (10⁻⁸ m s²)",
+    "n_energy": "n_E",
+    "n_theta": "n_θ",
+    "n_psidot": "n_ψ̇",
+}
 
 
-def write_index(path: Path, rows: Sequence[Row], compare: bool) -> str:
-    """Write the page; with the comparison of repeats, if that is wanted, into `repeats` beside it.
+def index_page(rows: Sequence[Row], repeats: Sequence[Row] = (), together: str = "") -> str:
+    """HTML that needs no other file but the reports that it links.
 
-    returns : why there is no comparison although it was wanted; empty otherwise
-    Raises OutputError.
+    repeats : as `repeats_of` gives them; together : page of the diagnosis of all, where there is one
     """
-    fragment, problem = _comparison(path.parent, rows) if compare else ("", "")
-    if (path.parent / FOLDER / "diagnosis.html").is_file():
-        link = f'<p><a href="{FOLDER}/diagnosis.html">What the model lacks, all recordings together</a></p>'
-        fragment = section("All recordings together", [link]) + fragment
-    write_whole(path, index_page(rows, fragment).encode())
-    return problem
+    files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
+    problems = [
+        Markup(f"<b>{_shown(r['recording'])}</b> ({_shown(r['status'])}): {_shown(r['reason'])}")
+        for r in rows
+        if r["reason"]
+    ]
+    problems += [_shown(f"{names}: the same images, one recording for any mean") for names in copies(rows)]
+    header = ("recording", "", "status", "pairs", *_FITTED.values(), "t_f (s)", "rms (px)", "χ²")
+    results = table("", header, [_cells(row) for row in rows], [row["status"].split()[0] for row in rows])
+    parts = [paragraph(_said(rows)), warning("Problems", problems), section("Results", [results, files])]
+    if together:
+        link = f'<p><a href="{together}">What the model lacks, all recordings together</a></p>'
+        parts.append(section("All recordings together", [link]))
+    return page("Batch of recordings", [*parts, _repeats(repeats) if repeats else ""])
 
 
-def _comparison(folder: Path, rows: Sequence[Row]) -> tuple[str, str]:
-    """The repeats as a part of the page, and what went wrong."""
-    trajectories = [folder / row["trajectory"] for row in rows if row["report"]]
-    if len(trajectories) < 2:
-        return "", ""
-    from disctrack import repeats  # draws figures: only where they are wanted
-
-    try:
-        written = repeats.write(repeats.compare(trajectories), folder / "repeats")
-    except Exception as error:  # the single results are worth more than their comparison
-        return "", f"the repeats could not be compared: {reason_of(error)}"
-    return written.fragment, ""
-
-
-def index_page(rows: Sequence[Row], fragment: str = "") -> str:
-    """HTML that needs no other file but the reports that it links. fragment : HTML to end with"""
+def _said(rows: Sequence[Row]) -> str:
     done = [row for row in rows if row["pairs_measured"] is not None]
     pairs = sum(row["pairs_measured"] for row in done)
     said = (
         f"{_counted(len(rows), 'recording')}, {len(done)} of them measured, {_counted(pairs, 'pair')} with a pose. "
         "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the "
-        "dots is the only loss of a rolling model fitted to all images; where repeats are compared, k_m accounts "
-        "for the whole loss of energy, or that of the diagnosis: other losses enter these in other ways, and so they "
-        "differ."
+        "dots is the only loss of a rolling model fitted to all images; in a diagnosis other losses enter beside it, "
+        "and so its k_m differs."
     )
-    files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
-    problems = [
-        Markup(f"<b>{text(r['recording'])}</b> ({text(r['status'])}): {text(r['reason'])}") for r in rows if r["reason"]
-    ]
-    problems += [text(f"{names}: the same images, one recording for any mean") for names in copies(rows)]
     diagnosed = [row for row in rows if row["diagnosis"]]
+    if not diagnosed:
+        return said
     missing = [row for row in diagnosed if row["diagnosis"] != "nothing missing"]
-    if diagnosed:
-        sure = sum((row["diagnosis_false_discovery"] or 0.0) < FALSE_DISCOVERY for row in missing)
-        said += (
-            f" Something is missing in {len(missing)} of {_counted(len(diagnosed), 'diagnosed recording')}; {sure} of "
-            f"these stand at a rate of false discoveries of {FALSE_DISCOVERY:.0%} over the batch."
+    sure = sum((row["diagnosis_false_discovery"] or 0.0) < FALSE_DISCOVERY for row in missing)
+    return (
+        f"{said} Something is missing in {len(missing)} of {_counted(len(diagnosed), 'diagnosed recording')}; {sure} "
+        f"of these stand at a rate of false discoveries of {FALSE_DISCOVERY:.0%} over the batch."
+    )
+
+
+def _repeats(repeats: Sequence[Row]) -> str:
+    said = paragraph(
+        "Mean and standard deviation over the recordings of one disc on one surface, from one case as declared. "
+        "χ² is their squared spread over the stated variances, per degree of freedom: far above 1, with a small "
+        "probability p, they disagree by more than the measurement explains."
+    )
+    scales = {"k_m_m_s2": 1e8}
+    cells = [
+        (
+            printable(row["repeats"]),
+            _FITTED[row["quantity"]],
+            str(row["n"]),
+            _plus_minus(row["mean"], row["standard_deviation"], scales.get(row["quantity"], 1.0)),
+            f"{row['reduced_chi_square']:.3g}",
+            f"{row['p_value']:.2g}",
         )
-    header = (
-        "recording",
-        "",
-        "status",
-        "pairs",
-        "k_m from the dots (10⁻⁸ m s²)",
-        "n_E",
-        "n_θ",
-        "n_ψ̇",
-        "t_f (s)",
-        "rms (px)",
-        "χ²",
-    )
-    results = table("", header, [_cells(row) for row in rows], [row["status"].split()[0] for row in rows])
-    return page(
-        "Batch of recordings",
-        [paragraph(said), warning("Not as it should be", problems), section("Results", [results, files]), fragment],
-    )
+        for row in repeats
+    ]
+    header = ("recordings", "", "n", "mean ± standard deviation", "χ²", "p")
+    files = '<p>With weighted means: <a href="repeats.csv">repeats.csv</a>.</p>'
+    return section("Repeats", [said, table("", header, cells), files])
+
+
+def _shown(said: str) -> Markup:
+    return text(printable(said))
 
 
 def _counted(n: int, what: str) -> str:
@@ -96,11 +93,11 @@ def _cells(row: Row) -> list[str]:
     rms = [row[f"reprojection_rms_{camera}_px"] for camera in ("left", "right")]
     pairs = "" if row["pairs"] is None else f"{row['pairs_measured']} / {row['pairs']}"
     return [
-        row["recording"],
+        printable(row["recording"]),
         Markup(
             " ".join(_link(row[key], name) for key, name in (("report", "report"), ("diagnosis_report", "diagnosis")))
         ),
-        SAID.get(row["status"], row["status"]),
+        SAID.get(str(row["status"]), str(row["status"])),
         pairs,
         _friction(row),
         *(_plus_minus(row[n], row[f"{n}_sigma"]) for n in ("n_energy", "n_theta", "n_psidot")),

@@ -14,6 +14,7 @@ from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
 from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.analyse.stage import run_analyse, write_analysis
+from disctrack.batch.columns import Row
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job
@@ -25,11 +26,13 @@ from disctrack.batch.records import (
     SKIPPED,
     Record,
     Result,
+    Stages,
     is_done,
     read_record,
     stages_asked,
     write_record,
 )
+from disctrack.batch.repeats import group_of
 from disctrack.calibrate.stage import calibrate_into, is_rig_of, source_of
 from disctrack.errors import AnalysisError, DiscTrackError, OutputError
 from disctrack.files.whole import write_whole
@@ -45,6 +48,7 @@ from disctrack.trajectory.reuse import origin_of, remember
 Progress = Callable[[float], None]  # is told the share of the job that is done
 
 LOCK = ".batch.lock"
+BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again
 _TRACKED = 0.5  # share of the progress after tracking
 
 
@@ -61,7 +65,7 @@ def do(job: Job, progress: Progress = lambda share: None) -> Result:
 def make_rig(job: Job) -> Result:
     """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Busy."""
     path = Path(job.rig)
-    with locked(path.with_name(LOCK)):
+    with locked(path.with_name(LOCK), BUSY_FOR):
         source = source_of(read_recording(job.folder), job.options.calibration)
         if is_rig_of(path, source) and not job.options.overwrite:
             return Result(SKIPPED, Record(MEASURED))
@@ -77,7 +81,7 @@ def make_rig(job: Job) -> Result:
 def make_recording(job: Job, progress: Progress) -> Result:
     """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Busy."""
     results = Path(job.results)
-    with locked(results / LOCK):
+    with locked(results / LOCK, BUSY_FOR):
         try:
             return _make_recording(job, results, progress)
         except Exception as error:
@@ -155,7 +159,7 @@ def _after_tracking(
     findings: dict[str, Any],
     provenance: Provenance,
     job: Job,
-    asked: dict[str, Any],
+    asked: Stages,
 ) -> Record:
     """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
     files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
@@ -197,7 +201,7 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
     return analysis, None
 
 
-def _diagnose(path: Path) -> tuple[Path, dict[str, Any]]:
+def _diagnose(path: Path) -> tuple[Path, Row]:
     from disctrack.diagnosis import run_diagnose
     from disctrack.diagnosis.model_file import PAPER
 
@@ -208,10 +212,11 @@ def _diagnose(path: Path) -> tuple[Path, dict[str, Any]]:
     return pages["diagnosis.html"], json.loads(pages["diagnosis.json"].read_text(encoding="utf-8"))
 
 
-def _origin(recording: Recording, provenance: Provenance) -> dict[str, str]:
+def _origin(recording: Recording, provenance: Provenance) -> Row:
     inputs = json.dumps(dict(provenance.inputs), sort_keys=True).encode()
     return {
         "name": recording.name,
+        "repeats": group_of(recording),
         "input_sha256": hashlib.sha256(inputs).hexdigest(),
         "fingerprint": provenance.fingerprint,
         "version": provenance.version,

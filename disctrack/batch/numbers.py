@@ -1,12 +1,10 @@
 """What was measured in one recording, with sigmas, in SI units: the numbers of its row in the summary."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
+from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
-from disctrack.batch.columns import UNITS
+from disctrack.batch.columns import UNITS, Row
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
@@ -14,17 +12,15 @@ from disctrack.errors import AnalysisError
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
 
-Numbers = dict[str, Any]
-
 _K_M = "km.k_m"
 
 
-def tracked_numbers(trajectory: Trajectory) -> Numbers:
+def tracked_numbers(trajectory: Trajectory) -> Row:
     """Pairs, misfit in the images and median sigmas; None where unknown."""
     rms = trajectory.reprojection_rms_px
     left_out = (FrameStatus.NOT_PROCESSED, FrameStatus.STILL)
     processed = ~np.isin(trajectory.frame_status, left_out)
-    numbers: Numbers = {
+    numbers: Row = {
         "pairs": int(processed.sum()),
         "pairs_measured": int(trajectory.measured.sum()),
         "duration_s": _number(np.ptp(trajectory.time[processed])) if processed.any() else None,
@@ -39,10 +35,10 @@ def tracked_numbers(trajectory: Trajectory) -> Numbers:
     return numbers
 
 
-def analysed_numbers(analysis: Analysis) -> Numbers:
+def analysed_numbers(analysis: Analysis) -> Row:
     """Exponents, instant of collapse and energy; `exponents_undetermined` says why there are none."""
     laws, energy = analysis.scaling.laws, analysis.energy
-    numbers: Numbers = {}
+    numbers: Row = {}
     for name in ("n_energy", "n_theta", "n_psidot"):
         exponent = getattr(laws, name)
         numbers[name] = _number(exponent.value) if laws.determined else None
@@ -56,13 +52,13 @@ def analysed_numbers(analysis: Analysis) -> Numbers:
     }
 
 
-def friction_numbers(trajectory: Trajectory) -> Numbers:
+def friction_numbers(trajectory: Trajectory) -> Row:
     """The paper's k_m [m s^2] fitted to the dots of all frames, with the reduced chi-square of that model.
 
     Where that is far from 1, the model lacks something and k_m takes a part of it: sigma is then larger by its root,
     and no more than a hint. `k_m_undetermined` says why there is no k_m.
     """
-    nothing: Numbers = {"k_m_m_s2": None, "k_m_sigma_m_s2": None, "k_m_reduced_chi_square": None}
+    nothing: Row = {"k_m_m_s2": None, "k_m_sigma_m_s2": None, "k_m_reduced_chi_square": None}
     try:
         declared = declared_model(trajectory)
         system = DiscSystem(trajectory, declared.model, candidates=(), known=declared.faults)
@@ -80,7 +76,7 @@ def friction_numbers(trajectory: Trajectory) -> Numbers:
     }
 
 
-def diagnosed_numbers(document: Mapping[str, Any]) -> Numbers:
+def diagnosed_numbers(document: Row) -> Row:
     """Verdict of a diagnosis.json, and the probability of such a gain by chance."""
     return {
         "diagnosis": str(document.get("verdict", "")),
@@ -89,10 +85,10 @@ def diagnosed_numbers(document: Mapping[str, Any]) -> Numbers:
     }
 
 
-def _number(value: Any) -> float | None:
+def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _median(values: Any) -> float | None:
-    known = np.asarray(values)[np.isfinite(values)]
+def _median(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
     return _number(np.median(known)) if known.size else None

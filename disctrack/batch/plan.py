@@ -1,13 +1,9 @@
 """What is to be done: each rig once, then one job per recording."""
 
-from __future__ import annotations
-
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from calibration import CalibrationSettings
 from disctrack.batch.find import FOLDER, RESULTS, FoundRecordings
@@ -53,7 +49,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work for one process; all of JSON's types, so that it can travel."""
+    """One piece of work for one process."""
 
     kind: str  # "rig" or "recording"
     name: str  # of the recording; for a rig, the first recording that needs it
@@ -61,7 +57,6 @@ class Job:
     results: str  # folder for what comes out
     rig: str  # rig file: what a "rig" makes and a "recording" uses
     options: BatchOptions
-    needs_rig: bool = False  # wait for the "rig" job of the same file
     pairs: int = 0
     threads: int = 1  # that read images
     adopt: tuple[str, ...] = ()  # rig files of earlier runs that may be the same
@@ -73,16 +68,6 @@ class Job:
             return _CALIBRATION
         o = self.options
         return _START + self.pairs + _NUMBERS + _REPORT * o.report + _DIAGNOSIS * o.diagnose
-
-    def as_json(self) -> str:
-        """One line."""
-        return json.dumps(dataclasses.asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> Job:
-        """What `as_json` wrote."""
-        fields = json.loads(text)
-        return cls(**fields | {"options": BatchOptions(**fields["options"]), "adopt": tuple(fields["adopt"])})
 
 
 @dataclass(frozen=True)
@@ -145,7 +130,7 @@ def _job(places: Places, recording: Recording, name: str, options: BatchOptions,
     earlier = str(results / "rig.h5")
     job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
     rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
-    return Job("recording", name, str(folder), str(results), str(rig), options, needs_rig=True, pairs=n)
+    return Job("recording", name, str(folder), str(results), str(rig), options, pairs=n)
 
 
 def _shared_rig(places: Places, recording: Recording, options: BatchOptions) -> Path:
@@ -158,8 +143,3 @@ def with_threads(jobs: Sequence[Job], cores: int, side_by_side: int) -> tuple[Jo
     """Cores that no other recording uses read images ahead."""
     threads = max(1, cores // max(1, min(side_by_side, len(jobs))))
     return tuple(dataclasses.replace(job, threads=threads) for job in jobs)
-
-
-def options_as_json(options: BatchOptions) -> dict[str, Any]:
-    """For the summary."""
-    return {k: v for k, v in dataclasses.asdict(options).items() if k != "overwrite"}

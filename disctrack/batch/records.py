@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from disctrack.batch.columns import Row
 from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
@@ -19,6 +18,8 @@ SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
 MEASURED, SKIPPED, FAILED, NOT_MEASURED = "measured", "skipped", "failed", "not measured"
 BUSY = "busy"  # another batch is at it
 
+Stages = dict[str, float | bool]  # what is made of a trajectory, with which settings
+
 
 @dataclass(frozen=True)
 class Record:
@@ -27,9 +28,9 @@ class Record:
     status: str  # MEASURED or FAILED
     reason: str = ""
     fingerprint: str = ""  # of the trajectory's inputs, settings and version
-    stages: dict[str, Any] = field(default_factory=dict)  # what was made of the trajectory, with which settings
+    stages: Stages = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)  # what -> path relative to the record's folder
-    numbers: dict[str, Any] = field(default_factory=dict)  # columns of the summary
+    numbers: Row = field(default_factory=dict)  # columns of the summary
 
 
 @dataclass(frozen=True)
@@ -39,22 +40,13 @@ class Result:
     status: str
     record: Record
 
-    def as_dict(self) -> dict[str, Any]:
-        """Of JSON's types."""
-        return dataclasses.asdict(self)
-
     @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> Result:
-        """What `as_dict` gave."""
-        return cls(fields["status"], Record(**fields["record"]))
-
-    @classmethod
-    def failed(cls, reason: str, numbers: dict[str, Any] | None = None) -> Result:
+    def failed(cls, reason: str) -> Result:
         """A failure with its reason."""
-        return cls(FAILED, Record(FAILED, reason, numbers=numbers or {}))
+        return cls(FAILED, Record(FAILED, reason))
 
 
-def stages_asked(options: BatchOptions) -> dict[str, Any]:
+def stages_asked(options: BatchOptions) -> Stages:
     """What the options ask for beyond the trajectory."""
     return {
         "window_s": options.window,
@@ -81,7 +73,7 @@ def read_record(folder: Path) -> Record | None:
         return None
 
 
-def is_done(folder: Path, record: Record | None, asked: dict[str, Any]) -> bool:
+def is_done(folder: Path, record: Record | None, asked: Stages) -> bool:
     """True if the record tells of a measured recording with all stages asked for, and all its files are there.
 
     The trajectory must be the record's; whether that is the result of the present inputs is another question

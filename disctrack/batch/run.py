@@ -1,7 +1,6 @@
 """A batch from end to end: find, plan, do, sum up."""
 
-from __future__ import annotations
-
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -10,16 +9,16 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from disctrack.batch.cluster import connect, run_on_cluster
-from disctrack.batch.columns import copies
+from disctrack.batch.columns import Row, copies
 from disctrack.batch.find import find_recordings
-from disctrack.batch.jobs import JobQueue
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
-from disctrack.batch.processes import run_here
+from disctrack.batch.pool import Cluster, Pool, Processes
 from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
-from disctrack.batch.summary import Row, counts, line_of, rows_of, write_summary
+from disctrack.batch.summary import counts, line_of, rows_of, write_summary
 from disctrack.batch.together import FOLDER, diagnose_all
+from disctrack.batch.work import do_all
 from disctrack.errors import ClusterError, OutputError
+from disctrack.files.text import printable
 from disctrack.files.whole import check_writable
 from disctrack.recording.declaration import FILE_NAME
 from disctrack.recording.readers.blocks import default_threads
@@ -32,7 +31,7 @@ class BatchOutcome:
     """What a batch did."""
 
     rows: tuple[Row, ...]  # of the recordings that were this batch's to do
-    files: tuple[Path, ...]  # summary.json, summary.csv, index.html; none where they could not be written
+    files: tuple[Path, ...]  # summary.json, summary.csv, repeats.csv, index.html; none where they could not be written
     problems: tuple[str, ...]  # besides those of single recordings
     interrupted: bool = False
     together: tuple[str, ...] = ()  # what the diagnosis of all recordings together says
@@ -54,7 +53,12 @@ class BatchOutcome:
         total = ", ".join(f"{n} {status}" for status, n in counts(self.rows).items() if n)
         left = [f"{'left out':<13} {name:<{width}}  images, and no {FILE_NAME}" for name in self.undeclared]
         left += [f"{'copies':<13} {names}: the same images, one recording for any mean" for names in copies(self.rows)]
-        return [*(line_of(row, width) for row in self.rows), *left, f"{'total':<13} {total}", *self.together]
+        return [
+            *(line_of(row, width) for row in self.rows),
+            *map(printable, left),
+            f"{'total':<13} {total}",
+            *self.together,
+        ]
 
 
 def run_batch(
@@ -75,19 +79,19 @@ def run_batch(
     is in its row.
     """
     options = options or BatchOptions()
-    client = connect(cluster) if cluster is not None else None  # before the work: a wrong address must be told at once
-    try:
+    cores = default_threads()
+    n = side_by_side or cores
+    # before the work: a wrong address must be told at once
+    pool: Pool = Processes(n) if cluster is None else Cluster(cluster)
+    with contextlib.closing(pool):
         places = _places(folders, output)
         check_writable(places.common)
         mine = (shard or Shard()).part(places.found.recordings)
         plan = make_plan(places, mine, options)
+        if cluster is None:
+            plan = replace(plan, recordings=with_threads(plan.recordings, cores, n))
         results = {name: Result.failed(reason) for name, reason in plan.failures.items()}
-        cores = default_threads()
-        n = side_by_side or cores
-        stopped = _do(plan, results, n if client is None else None, cores, client)
-    finally:
-        if client is not None:
-            client.close()
+        stopped = _do(plan, results, pool)
     for job in plan.recordings:
         results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, stopped)))
     whole = shard is None  # or else whoever sums up the shards
@@ -109,26 +113,23 @@ def _places(folders: Sequence[str | Path], output: str | Path | None) -> Places:
     return Places(found, apart)
 
 
-def _do(plan: BatchPlan, results: dict[str, Result], n: int | None, cores: int, client: object | None) -> str:
+def _do(plan: BatchPlan, results: dict[str, Result], pool: Pool) -> str:
     """Fill `results` with what becomes of the plan's recordings; returns why some have none."""
-    recordings = with_threads(plan.recordings, cores, n) if n is not None else plan.recordings
-    with _Bar(plan, len(results)) as bar:
+    bar = _Bar(plan, len(results))
 
-        def done(job: Job, result: Result) -> None:
-            if job.kind == "recording":
-                results[job.name] = result
-            bar.done(job, result)
+    def done(job: Job, result: Result) -> None:
+        if job.kind == "recording":
+            results[job.name] = result
+        bar.done(job, result)
 
-        jobs = JobQueue(plan.rigs, recordings, done)
-        try:
-            if client is None:
-                run_here(jobs, n or 1, bar.share)
-            else:
-                run_on_cluster(client, jobs, bar.share)
-        except KeyboardInterrupt:
-            return INTERRUPTED
-        except ClusterError as error:
-            return str(error)
+    try:
+        do_all(plan.rigs, plan.recordings, pool, done, bar.share)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except ClusterError as error:
+        return str(error)
+    finally:
+        bar.close()
     return ""
 
 
@@ -152,8 +153,7 @@ def _summed_up(
             interrupted = True
     files: tuple[Path, ...] = ()
     try:
-        rows, files, wrong = write_summary(places, places.found.recordings, results, options)
-        problems += wrong
+        rows, files = write_summary(places, places.found.recordings, results, options)
     except OutputError as error:  # the results themselves may be safe all the same
         problems.append(str(error))
         rows = rows_of(places, places.found.recordings, results)
@@ -167,32 +167,27 @@ class _Bar:
     """One bar for the whole batch, on stderr, where that is a terminal. What was skipped does not spoil the rate."""
 
     def __init__(self, plan: BatchPlan, n_failed: int) -> None:
-        self._jobs = (*plan.rigs, *plan.recordings)
-        self._share: dict[tuple[str, str], float] = {}
+        self._share: dict[Job, float] = {}
         self._n, self._n_failed, self._finished = len(plan.recordings) + n_failed, n_failed, n_failed
-
-    def __enter__(self) -> _Bar:
         self._bar = tqdm(
-            total=sum(job.work for job in self._jobs),
+            total=sum(job.work for job in (*plan.rigs, *plan.recordings)),
             bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]",
             disable=None,
             leave=False,
             smoothing=0.1,
         )
         self._tell()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._bar.close()
 
     def share(self, job: Job, share: float) -> None:
-        key = (job.kind, job.name)
-        self._bar.update((share - self._share.get(key, 0.0)) * job.work)
-        self._share[key] = share
+        self._bar.update((share - self._share.get(job, 0.0)) * job.work)
+        self._share[job] = share
 
     def done(self, job: Job, result: Result) -> None:
         if result.status in (SKIPPED, FAILED) and not self._bar.disable:
-            self._bar.total -= (1.0 - self._share.get((job.kind, job.name), 0.0)) * job.work
+            self._bar.total -= (1.0 - self._share.get(job, 0.0)) * job.work
         else:
             self.share(job, 1.0)
         if job.kind == "recording":

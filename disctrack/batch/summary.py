@@ -2,21 +2,24 @@
 
 import contextlib
 import csv
+import dataclasses
 import io
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from disctrack.batch.columns import COLUMNS, FALSE_DISCOVERY, LACKS_SOMETHING
+from disctrack.batch.columns import COLUMNS, FALSE_DISCOVERY, LACKS_SOMETHING, Row
+from disctrack.batch.index import index_page
 from disctrack.batch.locks import Busy, locked
-from disctrack.batch.plan import BatchOptions, Places, options_as_json
+from disctrack.batch.plan import BatchOptions, Places
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
+from disctrack.batch.repeats import REPEATS, repeats_of
+from disctrack.batch.together import FOLDER
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
+from disctrack.files.text import csv_cell, printable
 from disctrack.files.whole import write_whole
 from disctrack.recording.changed import changed_since
 from disctrack.recording.declaration import FILE_NAME
@@ -25,8 +28,6 @@ from disctrack.trajectory.file import read_provenance
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
 _PATHS = ("trajectory", "report", "diagnosis_report")
 _WAIT = 300.0  # [s] for another process that writes the summary
-
-Row = dict[str, Any]
 
 
 def rows_of(places: Places, recordings: Sequence[Path], results: Mapping[str, Result]) -> list[Row]:
@@ -57,7 +58,7 @@ def _if_stale(folder: Path, results: Path, record: Record) -> Record:
     measured = read_provenance(results / record.files["trajectory"]).settings.get("recording")
     changed = changed_since(folder, measured) if isinstance(measured, dict) else ""
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
-    return replace(record, reason="; ".join(filter(None, [stale, record.reason])))
+    return dataclasses.replace(record, reason="; ".join(filter(None, [stale, record.reason])))
 
 
 def _row(places: Places, folder: Path, name: str, record: Record, status: str) -> Row:
@@ -81,32 +82,38 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_summary(
     places: Places, recordings: Sequence[Path], results: Mapping[str, Result], options: BatchOptions
-) -> tuple[list[Row], tuple[Path, ...], tuple[str, ...]]:
-    """Write summary.json, summary.csv and index.html; returns the rows, the files, and what is wrong with them.
+) -> tuple[list[Row], tuple[Path, ...]]:
+    """Write summary.json, summary.csv, repeats.csv and index.html; returns the rows and the files.
 
     Shards that end at the same time write one after the other, each with all that is on the disk by then: the last one
     has everything. Raises OutputError.
     """
-    from disctrack.batch.index import write_index
-
     folder = places.common
     with _for_writing(folder):
         rows = with_false_discovery(rows_of(places, recordings, results))
+        repeats = repeats_of(rows)
         document = {
             "schema": SCHEMA,
             "schema_version": SCHEMA_VERSION,
             "version": __version__,
             "searched": [str(places.found.base), *places.found.problems],
-            "options": options_as_json(options),
+            "options": dataclasses.asdict(options),
             "counts": counts(rows),
             "columns": COLUMNS,
             "recordings": rows,
+            "columns_of_repeats": REPEATS,
+            "repeats": repeats,
         }
-        write_whole(folder / "summary.json", json_file(document))
-        write_whole(folder / "summary.csv", _as_csv(rows).encode())
-        problem = write_index(folder / "index.html", rows, compare=options.report)
-    files = tuple(folder / name for name in ("summary.json", "summary.csv", "index.html"))
-    return rows, files, (problem,) if problem else ()
+        together = f"{FOLDER}/diagnosis.html"
+        contents = {
+            "summary.json": json_file(document),
+            "summary.csv": _as_csv(COLUMNS, rows),
+            "repeats.csv": _as_csv(REPEATS, repeats),
+            "index.html": index_page(rows, repeats, together if (folder / together).is_file() else "").encode(),
+        }
+        for name, content in contents.items():
+            write_whole(folder / name, content)
+    return rows, tuple(folder / name for name in contents)
 
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
@@ -147,19 +154,19 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
     return {status: statuses.count(status) for status in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
 
 
-def _as_csv(rows: Sequence[Row]) -> str:
+def _as_csv(columns: Iterable[str], rows: Sequence[Row]) -> bytes:
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(COLUMNS))
+    writer = csv.DictWriter(text, list(columns))
     writer.writeheader()
-    writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
-    return text.getvalue()
+    writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
+    return text.getvalue().encode(errors="backslashreplace")
 
 
 def line_of(row: Row, width: int) -> str:
     """One line for people: what became of a recording. width : of the longest name"""
     head = f"{row['status']:<13} {row['recording']:<{width}}"
     if row["status"] in (FAILED, NOT_MEASURED):
-        return f"{head}  {row['reason']}"
+        return printable(f"{head}  {row['reason']}")
     parts = [f"{row['pairs_measured']} of {row['pairs']} pairs"]
     if row["k_m_m_s2"] is not None:
         parts.append(f"k_m {row['k_m_m_s2'] * 1e8:.4f} +- {row['k_m_sigma_m_s2'] * 1e8:.4f} e-8 m s2")
@@ -178,4 +185,4 @@ def line_of(row: Row, width: int) -> str:
         parts.append(f"{row['diagnosis']}{doubt if row['diagnosis'] != 'nothing missing' else ''}")
     if row["reason"]:
         parts.append(f"but {row['reason']}")
-    return f"{head}  {', '.join(parts)}"
+    return printable(f"{head}  {', '.join(parts)}")

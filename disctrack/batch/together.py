@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from disctrack.batch.columns import Row
 from disctrack.batch.reasons import reason_of
 
 FOLDER = "together"
 
 
-def diagnose_all(folder: Path, rows: Sequence[dict[str, Any]], processes: int) -> tuple[list[str], str]:
+def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> tuple[list[str], str]:
     """One diagnosis of all measured trajectories, into a folder beside the summary, unless it is there already.
 
     returns : what it says, and why there is none although it was wanted; empty otherwise

@@ -6,6 +6,7 @@ import sys
 from disctrack.batch import BatchOptions, BatchOutcome, Shard, run_batch, summarise_batch
 from disctrack.commands import DONE, FAILED, INCOMPLETE
 from disctrack.commands import _outputs as outputs
+from disctrack.files.text import printable
 from disctrack.track import summary
 
 
@@ -40,7 +41,7 @@ def _options(arguments: argparse.Namespace) -> BatchOptions:
 def _tell_problems(outcome: BatchOutcome) -> None:
     sys.stdout.flush()
     for problem in outcome.problems:
-        print(f"disctrack: {problem}", file=sys.stderr)
+        print(f"disctrack: {printable(problem)}", file=sys.stderr)
     if outcome.failed and not outcome.interrupted:
         print("disctrack: not everything was measured (see above). The same command tries it again.", file=sys.stderr)
     elif outcome.incomplete and not outcome.interrupted:

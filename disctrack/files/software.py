@@ -7,7 +7,7 @@ from pathlib import Path
 __version__ = "0.2.0"
 
 # Rooms beside the measurement: what they make is never reused, nor part of what is.
-_BESIDE = ("examples", "first_look", "repeats", "validate")
+_BESIDE = ("examples", "first_look", "validate")
 
 
 @cache

@@ -44,11 +44,11 @@ from scipy.optimize import least_squares
 
 from calibration.cameras.camera import StereoRig
 from calibration.rig_file import read_rig
-from disctrack.batch.processes import ONE_THREAD
 from disctrack.files.software import software_version
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.blocks import ONE_THREAD
 from disctrack.recording.readers.file_numbers import NumberedFiles
 from disctrack.recording.readers.images import ImageSequence
 from disctrack.track.arrays import measure_pairs

@@ -75,7 +75,7 @@ STAIRS = (
     ("trajectory", "rolling", "recording", "pages"),
     ("track", "analyse"),
     ("synthetic", "discrepancy"),
-    ("diagnosis", "calibrate", "repeats"),
+    ("diagnosis", "calibrate"),
     ("first_look", "examples", "validate", "batch"),
     ("commands",),
     ("cli",),

@@ -8,6 +8,7 @@ import os
 import re
 import resource
 import shutil
+from concurrent.futures import Future
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -20,6 +21,7 @@ from disctrack.batch import BatchOptions, find_recordings, read_summary, run, ru
 from disctrack.batch import measure as stage
 from disctrack.batch.plan import Places, make_plan
 from disctrack.batch.records import read_record
+from disctrack.batch.repeats import COMPARED
 from disctrack.cli import main
 from disctrack.files.whole import output_error
 from disctrack.track.tracking import prepare
@@ -57,11 +59,22 @@ def jobs_of(folder: Path, **options):
 def in_this_process(monkeypatch):
     """No processes of its own, where a test is about something else: starting them takes longer than measuring."""
 
-    def run_here(jobs, side_by_side, share):
-        while (job := jobs.next()) is not None:
-            jobs.finish(job, stage.do(job))
+    class Here:
+        def __init__(self, size):
+            self.size = size
 
-    monkeypatch.setattr("disctrack.batch.run.run_here", run_here)
+        def submit(self, job):
+            future = Future()
+            future.set_result(stage.do(job))
+            return future
+
+        def result(self, future):
+            return future.result()
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr("disctrack.batch.run.Processes", Here)
 
 
 @pytest.mark.statistical
@@ -367,7 +380,7 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(recordi
 
 @pytest.mark.slow
 def test_the_index_links_the_reports_and_compares_repeats(sample_clip, rig_file, tmp_path):
-    """Two parts of one motion: on a common clock they are the same, and the comparison must say so."""
+    """Two parts of one motion: what is fitted to them is the same, and the comparison must say so."""
     text = (sample_clip / "recording.toml").read_text()
     start, end = text.index("[calibration]"), text.index("[gravity]")
     for name, frames in (("run 1", slice(0, 300)), ("run 2", slice(15, 300))):
@@ -384,7 +397,10 @@ def test_the_index_links_the_reports_and_compares_repeats(sample_clip, rig_file,
     links = [unquote(link) for link in re.findall(r'href="([^"]+\.html)"', page.read_text())]
     assert len(links) == 2
     assert all((page.parent / link).is_file() for link in links)
-    assert "the 2 runs agree" in page.read_text()
+    found = json.loads((page.parent / "summary.json").read_text())["repeats"]
+    assert {row["quantity"]: row["n"] for row in found} == dict.fromkeys(COMPARED, 2)
+    assert all(row["p_value"] > 1e-3 for row in found)  # one motion: within the sigmas
+    assert "Repeats" in page.read_text()
     one, two = outcome.rows
     later = one["t_f_s"] - two["t_f_s"]  # the second begins 15 ms later
     assert later == pytest.approx(0.015, abs=4 * np.hypot(one["t_f_sigma_s"], two["t_f_sigma_s"]))

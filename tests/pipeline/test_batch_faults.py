@@ -16,10 +16,11 @@ import h5py
 import numpy as np
 import pytest
 
-from disctrack.batch import BatchOptions, cluster, find_recordings, processes, run_batch
+from disctrack.batch import BatchOptions, find_recordings, pool, run_batch
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import Places, make_plan
+from disctrack.batch.pool import connect
 from disctrack.batch.records import MEASURED, is_done, read_record
 from disctrack.cli import main
 from disctrack.errors import ClusterError
@@ -182,15 +183,16 @@ def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_pat
 
 @pytest.mark.statistical
 def test_a_killed_worker_is_tried_again_and_a_deadly_recording_fails_alone(day, monkeypatch):
-    begin, deaths = processes.Worker.begin, {"a": 2, "b": 1}  # how often the process is killed
+    begin, deaths = pool._Worker.begin, {"a": 2, "b": 1}  # how often the process is killed
 
     def deadly(self, job):
-        begin(self, job)
+        future = begin(self, job)
         if deaths[job.name]:
             deaths[job.name] -= 1
-            self._process.kill()
+            self.process.kill()
+        return future
 
-    monkeypatch.setattr(processes.Worker, "begin", deadly)
+    monkeypatch.setattr(pool._Worker, "begin", deadly)
     outcome = run_batch([day], BatchOptions(report=False), side_by_side=2)
     a, b = outcome.rows
     assert (a["status"], b["status"]) == ("failed", "measured")
@@ -202,7 +204,7 @@ def test_recordings_for_which_no_process_can_be_started_fail_with_that_reason(da
     def refused(*_, **__):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(processes.subprocess, "Popen", refused)
+    monkeypatch.setattr(pool.SpawnProcess, "start", refused)
     outcome = run_batch([day], BatchOptions(report=False))
     assert [row["status"] for row in outcome.rows] == ["failed", "failed"]
     assert "no process could be started for it: Resource temporarily unavailable" in outcome.rows[0]["reason"]
@@ -248,19 +250,19 @@ def dask_cluster(tmp_path):
 @_OF_ANOTHER_PROJECT
 def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(dask_cluster, day, monkeypatch):
     address, workers = dask_cluster
-    wait_for_workers, submitted = cluster.connect, []
+    submitted = []
 
     def connect_to_both(address):
         wait_until(lambda: has_workers(address, len(workers)))
-        return wait_for_workers(address)
+        return connect(address)
 
     def kill_one():
         wait_until(lambda: all((day / name / "results" / LOCK).exists() for name in NAMES))
         workers[0].kill()  # both recordings are being measured, so one of them is lost with it
         submitted.append(time.monotonic())
 
-    monkeypatch.setattr("disctrack.batch.run.connect", connect_to_both)
-    killer = threading.Thread(target=kill_one)
+    monkeypatch.setattr(pool, "connect", connect_to_both)
+    killer = threading.Thread(target=kill_one, daemon=True)
     killer.start()
     outcome = run_batch([day], BatchOptions(report=False), cluster=address)
     killer.join()
@@ -272,7 +274,7 @@ def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(dask_clus
 
 
 def has_workers(address: str, n: int) -> bool:
-    with contextlib.suppress(ClusterError), contextlib.closing(cluster.connect(address)) as client:
+    with contextlib.suppress(ClusterError), contextlib.closing(connect(address)) as client:
         return len(client.scheduler_info()["workers"]) == n
     return False
 
@@ -280,7 +282,7 @@ def has_workers(address: str, n: int) -> bool:
 @_OF_ANOTHER_PROJECT
 def test_a_dead_address_and_a_missing_extra_are_told_before_anything_is_done(day, monkeypatch, capsys):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "CONNECT", 0.5)
+    monkeypatch.setattr(pool, "CONNECT", 0.5)
     assert main(["batch", str(day), "--cluster", "tcp://127.0.0.1:9"]) == 1
     assert "no scheduler answers" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "distributed", None)

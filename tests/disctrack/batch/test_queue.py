@@ -1,29 +1,36 @@
 """What a batch does with jobs, locks and folders, without measuring anything."""
 
+import csv
 import errno
 import fcntl
+import io
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from scipy import optimize, stats
 
 from disctrack.batch import locks
-from disctrack.batch.cluster import run_on_cluster
 from disctrack.batch.columns import COLUMNS, copies
 from disctrack.batch.find import find_recordings
 from disctrack.batch.index import index_page
-from disctrack.batch.jobs import JobQueue
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job, Shard
+from disctrack.batch.pool import Cluster, Died
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
+from disctrack.batch.repeats import COMPARED, repeats_of
 from disctrack.batch.run import BatchOutcome
-from disctrack.batch.summary import line_of
+from disctrack.batch.summary import _as_csv, line_of
+from disctrack.batch.work import do_all
 from disctrack.errors import ClusterError, RecordingError
 
 GOOD = Result(MEASURED, Record(MEASURED))
@@ -95,120 +102,118 @@ def test_shards_give_every_recording_once(n, tmp_path):
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
-def job(name, rig="given.h5", kind="recording", needs_rig=False):
-    return Job(kind, name, f"/{name}", f"/{name}/results", rig, BatchOptions(), needs_rig)
+def job(name, rig="given.h5", kind="recording"):
+    return Job(kind, name, f"/{name}", f"/{name}/results", rig, BatchOptions())
+
+
+RIG = job("a", "shared.h5", "rig")
+WITH_RIG = [job("a", "shared.h5"), job("b"), job("c", "shared.h5")]
+
+
+class Pool:
+    """Gives the answers to each job one after the other (GOOD, unless others are listed), the oldest job's first."""
+
+    def __init__(self, size=2, **answers):
+        self.size, self.answers = size, answers
+        self.begun, self.running, self.most = [], [], {}
+
+    def submit(self, job):
+        answer = (self.answers.get(f"{job.kind}_{job.name}") or [GOOD]).pop(0)
+        if isinstance(answer, OSError):
+            raise answer
+        self.begun.append((job.kind, job.name))
+        self.running.append((future := Future(), answer))
+        self.most[job.name] = len(self.running)
+        self.running[0][0].set_result(None) if not self.running[0][0].done() else None
+        return future
+
+    def result(self, future):
+        (answer,) = (answer for running, answer in self.running if running is future)
+        self.running = [(running, answer) for running, answer in self.running if running is not future]
+        if self.running and not self.running[0][0].done():
+            self.running[0][0].set_result(None)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def share(self, future):
+        return 0.0
+
+
+def done_by(pool, recordings, rigs=()):
+    results = {}
+    do_all(
+        rigs, recordings, pool, lambda job, result: results.__setitem__((job.kind, job.name), result), lambda *_: None
+    )
+    return {name: result for (kind, name), result in results.items() if kind == "recording"}
+
+
+def test_recordings_wait_for_their_rig_and_no_others_do():
+    pool = Pool(size=3)
+    results = done_by(pool, WITH_RIG, [RIG])
+    assert pool.begun == [("rig", "a"), ("recording", "b"), ("recording", "a"), ("recording", "c")]
+    assert [results[name].status for name in "abc"] == [MEASURED] * 3
+
+
+def test_without_its_rig_a_recording_fails_with_the_rigs_reason_and_others_go_on():
+    results = done_by(Pool(rig_a=[Result.failed("no corners found")]), WITH_RIG, [RIG])
+    assert "no corners found" in results["a"].record.reason
+    assert [results[name].status for name in "abc"] == [FAILED, MEASURED, FAILED]
+
+
+def test_a_recording_at_which_another_batch_works_is_asked_for_again_after_the_others():
+    pool = Pool(size=1, recording_a=[Result(BUSY, Record(FAILED)), GOOD])
+    assert done_by(pool, [job("a"), job("b")])["a"].status == MEASURED
+    assert [name for _, name in pool.begun] == ["a", "b", "a"]
+
+
+def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
+    pool = Pool(recording_a=[Died("killed"), Died("killed")], recording_b=[Died("killed"), GOOD])
+    results = done_by(pool, [job(name) for name in "abcd"])
+    assert results["a"].record.reason == "twice, killed"
+    assert [results[name].status for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
+    assert [name for _, name in pool.begun][4:] == ["a", "b"]
+    assert (pool.most["a"], pool.most["b"], pool.most["c"]) == (1, 1, 2)
+
+
+def test_a_job_for_which_no_process_can_be_started_fails_alone():
+    results = done_by(Pool(recording_a=[OSError(errno.EAGAIN, "no more processes")]), [job("a"), job("b")])
+    assert "no process could be started for it: no more processes" in results["a"].record.reason
+    assert results["b"].status == MEASURED
 
 
 @pytest.fixture
-def results():
-    return {}
+def cluster(monkeypatch):
+    """A cluster whose futures have an answer, an error, or were cancelled."""
+
+    class Client:
+        def get_executor(self, pure: bool):
+            return self
+
+        def submit(self, do: Callable, job: Job):
+            future = Future()
+            if isinstance(answer := self.answers.pop(0), Exception):
+                future.set_exception(answer)
+            else:
+                future.set_result(answer)
+            return future
+
+    client = Client()
+    monkeypatch.setattr("disctrack.batch.pool.connect", lambda address: client)
+    return client
 
 
-def queue_of(rigs, recordings, results):
-    return JobQueue(rigs, recordings, lambda job, result: results.__setitem__((job.kind, job.name), result))
+def test_answers_of_a_cluster_are_results_deaths_and_failures(cluster):
+    cluster.answers = [GOOD, Died("killed"), RuntimeError("worker lost too often"), GOOD]
+    results = done_by(Cluster("tcp://there"), [job("a"), job("b"), job("c")])
+    assert {name: result.status for name, result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
+    assert "worker lost too often" in results["c"].record.reason
 
 
-def test_a_job_survives_its_journey_as_text():
-    for options in (BatchOptions(), BatchOptions(window=0.25, diagnose=True, report=False)):
-        there = Job("rig", "a b", "/é", "/r", "/x", options, True, 3, 2, ("/1", "/2"))
-        assert Job.from_json(there.as_json()) == there
-
-
-def test_recordings_wait_for_their_rig_and_no_others_do(results):
-    jobs = queue_of(
-        [job("a", "shared.h5", "rig")],
-        [job("a", "shared.h5", needs_rig=True), job("b"), job("c", "shared.h5", needs_rig=True)],
-        results,
-    )
-    rig, b = jobs.next(), jobs.next()
-    assert (rig.kind, b.name, jobs.next()) == ("rig", "b", None)
-    jobs.finish(rig, GOOD)
-    assert [jobs.next().name, jobs.next().name] == ["a", "c"]
-    assert not jobs.finished
-
-
-def test_without_its_rig_a_recording_fails_with_the_rigs_reason_and_others_go_on(results):
-    jobs = queue_of([job("a", "shared.h5", "rig")], [job("a", "shared.h5", needs_rig=True), job("b")], results)
-    jobs.finish(jobs.next(), Result.failed("no corners found"))
-    assert "no corners found" in results["recording", "a"].record.reason
-    jobs.finish(jobs.next(), GOOD)
-    assert jobs.finished
-    assert results["recording", "b"].status == MEASURED
-
-
-def test_a_recording_at_which_another_batch_works_is_asked_for_again(results, monkeypatch):
-    monkeypatch.setattr("disctrack.batch.jobs.ASK_AGAIN", 0.02)
-    jobs = queue_of([], [job("a")], results)
-    jobs.finish(jobs.next(), Result(BUSY, Record(FAILED)))
-    assert jobs.next() is None
-    assert not jobs.finished
-    time.sleep(0.03)
-    jobs.finish(jobs.next(), GOOD)
-    assert jobs.finished
-    assert results["recording", "a"].status == MEASURED
-
-
-def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone(results):
-    jobs = queue_of([], [job("a"), job("b"), job("c")], results)
-    a, b = jobs.next(), jobs.next()
-    jobs.died(a, "killed")
-    c = jobs.next()
-    assert c.name == "c"
-    jobs.finish(c, GOOD)
-    assert jobs.next() is None  # b still runs
-    jobs.finish(b, GOOD)
-    assert jobs.next() == a
-    jobs.died(a, "killed")
-    assert jobs.finished
-    assert results["recording", "a"].record.reason == "twice, killed"
-    assert results["recording", "b"].status == MEASURED
-
-
-class Future:
-    """As dask's: done, with an answer, an error, or cancelled."""
-
-    def __init__(self, answer):
-        self.answer = answer
-
-    def done(self):
-        return True
-
-    def cancelled(self):
-        return self.answer is None
-
-    def result(self):
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
-
-
-class Client:
-    """Gives one answer after the other, whatever it is asked."""
-
-    def __init__(self, *answers):
-        self.answers = list(answers)
-
-    def submit(self, *given, **options):
-        return Future(self.answers.pop(0))
-
-    def cancel(self, futures, force):
-        assert not any(isinstance(future.answer, dict) for future in futures)
-
-
-def test_answers_of_a_cluster_are_results_deaths_and_failures(results):
-    jobs = queue_of([], [job("a"), job("b"), job("c")], results)
-    client = Client(GOOD.as_dict(), {"died": "killed"}, RuntimeError("worker lost too often"), GOOD.as_dict())
-    run_on_cluster(client, jobs, lambda job, share: None)
-    assert jobs.finished
-    assert {name: result.status for (_, name), result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
-    assert "worker lost too often" in results["recording", "c"].record.reason
-
-
-def test_a_lost_scheduler_is_told_and_no_recording_is_blamed(results):
-    jobs = queue_of([], [job("a"), job("b")], results)
+def test_a_lost_scheduler_is_told_and_no_recording_is_blamed(cluster):
+    cluster.answers = [CancelledError(), CancelledError()]
     with pytest.raises(ClusterError, match="scheduler was lost"):
-        run_on_cluster(Client(GOOD.as_dict(), None), jobs, lambda job, share: None)
-    assert set(results) == {("recording", "a")}
+        done_by(Cluster("tcp://there"), [job("a"), job("b")])
 
 
 def test_reasons_are_one_line_and_say_what_to_do():
@@ -313,3 +318,66 @@ def test_a_line_warns_where_the_model_lacks_something():
     measured = row(pairs=10, pairs_measured=10, k_m_m_s2=3.81e-8, k_m_sigma_m_s2=1e-11, k_m_reduced_chi_square=1.01)
     assert "lacks" not in line_of(measured, 3)
     assert "lacks something (chi-square 23.9)" in line_of(measured | {"k_m_reduced_chi_square": 23.9}, 3)
+
+
+def repeats_with(values, sigmas, **known):
+    """Rows of one group whose n_theta is as given."""
+    return [
+        row(recording=str(i), input_sha256=str(i), repeats="glass", n_theta=v, n_theta_sigma=s, **known)
+        for i, (v, s) in enumerate(zip(values, sigmas, strict=True))
+    ]
+
+
+def test_means_and_spread_of_repeats_agree_with_least_squares(rng):
+    """Runs that scatter as their sigmas say, and the same with a scatter of their own."""
+    sigma = rng.uniform(0.5, 2.0, 7) * 1e-3
+    value = 0.667 + sigma * rng.standard_normal(7)
+    for added in (0.0, 0.01):
+        there = value + added * rng.standard_normal(7)
+        (found,) = repeats_of(repeats_with(there, sigma))
+        fit, covariance = optimize.curve_fit(
+            lambda x, a: a + 0 * x, np.zeros(7), there, sigma=sigma, absolute_sigma=True
+        )
+        np.testing.assert_allclose(
+            [found["weighted_mean"], found["weighted_mean_sigma"] ** 2], [fit[0], covariance[0, 0]]
+        )
+        chi_square = np.sum(((there - fit[0]) / sigma) ** 2)
+        np.testing.assert_allclose(found["reduced_chi_square"], chi_square / 6, rtol=1e-6)
+        np.testing.assert_allclose(found["p_value"], stats.chi2.sf(chi_square, 6), rtol=1e-5)
+        np.testing.assert_allclose([found["mean"], found["standard_deviation"]], [there.mean(), there.std(ddof=1)])
+        assert (found["p_value"] > 1e-3) == (added == 0.0)
+
+
+def test_published_trials_have_the_published_mean():
+    from disctrack.analyse.published import published_table
+
+    table = published_table("glass")
+    exponents = table.exponents[:, 1]
+    (found,) = repeats_of(repeats_with(exponents, np.ones(len(exponents))))
+    np.testing.assert_allclose(found["mean"], table.average[1], rtol=1e-12)
+    assert found["n"] == len(exponents)
+
+
+def test_repeats_are_of_one_group_determined_and_no_copies():
+    rows = repeats_with([0.66, 0.67, 0.68, 0.9, 0.9, 0.7], [0.01] * 6)
+    rows[3] |= {"repeats": "steel"}  # alone of its kind
+    rows[4] |= {"input_sha256": "0"}  # a copy of the first
+    rows[5] |= {"n_theta": None, "n_theta_sigma": None}
+    rows.append(row(recording="failed", status=FAILED))
+    (found,) = repeats_of(rows)
+    assert (found["repeats"], found["quantity"], found["n"]) == ("glass", "n_theta", 3)
+    assert found["mean"] == pytest.approx(0.67)
+    assert set(COMPARED) <= set(COLUMNS)
+    page = index_page(rows, [found])
+    assert "0.6700 ± 0.0100" in page
+    assert "Repeats" not in index_page(rows)
+
+
+def test_names_are_text_in_a_spreadsheet_and_steer_no_terminal():
+    names = ["=1+1", "+1", "-1", "@SUM(A1)", "\x1b[2J", "plain é"]
+    rows = [row(recording=name, reason="\x1b]0;title\x07", pairs=-1) for name in names]
+    cells = list(csv.DictReader(io.StringIO(_as_csv(COLUMNS, rows).decode())))
+    assert [cell["recording"] for cell in cells] == ["'=1+1", "'+1", "'-1", "'@SUM(A1)", r"\x1b[2J", "plain é"]
+    assert cells[0]["pairs"] == "-1"  # a number stays one
+    assert "\x1b" not in index_page(rows)
+    assert not any("\x1b" in line_of(item | {"status": FAILED}, 3) for item in rows)
