@@ -26,7 +26,7 @@ from disctrack.diagnosis.motion_start import STRETCHES, start_values
 from disctrack.diagnosis.sought import sought
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp, Values
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
@@ -96,7 +96,7 @@ class StaticView:
     whiten: Array  # (k, 2, m, 2, 2)
 
 
-class DiscSystem:
+class DiscSystem(System):
     """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
 
     def __init__(
@@ -300,7 +300,6 @@ class DiscSystem:
             setattr(part, name, getattr(self, name)[:n])
         return part
 
-    @property
     def beginnings(self) -> tuple[DiscSystem, ...]:
         """Parts over which a motion is followed that a fit of the whole would not find."""
         span = float(self.time[-1] - self.time[0])

@@ -448,7 +448,7 @@ def _refitted(
 
 
 def _widths(law: LearnedLaw) -> list[Quantity]:
-    return [q for q in law.candidate.quantities if q.name.partition(".")[2].partition("_")[0] in WIDTHS]
+    return [q for q in law.candidate.quantities if q.part.partition("_")[0] in WIDTHS]
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
@@ -544,7 +544,7 @@ def _family_of(name: str) -> int:
 
 
 def _is_shape(q: Quantity) -> bool:
-    return q.name.partition(".")[2].partition("_")[0] in _SHAPES
+    return q.part.partition("_")[0] in _SHAPES
 
 
 def _law(chosen: Sequence[Family], values: Array, name: str) -> LearnedLaw:

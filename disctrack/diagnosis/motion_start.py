@@ -77,8 +77,8 @@ def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
     values |= {law.name: system.model.values[law.name] for law in laws}
     if SLIP in names:
         values[SLIP] = 1.0 / first_friction(times, q, system.model.gravity)
-    state = tuple(quantity for quantity in system.base if quantity.name.startswith("state.") or quantity.name == SLIP)
-    for stretch, part in zip(STRETCHES, system.beginnings, strict=False):
+    state = tuple(quantity for quantity in system.base if quantity.is_initial or quantity.name == SLIP)
+    for stretch, part in zip(STRETCHES, system.beginnings(), strict=False):
         # a law of friction shows only over several turns: held until the stretch is long enough
         moved = state if stretch < 0.1 else (*state, *laws)
         values = fit(part, moved, values).values

@@ -151,7 +151,7 @@ class Planner:
         self.system, self.fit, self._noise = system, fit, noise
         new = {q.name: q for c in candidates for q in c.quantities}
         self.tested = tuple(new.values())
-        fitted = tuple(q for q in fit.quantities if not q.name.startswith("state.") and q.name not in new)
+        fitted = tuple(q for q in fit.quantities if not q.is_initial and q.name not in new)
         self._local = tuple(q for q in fitted if q.belongs_to)
         self.own = tuple(q for q in fit.quantities if not q.belongs_to and q.name not in new)
         n_rig = system.rig_directions.shape[1]

@@ -37,7 +37,7 @@ from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.significance import price_of_a_number, wald
-from disctrack.discrepancy.system import System, Wrapped
+from disctrack.discrepancy.system import System
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
@@ -161,7 +161,7 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
 
 def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:
     """The system with its noise as the diagnosis found it."""
-    return diagnosis.judged.over(system) if isinstance(diagnosis.judged, Wrapped) else system
+    return (diagnosis.judged or system).over(system)
 
 
 @dataclass(frozen=True)

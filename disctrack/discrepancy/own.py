@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import OwnNumbers, eliminate, triangle
-from disctrack.discrepancy.system import Quantity, System, Values, blocks
+from disctrack.discrepancy.system import Quantity, System, Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Own:
             if q.slot:
                 own.setdefault(q.block, []).append(q)
         self.slots = tuple(dict.fromkeys(q.slot for block in own.values() for q in block))
-        rows, rest = blocks(system), np.ones(len(system.weights), bool)
+        rows, rest = system.blocks, np.ones(len(system.weights), bool)
         self.blocks = []
         for number, of_block in own.items():
             here = np.arange(rows[number].start, rows[number].stop)

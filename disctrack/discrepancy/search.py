@@ -27,10 +27,6 @@ from disctrack.discrepancy.system import (
     System,
     TrialGivenUp,
     Values,
-    beginnings,
-    hurried,
-    several_minima,
-    undo_each_other,
 )
 
 CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
@@ -173,7 +169,7 @@ class _Search:
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
         self.refits: dict[str, Trial] = {}
-        self.rough = several_minima(system)
+        self.rough = system.several_minima
         self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
         self.free_runs: list[tuple[Fit, HeldOut]] = []
 
@@ -259,7 +255,7 @@ class _Search:
                 values.setdefault(name, value)
         quantities = self._quantities(candidates)
         try:
-            found = fit(self.system if patient else hurried(self.system), quantities, values)
+            found = fit(self.system if patient else self.system.hurried(), quantities, values)
         except TrialGivenUp:
             return no_fit(quantities, values)
         if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
@@ -302,7 +298,7 @@ class _Search:
         """Have some steps from this start removed a good part of the residual?"""
         values = dict(current.fit.values) | dict(start)
         try:
-            few = fit(hurried(self.system, SOON), self._quantities(together), values, max_iterations=FIRST_STEPS)
+            few = fit(self.system.hurried(SOON), self._quantities(together), values, max_iterations=FIRST_STEPS)
         except TrialGivenUp:
             return False
         return few.cost < PROMISING * current.fit.cost
@@ -316,9 +312,9 @@ class _Search:
         values, quantities = {**current.fit.values, **start}, self._quantities(together)
         if current.fit.reduced_chi_square < FAR * self.noise:
             return None
-        for part in beginnings(self.system):
+        for part in self.system.beginnings():
             try:
-                found = fit(hurried(part, len(self.system.time) / len(part.time)), quantities, values)
+                found = fit(part.hurried(len(self.system.time) / len(part.time)), quantities, values)
             except TrialGivenUp:
                 return None
             if not found.converged or found.reduced_chi_square > AGREES * self.noise:
@@ -433,7 +429,7 @@ class _Search:
         limits = [(values[q.name], q) for c in extra if c.kind == "measurement" for q in c.quantities]
         if any(v != q.null and not q.lower < v < q.upper for v, q in limits):
             return True
-        if undo_each_other(self.system, trial.candidates, values, self.fits[frozenset()].values):
+        if self.system.undo_each_other(trial.candidates, values, self.fits[frozenset()].values):
             return True
         faults = [c for c in trial.candidates if c.kind == "measurement"]
         if len(faults) < 2:
@@ -488,7 +484,7 @@ class _Search:
                 swapped = list(trial.candidates)
                 swapped[position] = better.candidate
                 new = replace(trial, candidates=tuple(swapped), fit=better.fit, held_out=self._held_out(better.fit))
-                undone = undo_each_other(self.system, swapped, better.fit.values, self.fits[frozenset()].values)
+                undone = self.system.undo_each_other(swapped, better.fit.values, self.fits[frozenset()].values)
                 if not undone and self._log_density(new) > self._log_density(trial) - CLASS_GAIN / 2 * self.noise:
                     trial = new
                     found = self._rivals(trial, position)
@@ -608,7 +604,7 @@ def _near_enough(system: System, base: Fit) -> bool:
     Where equations jump, chi-square is rough: far above the noise no step may lead to the bottom of a rough valley.
     """
     excess = base.chi_square - base.degrees_of_freedom
-    return several_minima(system) and base.promised < ROUGH * excess
+    return system.several_minima and base.promised < ROUGH * excess
 
 
 def _refusal(base: Fit, settings: Settings) -> Diagnosis:
@@ -624,9 +620,7 @@ def _bounds(score: Score) -> str:
     """What the data leave room for, where they show no more than noise does."""
     sizes = zip(score.candidate.quantities, np.abs(score.values), score.sigma, strict=True)
     open_ = [(q, size + TWO_SIDED * sigma) for q, size, sigma in sizes if np.isfinite(size + sigma)]
-    most = ", ".join(
-        f"{q.name.partition('.')[2]} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_
-    )
+    most = ", ".join(f"{q.part} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_)
     return f"; only bounded: {most} (95 %)" if most else ""
 
 

@@ -17,7 +17,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score
 from disctrack.discrepancy.search import CLASS_GAIN, FAINT, Diagnosis, Found, Tried
-from disctrack.discrepancy.system import Candidate, Quantity, System, TrialGivenUp, hurried
+from disctrack.discrepancy.system import Candidate, Quantity, System, TrialGivenUp
 
 MAX_TRIALS = 24  # values of a shape at which the rest is refitted
 ALONG = 5.0  # times the time of a trial, for all that follows from the best start
@@ -63,7 +63,7 @@ def _refined(system: System, diagnosis: Diagnosis, position: int) -> tuple[Diagn
         else:
             sigma = trial.sigma(q.name) if trial is not None else expected
             size = f"sigma {sigma:.2g} {q.unit if q.unit != '1' else ''}".rstrip() if np.isfinite(sigma) else "unseen"
-            name = q.name.partition(".")[2]
+            name = q.part
             notes.append(
                 f"{found.candidate.name}: this recording does not determine {name} ({size}); {q.null:g} is assumed"
             )
@@ -225,10 +225,10 @@ def _with_free_shape(
     fits = []
     for shape in starts or _grid(candidate):
         with suppress(TrialGivenUp):
-            fits.append(_started(hurried(system), base, candidate, shape))
+            fits.append(_started(system.hurried(), base, candidate, shape))
     if not fits:
         return None
-    system = hurried(system, ALONG)
+    system = system.hurried(ALONG)
     first = min(fits, key=lambda f: f.cost)
     excess = [f.chi_square / diagnosis.noise - f.degrees_of_freedom for f in (base, first)]
     # beside others little may exceed the noise: there it is to describe more than what it stands in for

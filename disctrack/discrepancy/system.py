@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -77,20 +76,18 @@ class Candidate:
         return tuple(q.name for q in self.quantities)
 
 
-class System(Protocol):
-    """Data, model, and the effects it may lack. Samples are rows in time; a row has one or more whitened numbers."""
+class System:
+    """Data, model, and the effects it may lack. Samples are rows in time; a row has one or more whitened numbers.
 
-    @property
-    def time(self) -> Array:
-        """(n,) instant of each sample [s], not decreasing."""
+    A system of one's own sets the first four and says how it predicts; the rest it changes where it knows better.
+    """
 
-    @property
-    def base(self) -> tuple[Quantity, ...]:
-        """Quantities that every fit moves: initial conditions, declared laws, nuisances with priors."""
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Effects that the model may lack."""
+    time: Array  # (n,) instant of each sample [s], not decreasing
+    weights: Array  # (n,) how many numbers of each row are data
+    base: tuple[Quantity, ...]  # that every fit moves: initial conditions, declared laws, nuisances with priors
+    candidates: tuple[Candidate, ...]  # effects that the model may lack
+    several_minima: bool = False  # may fits of the same quantities end in different minima?
+    blocks: Sequence[slice] = ()  # rows that may have quantities of their own (`discrepancy.own`)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, w), data minus prediction, zeros for missing data; its model's derivative (n, w, k).
@@ -98,10 +95,7 @@ class System(Protocol):
         The derivative is that of the prediction: the residual after a step d is residual - derivative @ d. Not finite
         where there is no prediction.
         """
-
-    @property
-    def weights(self) -> Array:
-        """(n,) how many numbers of each row are data."""
+        raise NotImplementedError
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """Values from which refits of a candidate with a threshold begin, given a fit without it.
@@ -109,6 +103,29 @@ class System(Protocol):
         Of any other: of its shape, where the system knows where to look; none, where the shape's range is tried.
         least : gain to first order, below which a shape that has to be looked for is worth no refit
         """
+        return ()
+
+    def hurried(self, share: float = 1.0) -> System:
+        """The system as one trial among many sees it: raises TrialGivenUp where following it takes too long.
+
+        share : of the time that a whole fit may take
+        """
+        return self
+
+    def beginnings(self) -> Sequence[System]:
+        """Parts of the system from its first sample on, shorter ones first."""
+        return ()
+
+    def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
+        """Do some of these effects undo each other, or what the model has?
+
+        values, before : as fitted with and without them
+        """
+        return False
+
+    def over(self, system: System) -> System:
+        """Another system, seen as this one sees the one that it wraps."""
+        return system
 
 
 class GivenUp(Exception):
@@ -119,92 +136,39 @@ class TrialGivenUp(GivenUp):
     """One of many hypotheses would take too long: the others are still to be tried."""
 
 
-def hurried(system: System, share: float = 1.0) -> System:
-    """The system as one trial among many sees it: raises TrialGivenUp where following it takes too long.
-
-    share : of the time that a whole fit may take
-    """
-    of = getattr(system, "hurried", None)
-    return system if of is None else of(share)
-
-
-def several_minima(system: System) -> bool:
-    """May fits of the same quantities end in different minima? Not where the system does not say so."""
-    return bool(getattr(system, "several_minima", False))
-
-
-def beginnings(system: System) -> Sequence[System]:
-    """Parts of the system from its first sample on, shorter ones first; none where it does not give any."""
-    return tuple(getattr(system, "beginnings", ()))
-
-
-def blocks(system: System) -> Sequence[slice]:
-    """Rows that may have quantities of their own (`engine.own`); none where the system does not say so."""
-    return tuple(getattr(system, "blocks", ()))
-
-
-def undo_each_other(system: System, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
-    """Do some of these effects undo each other, or what the model has? Not where the system does not say so.
-
-    values, before : as fitted with and without them
-    """
-    of = getattr(system, "undo_each_other", None)
-    return of is not None and bool(of(candidates, values, before))
-
-
-class Wrapped:
+class Wrapped(System):
     """A system as another sees it: all as it is, but for what a subclass changes."""
 
     def __init__(self, system: System) -> None:
+        self._see(system)
+
+    def _see(self, system: System) -> None:
         self._system = system
+        self.time, self.weights, self.base, self.candidates = (
+            system.time,
+            system.weights,
+            system.base,
+            system.candidates,
+        )
+        self.several_minima, self.blocks = system.several_minima, system.blocks
 
     def over(self, system: System) -> Wrapped:
         """The same view of another system."""
         view = copy(self)
-        view._system = system
+        view._see(system)
         return view
-
-    @property
-    def time(self) -> Array:
-        """(n,) instants of all samples [s]."""
-        return self._system.time
-
-    @property
-    def base(self) -> tuple[Quantity, ...]:
-        """As the system's."""
-        return self._system.base
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """As the system's."""
-        return self._system.candidates
-
-    @property
-    def weights(self) -> Array:
-        """As the system's."""
-        return self._system.weights
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """As the system's."""
         return self._system.starts(candidate, values, least)
 
-    @property
-    def several_minima(self) -> bool:
-        """As the system's: may fits of the same quantities end in different minima?"""
-        return several_minima(self._system)
-
-    @property
-    def blocks(self) -> Sequence[slice]:
-        """As the system's: rows that may have quantities of their own."""
-        return blocks(self._system)
-
     def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
         """As the system's."""
-        return undo_each_other(self._system, candidates, values, before)
+        return self._system.undo_each_other(candidates, values, before)
 
-    def hurried(self, share: float) -> Wrapped:
+    def hurried(self, share: float = 1.0) -> Wrapped:
         """As the system's."""
-        return self.over(hurried(self._system, share))
+        return self.over(self._system.hurried(share))
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the system's."""
@@ -216,14 +180,14 @@ class Subset(Wrapped):
 
     def __init__(self, system: System, rows: Mask) -> None:
         """Rows (n,) True where the sample belongs to the subset."""
-        super().__init__(system)
         self._rows = rows
-        self.whole, self.key = system, rows.tobytes()
+        super().__init__(system)
+        self.key = rows.tobytes()
 
-    @property
-    def weights(self) -> Array:
-        """(n,) zero outside the subset."""
-        return np.where(self._rows, super().weights, 0)
+    def _see(self, system: System) -> None:
+        super()._see(system)
+        self.whole = system
+        self.weights = np.where(self._rows, system.weights, 0)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the whole system's, zeros outside the subset, even where there is no prediction."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.noise_with_memory import SampleStretch, SmoothNoise, estimate
-from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.discrepancy.system import System, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies
 from disctrack.examples.cube_effects import CANDIDATES, GRAVITY, columns, resting_columns
@@ -36,11 +36,11 @@ class _Rows:
     own: Array  # (n, 6, 12) by the flight's own place, velocity, attitude and angular velocity
 
 
-class CubeTosses:
+class CubeTosses(System):
     """Poses in free flight, two rows fewer than samples in each, then heights at rest, one row a toss."""
 
-    base: tuple[Quantity, ...] = ()
-    candidates: tuple[Candidate, ...] = CANDIDATES
+    base = ()
+    candidates = CANDIDATES
 
     def __init__(self, tosses: Sequence[Toss]) -> None:
         """Find the flights, measure their noise, whiten. Raises AnalysisError."""
@@ -65,10 +65,6 @@ class CubeTosses:
         self.weights = np.concatenate([*present, np.sum(np.any(still != 0, axis=-1), axis=1)])
         self.toss = np.concatenate([*toss, np.array([c.number for c in self.cubes], int)])
         self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
-
-    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """No candidate has a threshold."""
-        return ()
 
     def training_rows(self) -> Mask:
         """(n,) False for every third toss."""

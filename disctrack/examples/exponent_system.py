@@ -16,7 +16,7 @@ from calibration.kit.arrays import Array
 from disctrack.analyse.published import SURFACES, published_table
 from disctrack.diagnosis.motion import SLIP, motion_candidates
 from disctrack.disc import MA_2014
-from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import READING, LastStage, Setup
 from disctrack.rolling import CATALOGUE, Model, effects
@@ -113,7 +113,7 @@ def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = N
         quantities = c.quantities if shared else tuple(q for own in c.quantities for q in _per_surface(own, surfaces))
         found.append(replace(c, quantities=quantities))
     for quantity, title, source in _ERRORS_OF_READING:
-        name = quantity.name.partition(".")[0]
+        name = quantity.owner
         found.append(Candidate(name, name, "measurement", title, source, (quantity,)))
         if len(surfaces) > 1:
             each, title = _per_surface(quantity, surfaces), f"{title}, each surface its own"
@@ -121,7 +121,7 @@ def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = N
     return tuple(c for c in found if names is None or c.name in names)
 
 
-class ExponentSystem:
+class ExponentSystem(System):
     """Several series of trials with their model, for the engine."""
 
     def __init__(self, series: Sequence[Series], candidates: Sequence[str] | None = None) -> None:
@@ -141,12 +141,7 @@ class ExponentSystem:
         self.owner, self.trial, self.number = (np.array(a)[order] for a in (owner, trial, number))
         self.time = np.cumsum(np.concatenate([[0], (np.diff(self.trial) != 0) | (np.diff(self.owner) != 0)])) * 1.0
         self.weights = np.ones(len(self.time))
-        self._whiten = [np.linalg.inv(np.linalg.cholesky(s.covariance)) for s in self.series]
-
-    @property
-    def base(self) -> tuple[Quantity, ...]:
-        """The paper's k_m and the spin, per surface."""
-        return tuple(
+        self.base = tuple(
             q
             for s in self.series
             for q in (
@@ -154,6 +149,7 @@ class ExponentSystem:
                 Quantity(at(SPIN, s.setup.surface), "rad/s", 0.01, SPIN_AT_REST, prior_sigma=SPIN_SIGMA),
             )
         )
+        self._whiten = [np.linalg.inv(np.linalg.cholesky(s.covariance)) for s in self.series]
 
     @property
     def start(self) -> dict[str, float]:

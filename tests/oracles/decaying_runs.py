@@ -9,7 +9,7 @@ import numpy as np
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.reduction import Reduction
 from disctrack.discrepancy.joint.sharing import Member
-from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.discrepancy.system import Candidate, Quantity, System
 
 TIME = np.linspace(0.0, 3.0, 200)
 SIGMA = 0.01
@@ -20,7 +20,7 @@ def one(name, belongs_to, **more):
     return (Quantity(name, "1", 0.01, belongs_to=belongs_to, typical=0.1, **more),)
 
 
-class Decay:
+class Decay(System):
     def __init__(self, observed, density=1.0):
         self.root_density = density**0.5
         self.time, self.observed, self.weights = TIME, observed, np.ones(len(TIME))

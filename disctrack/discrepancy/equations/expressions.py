@@ -1,12 +1,15 @@
 """Formulas as text or SymPy expressions, with names checked, and made smooth where they jump."""
 
+import ast
 import difflib
 import keyword
+import math
+import operator
 from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from typing import Any, TypeAlias
 
 import sympy
-from sympy.parsing.sympy_parser import parse_expr
 
 from disctrack.errors import AnalysisError
 
@@ -17,6 +20,12 @@ FUNCTIONS = (
     "sign", "Abs", "Min", "Max", "Piecewise", "Heaviside", "pi",
 )  # fmt: skip
 _KNOWN = {name: getattr(sympy, name) for name in FUNCTIONS} | {"abs": sympy.Abs}
+MOST_PARTS = 4000  # of a formula as text: names, numbers and signs
+_OPERATIONS: Mapping[type, Any] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.Pow: operator.pow, ast.USub: operator.neg, ast.UAdd: operator.pos, ast.BitAnd: sympy.And, ast.BitOr: sympy.Or,
+    ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge, ast.Eq: sympy.Eq, ast.NotEq: sympy.Ne,
+}  # fmt: skip
 
 
 def checked_name(name: str, what: str) -> str:
@@ -32,15 +41,17 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
     """The formula in these symbols. Raises AnalysisError with `what` where it cannot be read or knows another name."""
     if isinstance(formula, str):
         try:
-            found = parse_expr(formula, local_dict={**_KNOWN, **symbols}, global_dict=_globals())
-        except Exception as error:
+            found = sympy.sympify(_Reader(symbols).read(formula))
+        except NameError as error:
             raise AnalysisError(
-                f"{what}: cannot read {formula!r} ({error}). Write it as in '-k*x - c*v**2'."
+                f"{what}: {unknown_name(str(error.name), [*symbols, *_KNOWN])} The formula is {formula}."
             ) from error
-        found = sympy.sympify(found)
+        except Exception as error:
+            shown = formula if len(formula) < 200 else f"{formula[:200]} ..."
+            raise AnalysisError(f"{what}: cannot read {shown!r} ({error}). Write it as in '-k*x - c*v**2'.") from error
     else:
         # a user's own symbols are meant by their names
-        found = sympy.sympify(formula)
+        found = sympy.sympify(formula, strict=True)
         found = found.xreplace({s: symbols[s.name] for s in found.free_symbols if s.name in symbols})
     unknown = sorted(s.name for s in found.free_symbols - set(symbols.values()))
     unknown += sorted(str(f.func) for f in found.atoms(sympy.core.function.AppliedUndef))
@@ -57,14 +68,72 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
     return f"{name!r} is not known; {hint}"
 
 
-def _globals() -> dict[str, Any]:
-    names: dict[str, Any] = {}
-    exec("from sympy import Symbol, Integer, Float, Rational, Function", names)
-    return names
+class _Reader:
+    """From text to an expression by the kinds of syntax that formulas need; nothing else is ever evaluated."""
+
+    def __init__(self, symbols: Mapping[str, sympy.Symbol]) -> None:
+        self._names = {**_KNOWN, **symbols}
+
+    def read(self, text: str) -> Any:
+        """Raises NameError, SyntaxError, TypeError, ValueError, RecursionError."""
+        tree = ast.parse(text.strip(), mode="eval")
+        parts = sum(isinstance(node, ast.expr) for node in ast.walk(tree))
+        if parts > MOST_PARTS:
+            raise ValueError(f"it has {parts} parts, and {MOST_PARTS} are the most")
+        return self._value(tree.body)
+
+    def _value(self, node: ast.expr) -> Any:
+        match node:
+            case ast.Constant(value=bool() as value):
+                return sympy.true if value else sympy.false
+            case ast.Constant(value=int() | float() as value):
+                return sympy.sympify(value)
+            case ast.Name(id=name):
+                if name not in self._names:
+                    raise NameError(name=name)
+                return self._names[name]
+            case ast.BinOp(op=ast.Add() | ast.Sub()):
+                return self._sum(node)
+            case ast.BinOp(left=left, op=ast.Pow(), right=right):
+                return _power(self._value(left), self._value(right))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATIONS:
+                return _OPERATIONS[type(op)](self._value(left), self._value(right))
+            case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATIONS:
+                return _OPERATIONS[type(op)](self._value(operand))
+            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATIONS:
+                return _OPERATIONS[type(op)](self._value(left), self._value(right))
+            case ast.Tuple(elts=elements):
+                return tuple(self._value(e) for e in elements)
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+                if name not in self._names:
+                    raise NameError(name=name)
+                return self._names[name](*(self._value(a) for a in arguments))
+        raise SyntaxError(f"{ast.unparse(node)!r} is nothing that a formula may hold")
+
+    def _sum(self, node: ast.expr) -> Any:
+        """Of terms on one level, however many."""
+        terms = []
+        while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
+            right = self._value(node.right)
+            terms.append(right if isinstance(node.op, ast.Add) else -right)
+            node = node.left
+        return sympy.Add(self._value(node), *reversed(terms))
 
 
-def smooth(expression: sympy.Expr, widths: dict[sympy.Expr, sympy.Symbol]) -> sympy.Expr:
+def _power(base: Any, exponent: Any) -> Any:
+    if base.is_number and exponent.is_number and base != 0:
+        size = float(exponent) * math.log2(abs(complex(base)))
+        if abs(size) > 1000:
+            raise ValueError(f"{base}**{exponent} is beyond all numbers")
+    return base**exponent
+
+
+def smooth(
+    expression: sympy.Expr, widths: dict[sympy.Expr, sympy.Symbol], moving: AbstractSet[sympy.Symbol] = frozenset()
+) -> sympy.Expr:
     """The expression with jumps made steep but smooth: sign(a) -> tanh(a / w), a step likewise.
+
+    A root of a sum of squares that all move has no slope where they vanish at once: sqrt(a) -> sqrt(a + w^2).
 
     A motion that crosses a jump has sensitivities that jump too; with a width they are those of the equations as they
     are solved. `widths` gets a symbol for every argument that has none yet.
@@ -74,10 +143,19 @@ def smooth(expression: sympy.Expr, widths: dict[sympy.Expr, sympy.Symbol]) -> sy
         return widths.setdefault(argument, sympy.Symbol(f"width_{len(widths)}", positive=True))
 
     out = expression.replace(sympy.sign, lambda a: sympy.tanh(a / width(a)))
-    return out.replace(
+    out = out.replace(
         lambda e: isinstance(e, sympy.Heaviside),
         lambda e: (1 + sympy.tanh(e.args[0] / width(e.args[0]))) / 2,
     )
+    return out.replace(
+        lambda e: e.is_Pow and e.base.is_Add and e.exp < 1 and (2 * e.exp).is_odd and _vanishes(e.base, moving),
+        lambda e: (e.base + width(sympy.sqrt(e.base)) ** 2) ** e.exp,
+    )
+
+
+def _vanishes(squares: sympy.Expr, moving: AbstractSet[sympy.Symbol]) -> bool:
+    """Is it a sum of squares of which none need stay?"""
+    return bool(squares.is_nonnegative) and all(term.free_symbols & moving for term in squares.args)
 
 
 def source_of(name: str, inputs: Sequence[sympy.Symbol | tuple[str, Sequence[sympy.Symbol]]],

@@ -198,11 +198,12 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
             _known(name, late, f"{here}, lag")
             late[name] -= parsed(f, {**without_motion, **mine}, f"{here}, lag of {name}")
     widths: dict[sympy.Expr, sympy.Symbol] = {}
-    rates = [smooth(e, widths) for e in rates]
+    moving = set(states.values())
+    rates = [smooth(e, widths, moving) for e in rates]
     rates = _solved(equations, rates, everything)
     return Formulas(
         equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(driving),
-        tuple(driving_rates), tuple(rates), tuple(smooth(e, widths) for e in observed.values()),
+        tuple(driving_rates), tuple(rates), tuple(smooth(e, widths, moving) for e in observed.values()),
         tuple(late.values()), widths, along, tuple(late_inputs),
     )  # fmt: skip
 

@@ -173,7 +173,7 @@ class _Competition:
         self._judged = judged
         self.price = price_of_a_number(system.weights)
         base = diagnosis.before
-        self.declared = {q.name: q.null for q in system.base if not q.name.startswith("state.")}
+        self.declared = {q.name: q.null for q in system.base if not q.is_initial}
         self.begin = dict(base.values)
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
         self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
@@ -182,8 +182,7 @@ class _Competition:
 
     def view(self, system: EquationSystem) -> System:
         """With the noise as judged, where the samples are those that were judged."""
-        of = getattr(self._judged, "over", None)
-        return system if of is None else of(system)
+        return system if self._judged is None else self._judged.over(system)
 
     def arrived(self, fitted: Fit) -> bool:
         """Could further steps gain no more than nothing? Along what only the prior holds, they go on for ever."""
@@ -234,7 +233,7 @@ class _Competition:
         values = self.begin
         if self.far:
             values = self.begin | self.declared | guessed(first)[0]
-            tied = tuple(q if q.name.startswith("state.") else _tied(q) for q in first.base)
+            tied = tuple(q if q.is_initial else _tied(q) for q in first.base)
             values = fit(first, tied, values, ITERATIONS).values
         scans = []
         for law in self.laws:
@@ -492,7 +491,7 @@ def _falls(own: Sequence[Quantity], smooth: float, power: float) -> Array:
 
 def _of_finer_waves(own: Sequence[Quantity]) -> float:
     """Variance of the law by waves shorter than those that are fitted, as the prior of these goes on."""
-    priors = {q.name.partition(".")[2]: q.typical for q in own}
+    priors = {q.part: q.typical for q in own}
     first, last = priors["a0"], priors[f"a{HARMONICS}"]
     finer = np.arange(HARMONICS + 1, FINEST)
     # the smoothness that was chosen is that whose last amplitude is this one
@@ -509,7 +508,7 @@ def _columns(own: Sequence[Quantity], law: Along, x: Array, values: Values) -> A
     whole = {"jump": np.sign(x), "slope": x / values[f"{NAME}_reach"]}
     found = []
     for q in own:
-        name = q.name.partition(".")[2]
+        name = q.part
         found.append(whole[name] if name in whole else np.cos(int(name[1:]) * np.pi * place))
     return np.column_stack(found)
 

@@ -180,7 +180,7 @@ def _asked(
             notes.append(remark)
     law = _law(system, diagnosis, channels, judged)
     if law is not None and law.system is not None and law.is_named(diagnosis):
-        judged = law.system if judged is system else getattr(judged, "over", lambda s: s)(law.system)
+        judged = law.system if judged is system else judged.over(law.system)
         system, diagnosis = law.system, with_law(diagnosis, law)
         if law.at_noise:
             notes = [n for n in notes if not n.startswith(ERROR_THAT_LASTS)]
@@ -395,8 +395,8 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tupl
     """Parameters that the data cannot part from others, to be held as declared; and how to say that."""
     # of many runs with numbers of their own a few tell it
     system = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
-    states = [q for q in system.base if q.name.startswith("state.")]
-    free = [q for q in system.base if not q.name.startswith("state.") and np.isinf(q.prior_sigma)]
+    states = [q for q in system.base if q.is_initial]
+    free = [q for q in system.base if not q.is_initial and np.isinf(q.prior_sigma)]
     own = Own(system, states)
     states = [q for q in states if not q.slot]
     residual, derivative = system.linearise(values, [*own.slots, *(q.name for q in (*states, *free))])

@@ -179,7 +179,7 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
     The first part of a motion may not tell parameters apart that the whole does (a motor that runs up), and a model
     that lacks something then takes them far away.
     """
-    parameters = [q for q in system.base if not q.name.startswith("state.")]
+    parameters = [q for q in system.base if not q.is_initial]
     shift = [abs(found.values.get(q.name, q.null) - q.null) / max(abs(q.null), q.scale) for q in parameters]
     if found.whole and max(shift, default=0.0) < _FAR:
         return found
@@ -188,7 +188,7 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
         q if "." in q.name else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
         for q in parameters
     )
-    states = tuple(q for q in system.base if q.name.startswith("state."))
+    states = tuple(q for q in system.base if q.is_initial)
     enough = LOST if found.followed >= min(turn(s) for s in system.stretches) else LOOSE
     led_to = misfit(system, found.values)
     if not found.whole and max(shift, default=0.0) >= _FAR:  # what led so far off and then lost the motion is no start
@@ -253,9 +253,9 @@ def trusted(
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:
     values, followed, last = dict(values), 0.0, False
-    parameters = [q for q in system.base if not q.name.startswith("state.")]
+    parameters = [q for q in system.base if not q.is_initial]
     leash = {q.name: _LEASH * max(abs(q.null), q.scale) for q in parameters}
-    states = tuple(q for q in system.base if q.name.startswith("state."))
+    states = tuple(q for q in system.base if q.is_initial)
     while not last:
         last = window >= duration
         part = system.with_(stretches=first_part(system.stretches, duration if last else window))

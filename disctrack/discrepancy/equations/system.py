@@ -15,7 +15,7 @@ from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations import _stiff_kernel
 from disctrack.discrepancy.equations.declared import Parameter, Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
@@ -40,7 +40,7 @@ class Prediction:
     derivative: Array  # (n, w, k)
 
 
-class EquationSystem:
+class EquationSystem(System):
     """Samples of all stretches, one after the other, with a row without data between two of them."""
 
     several_minima = True  # what users declare may bend anyhow
@@ -66,6 +66,7 @@ class EquationSystem:
         lengths = [len(s.time) for s in self.stretches]
         first = np.cumsum([0] + [n + 1 for n in lengths])
         self.rows = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
+        self.blocks = self.rows
         n, w = int(first[-1]), len(formulas.channels)
         self.time, self.weights, self.training = np.zeros(n), np.zeros(n), np.zeros(n, bool)
         for rows, s in zip(self.rows, self.stretches, strict=True):
@@ -78,11 +79,6 @@ class EquationSystem:
         self._per = {name: p.per for name, (_, p) in formulas.fitted.items() if p.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
-
-    @property
-    def blocks(self) -> Sequence[slice]:
-        """Rows of every stretch."""
-        return self.rows
 
     def with_(self, **changes: object) -> EquationSystem:
         """The same with other stretches, promoted terms, ..."""
@@ -154,10 +150,6 @@ class EquationSystem:
     def _limits(self) -> dict[str, float]:
         """Where the numbers lie that were tried along the motion: without their term's amount they move nothing."""
         return {n: v for n, v in self.aims.items() if n in self.formulas.along}
-
-    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """No term has a threshold."""
-        return ()
 
     def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
         """Are there terms far larger than all that moves the motion, of which next to nothing is left together?

@@ -8,7 +8,7 @@ import numpy as np
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.joint.reduction import Reduced
 from disctrack.discrepancy.joint.sharing import Sharing
-from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 Request = tuple[int, dict[str, float], tuple[str, ...]]  # recording, its shared values, names
 
@@ -20,7 +20,7 @@ class Reducer(Protocol):
         """What each recording says of its shared quantities."""
 
 
-class JointSystem:
+class JointSystem(System):
     """Recordings that share quantities. A row is a recording's least-squares problem in them, its own ones at best."""
 
     def __init__(self, sharing: Sharing, reducer: Reducer) -> None:
@@ -32,10 +32,6 @@ class JointSystem:
         self.weights: Array = np.array([m.n_data - k for m, k in zip(sharing.members, free, strict=True)], float)
         self.base: tuple[Quantity, ...] = tuple(sharing.base.values())
         self.candidates: tuple[Candidate, ...] = sharing.candidates
-
-    def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """No candidate has a threshold."""
-        return ()
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Rows (n, w) of the recordings' reduced problems, filled up with zeros, and their derivatives (n, w, k)."""

@@ -9,13 +9,13 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.shape import profiled
-from disctrack.discrepancy.system import Quantity
+from disctrack.discrepancy.system import Quantity, System
 from disctrack.synthetic.description import Faults
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
 
 
-class SquareBesidePower:
+class SquareBesidePower(System):
     """y = a t^2 + k t^p with noise; a may not be negative."""
 
     candidates = ()

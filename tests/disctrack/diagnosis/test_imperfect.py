@@ -18,7 +18,7 @@ from disctrack.diagnosis.stretch import at_rest
 from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.memory import inflation, long_run_variance
-from disctrack.discrepancy.system import Quantity
+from disctrack.discrepancy.system import Quantity, System
 from disctrack.synthetic.description import CameraFault, Faults
 from disctrack.validate.points import ORDINARY, Laboratory
 from tests.oracles.measured_disc import measured
@@ -109,7 +109,7 @@ def test_memory_enlarges_the_variance_of_a_sum_as_it_should(rng):
     assert_allclose(long_run_variance(white)[0] / np.mean(white**2), 1.0, rtol=0.15)
 
 
-class Line:
+class Line(System):
     """Rows of 24 numbers that are a multiple of a smooth course, and noise."""
 
     candidates, base = (), (Quantity("a", "1", 0.1),)

@@ -8,10 +8,10 @@ from disctrack.discrepancy.chance import chance
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.significance import false_discovery
-from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.discrepancy.system import Candidate, Quantity, System
 
 
-class Waves:
+class Waves(System):
     """A line with noise of variance 1; it may lack waves that overlap, some of one sign only, and pairs of them."""
 
     def __init__(self, data):

@@ -5,10 +5,10 @@ import pytest
 
 from disctrack.discrepancy.correlated import correlated
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.system import Quantity
+from disctrack.discrepancy.system import Quantity, System
 
 
-class TwoNearlyEqualSlopes:
+class TwoNearlyEqualSlopes(System):
     """y = a t + b t^1.1 + c with noise of variance 1."""
 
     candidates = ()

@@ -15,13 +15,13 @@ from disctrack.discrepancy.fit import compress, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
 from disctrack.discrepancy.search import Settings, _Search, diagnose
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp
 from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 
 SIGMA = 0.01
 
 
-class Oscillator:
+class Oscillator(System):
     """x'' = -w0^2 x - 2 d x' + f: started at (a, b); what it may lack: damping, a drift, a hum at 3 Hz, its twin."""
 
     def __init__(self, observed, time):
@@ -207,7 +207,7 @@ def test_ljung_box_accepts_noise_and_refuses_a_slow_wave(rng):
     assert ljung_box(rng.standard_normal((400, 300))).mean() == pytest.approx(20, abs=1.5)
 
 
-class Line:
+class Line(System):
     """Noise, or a line through the origin: a model that declares no quantity of its own."""
 
     def __init__(self, observed, time):
@@ -315,7 +315,7 @@ class Impatient(Oscillator):
 
     in_a_hurry = gives_up = False
 
-    def hurried(self, share):
+    def hurried(self, share=1.0):
         one = copy(self)
         one.in_a_hurry = True
         return one
@@ -356,7 +356,7 @@ def test_a_fit_that_leaves_much_is_found_to_a_share_of_its_own_scatter(rng):
     assert np.abs(off / scatter).max() < np.sqrt(1e-3)
 
 
-class Kinked:
+class Kinked(System):
     """Promises that a step of 1 removes all, but a step beyond 0.5 makes it worse, and a shorter one gains nearly 0."""
 
     time, weights, candidates = np.zeros(1), np.ones(1), ()
