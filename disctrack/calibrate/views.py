@@ -12,6 +12,7 @@ from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.brief import Outline
 from disctrack.errors import RecordingError
+from disctrack.files.inputs import MOST_IMAGE, read_regular
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording
 from disctrack.recording.readers import open_frames
@@ -185,6 +186,6 @@ def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArr
 
 def _content(file: Path) -> bytes:
     try:
-        return file.read_bytes()
+        return read_regular(file, MOST_IMAGE)
     except OSError as error:
         raise RecordingError(f"{file}: cannot be read: {error.strerror}. Copy it again.") from error

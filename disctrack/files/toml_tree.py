@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 
 from disctrack.errors import DiscTrackError, SceneError
+from disctrack.files.inputs import MOST_TEXT, read_regular
 
 
 def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
     """The file's tree. Raises `error` with the file, what is wrong with it, and what to do."""
     text = ""
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = read_regular(path, MOST_TEXT).decode("utf-8")
         return tomllib.loads(text)
     except UnicodeDecodeError as reason:
         raise error(f"{path}: byte {reason.start} is not UTF-8 text. Save the file as UTF-8.") from reason

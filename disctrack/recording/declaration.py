@@ -14,7 +14,7 @@ from calibration.judge.tolerances import BoardTolerances
 from calibration.kit.brief import Outline
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
-from disctrack.files.inputs import RECORDING_FILE, keep
+from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml
 
 FILE_NAME = RECORDING_FILE
@@ -45,6 +45,33 @@ KEYS: dict[str, tuple[str, ...]] = {
     "gravity": ("g_m_s2",),
     "air": ("pressure_hPa", "density_kg_m3"),
 }
+
+# What every number may be, both ends included, in the unit that its key names. Wide enough for a coin and for a mill
+# stone, narrow enough that a wrong unit or a slip of the pen is told before it becomes a wrong answer.
+RANGES: dict[str, tuple[float, float]] = {
+    "frame_rate_hz": (0.1, 1e7),
+    "exposure_us": (0, 1e7),
+    "radius_mm": (0.1, 1e4),
+    "thickness_mm": (0.001, 1e4),
+    "mass_g": (0.001, 1e7),
+    "radius_tolerance_mm": (0, 2),
+    "thickness_tolerance_mm": (0, 2),
+    "diameter_mm": (0.001, 1e3),
+    "centres_mm": (-1e4, 1e4),
+    "square_mm": (0.01, 1e4),
+    "marker_mm": (0.01, 1e4),
+    "square_tolerance_mm": (0, 2),
+    "flatness_tolerance_mm": (0, 2),
+    "view": (0, 1e5),
+    "board_thickness_mm": (0, 1e3),
+    "board_thickness_tolerance_mm": (0, 2),
+    "g_m_s2": (0.001, 1e3),
+    "pressure_hPa": (1e-9, 1e5),
+    "density_kg_m3": (1e-9, 1e3),
+}
+MOST_DOTS = 100
+MOST_CELLS = 100  # corners or squares along a side of a target
+MOST_COLUMNS = 10**6  # [px] of an image
 
 # What declares each kind of calibration target.
 TARGET_KEYS: dict[str, tuple[str, ...]] = {
@@ -149,7 +176,7 @@ def read_recording(path: str | Path) -> Recording:
     return Recording(
         folder=file.parent,
         name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,
-        frame_rate=cameras.get("frame_rate_hz", _positive),
+        frame_rate=cameras.number("frame_rate_hz"),
         exposure=_exposure(cameras) if "exposure_us" in cameras else None,
         left=cameras.get("left", _pattern),
         right=cameras.get("right", _pattern),
@@ -158,7 +185,7 @@ def read_recording(path: str | Path) -> Recording:
         table=_table(file, declared, required=rig_file is None),
         rig_file=rig_file,
         board_tolerances=_tolerances(file, declared),
-        gravity=_Section(file, declared, "gravity").get("g_m_s2", _positive),
+        gravity=_Section(file, declared, "gravity").number("g_m_s2"),
         air_density=_air_density(_Section(file, declared, "air")) if "air" in declared else AIR_DENSITY,
         declared=declared,
         sensors=(_sensor(cameras, "left"), _sensor(cameras, "right")),
@@ -171,8 +198,8 @@ def _air_density(air: _Section) -> float:
     if "density_kg_m3" in air and "pressure_hPa" in air:
         raise air.error("has both pressure_hPa and density_kg_m3; expected one of them. Keep the one you measured.")
     if "density_kg_m3" in air:
-        return float(air.get("density_kg_m3", _positive))
-    return AIR_DENSITY * (float(air.get("pressure_hPa", _positive)) / STANDARD_PRESSURE)
+        return float(air.number("density_kg_m3"))
+    return AIR_DENSITY * (float(air.number("pressure_hPa")) / STANDARD_PRESSURE)
 
 
 def _sensor(cameras: _Section, camera: str) -> SensorImages:
@@ -188,6 +215,8 @@ def _recording_file(path: Path) -> Path:
             path = path / FILE_NAME
         elif not path.exists() and path.name != FILE_NAME:
             raise RecordingError(f"{path}: no such folder. Give the folder that holds {FILE_NAME}.")
+        if fault := why_not_regular(path):
+            raise RecordingError(f"{path}: cannot be read: {fault}. Give a recording's folder.")
         if not path.is_file():
             raise RecordingError(f"{path}: not found. A recording is a folder with a {FILE_NAME} beside its images.")
     except (OSError, ValueError) as error:  # a name too long, or with a null character
@@ -254,9 +283,12 @@ class _Section:
             raise RecordingError(f"{self.file}: {', '.join(names)} {said}: every length in mm, mass in g, time in s.")
         try:
             return convert(self.values[key])
-        except (_Unfit, OverflowError) as error:
-            expected = error if isinstance(error, _Unfit) else "a smaller number"
-            raise RecordingError(f"{self.file}: {where} is {_shown(self.values[key])}; expected {expected}.") from error
+        except _Unfit as error:
+            raise RecordingError(f"{self.file}: {where} is {_shown(self.values[key])}; expected {error}.") from error
+
+    def number(self, key: str) -> float:
+        """The number at a key, within its range."""
+        return float(self.get(key, lambda value: _number(value, *RANGES[key])))
 
     def error(self, message: str) -> RecordingError:
         return RecordingError(f"{self.file}: [{self.name}] {message}")
@@ -274,31 +306,15 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _Unfit("a number")
-    if not math.isfinite(value):
-        raise _Unfit("a finite number")
+def _number(value: Any, least: float = -math.inf, most: float = math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+        raise _Unfit(f"a number from {least:g} to {most:g}")
     return float(value)
 
 
-def _positive(value: Any) -> float:
-    number = _number(value)
-    if number <= 0:
-        raise _Unfit("a number above 0")
-    return number
-
-
-def _not_negative(value: Any) -> float:
-    number = _number(value)
-    if number < 0:
-        raise _Unfit("a number of at least 0")
-    return number
-
-
 def _index(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise _Unfit("a whole number of at least 0")
+    if type(value) is not int or not 0 <= value <= RANGES["view"][1]:
+        raise _Unfit(f"a whole number from 0 to {RANGES['view'][1]:g}")
     return value
 
 
@@ -315,8 +331,12 @@ def _pattern(value: Any) -> str:
 
 
 def _part(value: Any) -> tuple[int, int, int, int]:
-    if not isinstance(value, list) or len(value) != 4 or not all(type(n) is int and 0 <= n < 10**6 for n in value):
-        raise _Unfit("[x, y, width, height] in pixels, e.g. [640, 0, 640, 512]")
+    if (
+        not isinstance(value, list)
+        or len(value) != 4
+        or not all(type(n) is int and 0 <= n < MOST_COLUMNS for n in value)
+    ):
+        raise _Unfit(f"[x, y, width, height] in pixels below {MOST_COLUMNS}, e.g. [640, 0, 640, 512]")
     x, y, width, height = value
     if not (width and height):
         raise _Unfit("a width and a height above 0")
@@ -331,8 +351,9 @@ def _table_source(value: Any) -> str:
 
 def _counts_of(what: str) -> Callable[[Any], tuple[int, int]]:
     def convert(value: Any) -> tuple[int, int]:
-        if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int and 1 <= n <= 1000 for n in value):
-            raise _Unfit(f"two whole numbers, {what}, e.g. [9, 6]")
+        whole = isinstance(value, list) and len(value) == 2 and all(type(n) is int for n in value)
+        if not whole or not all(1 <= n <= MOST_CELLS for n in value):
+            raise _Unfit(f"two whole numbers from 1 to {MOST_CELLS}, {what}, e.g. [9, 6]")
         return value[0], value[1]
 
     return convert
@@ -345,19 +366,21 @@ def _target_kind(value: Any) -> str:
 
 
 def _centres(value: Any) -> list[list[float]]:
-    expected = "a list of [x, y] pairs, at least 3 of them, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
-    if not isinstance(value, list) or len(value) < 3:
-        raise _Unfit(expected)
-    if not all(isinstance(centre, list) and len(centre) == 2 for centre in value):
-        raise _Unfit(expected)
+    pairs = isinstance(value, list) and all(isinstance(centre, list) and len(centre) == 2 for centre in value)
     try:
-        return [[_number(x), _number(y)] for x, y in value]
+        if not pairs or not 3 <= len(value) <= MOST_DOTS:
+            raise _Unfit
+        return [[_number(x, *RANGES["centres_mm"]) for x in centre] for centre in value]
     except _Unfit as error:
-        raise _Unfit(expected) from error
+        least, most = RANGES["centres_mm"]
+        raise _Unfit(
+            f"a list of [x, y] pairs, at least 3 and at most {MOST_DOTS} of them, each number from {least:g} to "
+            f"{most:g}, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
+        ) from error
 
 
 def _exposure(cameras: _Section) -> float:
-    exposure, interval = cameras.get("exposure_us", _not_negative) / 1e6, 1 / cameras.get("frame_rate_hz", _positive)
+    exposure, interval = cameras.number("exposure_us") / 1e6, 1 / cameras.number("frame_rate_hz")
     if exposure > 1.001 * interval:
         raise cameras.error(
             f"exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 * interval:g} us at frame_rate_hz. "
@@ -367,8 +390,8 @@ def _exposure(cameras: _Section) -> float:
 
 
 def _disc(disc: _Section, markers: _Section) -> Disc:
-    radius_mm = disc.get("radius_mm", _positive)
-    diameter_mm = markers.get("diameter_mm", _positive)
+    radius_mm = disc.number("radius_mm")
+    diameter_mm = markers.number("diameter_mm")
     centres_mm = markers.get("centres_mm", _centres)
     for number, (x, y) in enumerate(centres_mm):
         if math.hypot(x, y) + diameter_mm / 2 > radius_mm:
@@ -382,10 +405,8 @@ def _disc(disc: _Section, markers: _Section) -> Disc:
                     f"centres_mm: dots {other} and {number} overlap: {math.hypot(x - u, y - v):g} mm apart with "
                     f"diameter {diameter_mm:g}. Give each dot once."
                 )
-    sizes = radius_mm, disc.get("thickness_mm", _positive), disc.get("mass_g", _positive)
-    tolerances = {
-        key: disc.get(key, _not_negative) for key in ("radius_tolerance_mm", "thickness_tolerance_mm") if key in disc
-    }
+    sizes = radius_mm, disc.number("thickness_mm"), disc.number("mass_g")
+    tolerances = {key: disc.number(key) for key in ("radius_tolerance_mm", "thickness_tolerance_mm") if key in disc}
     return disc_from_mm(*sizes, centres_mm, diameter_mm, **tolerances)
 
 
@@ -409,9 +430,9 @@ def _target(section: _Section, kind: str) -> Target:
     try:
         if kind == "chessboard":
             corners = section.get("inner_corners", _counts_of("inner corners along the long and the short side"))
-            return Board(corners, section.get("square_mm", _positive) * 1e-3)
+            return Board(corners, section.number("square_mm") * 1e-3)
         squares = section.get("squares", _counts_of("columns and rows of squares, dark and light"))
-        square, marker = (section.get(key, _positive) * 1e-3 for key in ("square_mm", "marker_mm"))
+        square, marker = (section.number(key) * 1e-3 for key in ("square_mm", "marker_mm"))
         return CharucoBoard(squares, square, marker, section.get("dictionary", _text))
     except CalibrationError as error:
         raise section.error(str(error)) from error
@@ -422,13 +443,11 @@ def _tolerances(file: Path, declared: Mapping[str, Any]) -> BoardTolerances:
     given: dict[str, float] = {}
     calibration = _Section(file, declared, "calibration")
     if "square_tolerance_mm" in calibration and "square_mm" in calibration:
-        given["square"] = calibration.get("square_tolerance_mm", _not_negative) / calibration.get(
-            "square_mm", _positive
-        )
+        given["square"] = calibration.number("square_tolerance_mm") / calibration.number("square_mm")
     if "flatness_tolerance_mm" in calibration:
-        given["flatness"] = calibration.get("flatness_tolerance_mm", _not_negative) * 1e-3
+        given["flatness"] = calibration.number("flatness_tolerance_mm") * 1e-3
     if "board_thickness_tolerance_mm" in declared.get("table", {}):
-        given["thickness"] = _Section(file, declared, "table").get("board_thickness_tolerance_mm", _not_negative) * 1e-3
+        given["thickness"] = _Section(file, declared, "table").number("board_thickness_tolerance_mm") * 1e-3
     return BoardTolerances(**given)
 
 
@@ -437,4 +456,4 @@ def _table(file: Path, declared: Mapping[str, Any], required: bool) -> TableView
         return None
     table = _Section(file, declared, "table")
     source = table.get("from", _table_source) if "from" in table else "both"
-    return TableView(table.get("view", _index), table.get("board_thickness_mm", _not_negative) * 1e-3, source)
+    return TableView(table.get("view", _index), table.number("board_thickness_mm") * 1e-3, source)

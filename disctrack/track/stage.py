@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, TrackingError
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
 from disctrack.recording.declaration import Recording
@@ -159,18 +159,22 @@ def measure(
             not_read.update({(image.frame, image.camera): image for image in block.unreadable})
             yield block
 
-    tracking = track(
-        read_blocks,
-        tracked,
-        rig,
-        recording.disc,
-        rate,
-        gravity=recording.gravity,
-        settings=settings,
-        timestamps=None if stamps is None else stamps[span.start : span.stop],
-        workers=workers,
-        progress=progress,
-    )
+    try:
+        tracking = track(
+            read_blocks,
+            tracked,
+            rig,
+            recording.disc,
+            rate,
+            gravity=recording.gravity,
+            settings=settings,
+            timestamps=None if stamps is None else stamps[span.start : span.stop],
+            workers=workers,
+            progress=progress,
+        )
+    except TrackingError as error:
+        refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
+        raise
     unreadable = [not_read[place] for place in sorted(not_read)]
     seconds = time.perf_counter() - began
     found = findings_of(tracking)
@@ -188,6 +192,16 @@ def measure(
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     return Measurement(trajectory, tuple(unreadable), findings, seconds)
+
+
+def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, error: TrackingError) -> None:
+    """Raise RecordingError where most of n images cannot be read: that is why no disc was found in them."""
+    if 2 * len(lost) > n:
+        first = min(lost, key=lambda image: (image.frame, image.camera))
+        raise RecordingError(
+            f"{recording.folder}: the files cannot be read: {len(lost)} of {n} images, the first: {first.reason} "
+            "Is the disk still there?"
+        ) from error
 
 
 def findings_of(tracking: Tracking) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import keep
+from disctrack.files.inputs import keep, why_not_regular
 from disctrack.recording.readers.base import SUFFIXES
 
 
@@ -22,6 +22,8 @@ def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
             f"{folder / pattern}: no image matched for the {camera} camera. {_what_is_there(pattern, folder)}"
         )
     for file in files:
+        if fault := why_not_regular(file):
+            raise RecordingError(f"{file} ({camera} camera): cannot be read: {fault}. Move it away.")
         keep(file)
     return sorted(files, key=lambda file: natural_key(str(file)))
 

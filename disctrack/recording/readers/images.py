@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
+from disctrack.files.inputs import MOST_IMAGE, read_regular
 from disctrack.recording.readers.base import FrameReader, Frames, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode
 from disctrack.recording.readers.file_numbers import NumberedFiles, check_continuation, number_files
@@ -39,7 +40,7 @@ def open_image_sequence(numbered: NumberedFiles, camera: str) -> ImageSequence:
     def decoded(index: int) -> tuple[NDArray, Image]:
         file = files[index]
         try:
-            stored = decode(file.read_bytes(), str(file))
+            stored = decode(read_regular(file, MOST_IMAGE), str(file))
         except OSError as error:
             raise RecordingError(str(error)) from error
         return stored, as_grey(stored, str(file))
@@ -102,7 +103,7 @@ class ImageSequence(Frames):
         if file is None:
             raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
         try:
-            return file.read_bytes()
+            return read_regular(file, MOST_IMAGE)
         except OSError as error:
             raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy it again.") from error
 

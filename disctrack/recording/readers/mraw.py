@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from disctrack.errors import RecordingError
+from disctrack.files.inputs import MOST_TEXT, read_regular
 from disctrack.recording.readers.camera_frames import (
     PIXELS_PER_GROUP,
     CameraFrames,
@@ -20,8 +21,6 @@ from disctrack.recording.readers.camera_frames import (
 )
 from disctrack.recording.readers.camera_header import CameraHeader
 from disctrack.recording.readers.raw import RawFile, check_frame_size
-
-_MOST_HEADER_BYTES = 16 << 20  # real ones have 5 to 100 kB
 
 # Where the entries that matter lie: name in the .cih, path below <cih> in the .cihx.
 _ENTRIES = {
@@ -137,13 +136,9 @@ _EXPORT = "Export the recording again, or copy its header again."
 
 def _content(file: Path) -> bytes:
     try:
-        with file.open("rb") as stream:
-            content = stream.read(_MOST_HEADER_BYTES + 1)
+        return read_regular(file, MOST_TEXT)
     except OSError as error:
         raise RecordingError(f"{file}: cannot be read: {error.strerror}. Copy it again.") from error
-    if len(content) > _MOST_HEADER_BYTES:
-        raise RecordingError(f"{file}: more than {_MOST_HEADER_BYTES >> 20} MB, too much for a camera's header.")
-    return content
 
 
 def _from_text(content: bytes) -> dict[str, str]:

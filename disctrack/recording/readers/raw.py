@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
+from disctrack.files.inputs import open_regular
 from disctrack.recording.readers.base import Frames
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
@@ -38,7 +39,7 @@ class RawFile:
         self.path = path
         self._lock = threading.Lock()  # for systems without positioned reads
         try:
-            self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+            self._descriptor = open_regular(path)
             weakref.finalize(self, os.close, self._descriptor)
             self.size = os.fstat(self._descriptor).st_size
         except OSError as error:

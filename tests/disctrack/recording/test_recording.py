@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.recording.declaration import KEYS, OPTIONAL, read_recording
+from disctrack.recording.declaration import KEYS, OPTIONAL, RANGES, read_recording
 
 REFERENCE = """
 name = "clip"
@@ -138,10 +138,10 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path, written,
     [
         ("frame_rate_hz = 1000.0", 'frame_rate_hz = "fast"', "a number"),
         ("frame_rate_hz = 1000.0", "frame_rate_hz = true", "a number"),
-        ("frame_rate_hz = 1000.0", "frame_rate_hz = 0", "above 0"),
-        ("frame_rate_hz = 1000.0", "frame_rate_hz = nan", "finite"),
-        ("frame_rate_hz = 1000.0", f"frame_rate_hz = 1{'0' * 400}", "smaller"),
-        ("radius_mm = 37.5", "radius_mm = -37.5", "above 0"),
+        ("frame_rate_hz = 1000.0", "frame_rate_hz = 0", "from 0.1 to 1e+07"),
+        ("frame_rate_hz = 1000.0", "frame_rate_hz = nan", "from 0.1 to 1e+07"),
+        ("frame_rate_hz = 1000.0", f"frame_rate_hz = 1{'0' * 400}", "from 0.1 to 1e+07"),
+        ("radius_mm = 37.5", "radius_mm = -37.5", "[disc] radius_mm is -37.5; expected a number from 0.1 to 10000"),
         ('left = "left/*.png"', "left = 3", "file pattern"),
         ("inner_corners = [9, 6]", "inner_corners = [9]", "two whole numbers"),
         ("inner_corners = [9, 6]", "inner_corners = 9", "two whole numbers"),
@@ -156,6 +156,47 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path, written,
 )
 def test_a_wrong_value_is_shown_with_what_was_expected(tmp_path, written, found, expected):
     assert expected in message(tmp_path, REFERENCE.replace(written, found, 1))
+
+
+NUMBERS = [(key, *between) for key, between in RANGES.items() if key != "centres_mm"]
+
+ELSEWHERE = {  # keys that the reference does not hold: section, and what must stand there besides
+    "exposure_us": ("cameras", ""), "radius_tolerance_mm": ("disc", ""), "thickness_tolerance_mm": ("disc", ""),
+    "square_tolerance_mm": ("calibration", ""), "flatness_tolerance_mm": ("calibration", ""),
+    "board_thickness_tolerance_mm": ("table", ""), "pressure_hPa": ("air", ""), "density_kg_m3": ("air", ""),
+    "marker_mm": ("calibration", 'target = "charuco"\nsquares = [9, 6]\ndictionary = "4X4_50"\n'),
+}  # fmt: skip
+
+
+def declared_as(key, value):
+    if key not in ELSEWHERE:
+        return re.sub(rf"(?m)^{key} *=.*$", f"{key} = {value}", REFERENCE)
+    section, besides = ELSEWHERE[key]
+    text = REFERENCE + "\n[air]\n"
+    if besides:
+        text = re.sub("(?m)^inner_corners.*$", "", text)
+    return text.replace(f"[{section}]\n", f"[{section}]\n{besides}{key} = {value}\n")
+
+
+@pytest.mark.parametrize(("key", "least", "most"), NUMBERS)
+def test_every_number_has_a_range_and_the_message_tells_it(tmp_path, key, least, most):
+    wrong = [repr(2 * most), repr(least - 1), "nan", "inf", "true", '"1"'] + (["1.5"] if key == "view" else [])
+    for value in wrong:
+        found = message(tmp_path, declared_as(key, value))
+        assert f"{key} is {value.capitalize() if value == 'true' else value.replace(chr(34), chr(39))}" in found
+        assert f"from {least:g} to {most:g}" in found
+
+
+def test_every_number_that_is_declared_has_a_range():
+    assert set(RANGES) <= {key for keys in KEYS.values() for key in keys}
+    units = ("_mm", "_g", "_hz", "_us", "_s2", "_hPa", "_m3")
+    assert {k for keys in KEYS.values() for k in keys if k.endswith(units)} <= RANGES.keys()
+
+
+def test_dots_are_bounded_in_number(tmp_path):
+    dots = [[float(x), float(y)] for x in range(-15, 16) for y in range(-15, 16)]
+    text = re.sub(r"(?m)^centres_mm *=.*$", f"centres_mm = {dots}", REFERENCE)
+    assert "at most 100" in message(tmp_path, text)
 
 
 def test_a_syntax_error_is_told_with_its_line(tmp_path):

@@ -1,0 +1,108 @@
+"""What may be read as a file, and where nothing may be written."""
+
+import os
+import socket
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from disctrack.errors import OutputError, RecordingError
+from disctrack.files.inputs import open_regular, read_regular, refuse_input
+from disctrack.recording.declaration import read_recording
+from disctrack.recording.readers import open_frames
+from disctrack.recording.readers.raw import RawFile
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes and devices lie elsewhere there")
+
+
+def pipe(path):
+    os.mkfifo(path)
+
+
+def endless(path):
+    path.symlink_to("/dev/zero")
+
+
+def listening(path):
+    with socket.socket(socket.AF_UNIX) as opened:
+        here = os.getcwd()
+        os.chdir(path.parent)  # the name of a socket is short
+        opened.bind(path.name)
+        os.chdir(here)
+
+
+ODD = pytest.mark.parametrize(
+    ("made", "kind"), [(pipe, "a named pipe"), (endless, "a device"), (listening, "a socket"), (os.mkdir, "a folder")]
+)
+
+
+@ODD
+@pytest.mark.parametrize("name", ["0.png", "a.tif", "a.h5", "a.mkv", "a.cine", "a.cihx"])
+def test_what_is_no_regular_file_is_refused_at_once_by_name(tmp_path, made, kind, name):
+    """At once: reading a pipe that nobody writes to would never end."""
+    made(tmp_path / name)
+    with pytest.raises(RecordingError, match=rf"{name}.*cannot be read: it is {kind}, not a regular file"):
+        open_frames(name, tmp_path, "left")
+
+
+@ODD
+def test_a_declaration_is_a_regular_file(tmp_path, made, kind):
+    made(tmp_path / "recording.toml")
+    with pytest.raises(RecordingError, match=f"it is {kind}"):
+        read_recording(tmp_path)
+
+
+def test_a_frame_that_became_a_pipe_is_a_lost_frame(tmp_path):
+    frame = np.full((8, 9), 7, np.uint8)
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), frame)
+    reader = open_frames("*.png", tmp_path, "left")
+    (tmp_path / "1.png").unlink()
+    pipe(tmp_path / "1.png")
+    with pytest.raises(RecordingError, match=r"frame 1.*a named pipe"):
+        reader.read(1)
+    assert np.array_equal(reader.read(2), frame)
+    with pytest.raises(RecordingError, match="a named pipe"):
+        RawFile(tmp_path / "1.png")
+
+
+def test_a_file_is_read_up_to_its_bound(tmp_path):
+    (tmp_path / "a").write_bytes(bytes(1000))
+    assert read_regular(tmp_path / "a", 1000) == bytes(1000)
+    with pytest.raises(OSError, match="more than"):
+        read_regular(tmp_path / "a", 999)
+    os.truncate(tmp_path / "a", 1 << 40)  # a hole: nothing of it is read
+    with pytest.raises(OSError, match="more than"):
+        read_regular(tmp_path / "a", 999)
+    os.close(open_regular(tmp_path / "a"))
+
+
+def recording(folder, frames):
+    folder.mkdir()
+    (folder / "recording.toml").write_text(
+        f'[cameras]\nleft = "{frames}"\nright = "right/*.png"\n'
+        '[calibration]\nleft = "views/left_*.png"\nrig = "../r.h5"\n'
+    )
+    return folder
+
+
+@pytest.mark.parametrize("place", ["left", "right", "views"])
+def test_a_result_among_frames_or_views_is_refused_before_it_is_there(tmp_path, place):
+    folder = recording(tmp_path / "rec", "left/*.png")
+    with pytest.raises(OutputError, match="lies among the frames"):
+        refuse_input(folder / place / "trajectory.h5")
+
+
+@pytest.mark.parametrize("place", [".", "results", "left/results", ".."])
+def test_a_result_beside_or_below_them_is_not(tmp_path, place):
+    refuse_input(recording(tmp_path / "rec", "left/*.png") / place / "trajectory.h5")
+
+
+def test_frames_in_the_recordings_own_folder_leave_it_open_for_other_names(tmp_path):
+    folder = recording(tmp_path / "rec", "left_*.png")
+    refuse_input(folder / "trajectory.h5")
+    (folder / "left_1.png").touch()
+    with pytest.raises(OutputError, match="no output replaces an input"):
+        refuse_input(folder / "left_1.png")
