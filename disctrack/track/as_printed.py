@@ -17,6 +17,8 @@ pattern's from how regular it is: one that is stretched or sheared by little was
 size is moved by its share.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,8 +27,8 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.judge.tolerances import SIZE
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.least_squares import normal_of_rows, scaled_solve
 from disctrack.disc import Disc
-from disctrack.track.least_squares import inner_products
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
 from disctrack.track.side_by_side import side_by_side
 
@@ -87,9 +89,9 @@ def refine_as_built(
 
     prior_sigma = np.concatenate([np.sqrt(np.diag(rig.covariance)), np.full(2 * m, DOT_SIGMA)])
     free = np.concatenate([(prior_sigma[:N_RIG] > 0) & refine_rig, np.full(2 * m, refine_markers)])
-    joint = _fitted_jointly(
-        (markers_px[rows], markers_covariance_px2[rows]), rig, disc, (R[rows], t[rows]), free, prior_sigma
-    )
+    frames = DotsInFrames(rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows])
+    information = _prior_information(rig.covariance, free, m)
+    joint = fit_shared(frames, free, information, ITERATIONS, enough=0.02 * prior_sigma[free], repeats=SYSTEMATIC_PX)
     shift, remaining, current_rig = joint.shift, joint.covariance, rig.perturbed(joint.shift[:N_RIG])
     sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
     if refine_rig:
@@ -110,8 +112,8 @@ def refine_as_built(
         marker_shift=kept,
         marker_shift_sigma=sigma,
         rig_shift_sigmas=in_sigmas,
-        reduced_chi_square_before=joint.before,
-        reduced_chi_square_after=joint.after,
+        reduced_chi_square_before=joint.reduced_chi_square[0],
+        reduced_chi_square_after=joint.reduced_chi_square[-1],
         n_frames=len(rows),
         size=size,
         size_sigma=size_sigma,
@@ -120,51 +122,118 @@ def refine_as_built(
 
 
 @dataclass(frozen=True)
-class _Joint:
-    """Rig and dots fitted together, with a free pose for every frame."""
+class DotsInFrames:
+    """Dots seen in n frames, the poses they had, and what moves all of them beside rig and places of the dots.
 
-    shift: Array  # (30 + 2m,) of RIG_PARAMETERS and of the dots' places
-    covariance: Array  # (30 + 2m, 30 + 2m) of it; nought where it was not free
-    before: float  # reduced chi-square, as declared
-    after: float
+    A `shift` (30 + 2m + j,) of what the frames share: RIG_PARAMETERS, the dots' places in body axes, anything else.
+    """
 
+    rig: StereoRig  # as declared
+    disc: Disc
+    pixels: Array  # (n, 2, m, 2)
+    covariance: Array  # (n, 2, m, 2, 2) [px^2]
+    R: Array  # (n, 3, 3)
+    t: Array  # (n, 3) [m]
+    further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by anything else
 
-def _fitted_jointly(
-    seen: tuple[Array, Array], rig: StereoRig, disc: Disc, poses: tuple[Array, Array], free: Mask, prior_sigma: Array
-) -> _Joint:
-    """Fit what is free (30 + 2m,) to `seen`, dots and their covariances, from `poses`, attitudes and places."""
-    (observed, covariance), (R, t), m = seen, poses, disc.n_markers
-    information = _prior_information(rig.covariance, free, m)
-    shift = np.zeros(N_RIG + 2 * m)
-    current_rig, current_disc = rig, disc
-    before = after = np.nan
-    for iteration in range(ITERATIONS):
+    def shifted(self, shift: Array) -> tuple[Array, StereoRig, Array]:
+        """The pixels (n, 2, m, 2) without what else moved them, the rig, and the dots' places (m, 3) [m]."""
+        places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
+        moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
+        pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
+        return pixels, self.rig.perturbed(shift[:N_RIG]), self.disc.marker_centres_body + moved
+
+    def posed(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
+        """The frames with the poses that go with the shift; where a fit fails, the pose before."""
+        pixels, rig, centres = self.shifted(shift)
         fits = fit_poses(
-            observed, covariance, current_rig, current_disc.marker_centres_body, R, t,
-            reject_outliers=iteration > 0, with_sensitivity=False,
-        )  # fmt: skip
+            pixels, self.covariance, rig, centres, self.R, self.t, reject_outliers=reject, with_sensitivity=False
+        )
         ok = fits.converged
-        R, t = np.where(ok[:, None, None], fits.R_world_body, R), np.where(ok[:, None], fits.t_world_body, t)
-        after = float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1))
-        if iteration == 0:
-            before = after
+        R = np.where(ok[:, None, None], fits.R_world_body, self.R)
+        return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
+
+    def normal(self, shift: Array, used: Mask, free: Mask, workers: int = 1) -> tuple[Array, Array]:
+        """Normal matrix (k, k) and gradient (k,) of the free ones of what is shared, every frame's pose eliminated.
+
+        used : (n, 2, m) dots that count; free : (30 + 2m + j,); workers: threads
+        """
+        size, m = int(free.sum()), self.disc.n_markers
+        observed, rig, centres = self.shifted(shift)
+
+        def of(block: NDArray[np.intp]) -> Array:
+            """Sums (k, k + 1) over some frames: of the normal matrix, and of the gradient."""
+            R, t = self.R[block], self.t[block]
+            pixels, P = marker_pixels(R, t, rig, centres)
+            # d pixel / d point of the body = d pixel / d translation turned into body axes
+            d_body = P[..., :3] @ R[:, None, None]
+            C = np.zeros((len(block), 2, m, 2, len(free)))
+            if free[:N_RIG].any():
+                points = centres @ np.swapaxes(R, 1, 2) + t[:, None]
+                C[..., :N_RIG] = rig.project_with_jacobians(points)[2]
+            for k in range(m):
+                C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
+            if self.further is not None:
+                C[..., N_RIG + 2 * m :] = self.further[block]
+            seen = used[block][..., None]
+            W = np.where(seen[..., None], whitening(np.where(seen[..., None], self.covariance[block], np.eye(2))), 0.0)
+            r = np.where(seen, observed[block] - pixels, 0.0)
+            rows = np.concatenate([P, C[..., free], r[..., None]], axis=-1)
+            whitened = np.empty_like(rows)  # W is a triangle
+            np.multiply(W[..., 0, 0, None], rows[..., 0, :], out=whitened[..., 0, :])
+            np.multiply(W[..., 1, 1, None], rows[..., 1, :], out=whitened[..., 1, :])
+            whitened[..., 1, :] += W[..., 1, 0, None] * rows[..., 0, :]
+            matrix, gradient = normal_of_rows(whitened.reshape(len(block), -1, 6 + size + 1), 6).eliminated()
+            return np.column_stack([matrix, gradient])
+
+        blocks = np.array_split(np.arange(len(self.R)), max(1, len(self.R) // _AT_ONCE))
+        sums = np.sum(side_by_side(of, blocks, workers), axis=0)
+        normal, gradient = sums[:, :-1], sums[:, -1]
+        return 0.5 * (normal + normal.T), gradient
+
+
+@dataclass(frozen=True)
+class SharedFit:
+    """What frames share, fitted with a free pose for every frame."""
+
+    shift: Array  # (30 + 2m + j,) of RIG_PARAMETERS, of the dots' places, of anything else
+    covariance: Array  # of it; nought where it was not free
+    reduced_chi_square: list[float]  # before each step
+    frames: DotsInFrames  # with the poses before the last step
+
+
+def fit_shared(
+    frames: DotsInFrames,
+    free: Mask,
+    information: Array,
+    iterations: int,
+    *,
+    enough: Array | float = 0.0,
+    repeats: float = 0.0,
+    workers: int = 1,
+) -> SharedFit:
+    """Fit what is free (30 + 2m + j,) of what the frames share, by Gauss-Newton; workers: threads.
+
+    information : (k, k) of the prior about nought; enough : a step smaller than this (k,) is the last
+    repeats : [px] errors that are common to all frames: they bound what these tell together
+    """
+    shift, reduced = np.zeros(len(free)), []
+    for iteration in range(iterations):
+        frames, fits = frames.posed(shift, reject=iteration > 0)
+        ok = fits.converged
+        reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
         used = fits.used & ok[:, None, None]
-        normal, gradient = shared_normal_equations(observed, covariance, used, current_rig, current_disc, R, t, free)
-        # common errors: the data's information is bounded by what SYSTEMATIC_PX allows
+        normal, gradient = frames.normal(shift, used, free, workers)
         # dots that scatter more than the image noise alone makes them tell accordingly less, whatever is common to them
-        scale = _information_scale(covariance, used) / scatter_left(fits, normal, gradient)
+        scale = _information_scale(frames.covariance, used, repeats) / _scatter_left(fits, normal, gradient)
         matrix = scale * normal + information
-        rhs = scale * gradient - information @ shift[free]
-        step = np.zeros_like(shift)
-        step[free] = np.linalg.solve(matrix, rhs)
-        shift += step
-        current_rig = rig.perturbed(shift[:N_RIG])
-        current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + _body_shift(shift, m))
-        if np.all(np.abs(step[free]) < 0.02 * prior_sigma[free]) and iteration > 0:
+        step = scaled_solve(matrix, scale * gradient - information @ shift[free])
+        shift[free] += step
+        if np.all(np.abs(step) < enough) and iteration > 0:
             break
-    remaining = np.zeros((len(shift), len(shift)))
-    remaining[np.ix_(free, free)] = np.linalg.inv(matrix)
-    return _Joint(shift, remaining, before, after)
+    covariance = np.zeros((len(shift), len(shift)))
+    covariance[np.ix_(free, free)] = scaled_solve(matrix, np.eye(len(matrix)))
+    return SharedFit(shift, covariance, reduced, frames)
 
 
 def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
@@ -185,7 +254,7 @@ def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]
 
     Dots that lie off their places against each other by s, rms per axis, lie off them as a whole by s / sqrt(m). The
     dot that is off most is left out of s: one that was declared wrongly says nothing of the others. A sum of lengths is
-    less efficient than one of squares, and s has few degrees of freedom (both by simulation, test_shared_faults.py).
+    less efficient than one of squares, and s has few degrees of freedom (both by simulation, test_as_printed.py).
     """
     m = disc.n_markers
     squares = np.sort(np.sum(shift[:, :2] ** 2, axis=1))
@@ -269,10 +338,6 @@ def _prior_information(rig_covariance: Array, free: Mask, m: int) -> Array:
     return information[np.ix_(free, free)]
 
 
-def _body_shift(shift: Array, m: int) -> Array:
-    return np.column_stack([shift[N_RIG:].reshape(m, 2), np.zeros(m)])
-
-
 def declared_places_kept(disc: Disc, shift: Array) -> Array:
     """Displacements (m, 3) that differ from `shift` (m, 2) by a displacement and a turn of the whole pattern only.
 
@@ -308,7 +373,7 @@ def _pattern_motions(disc: Disc) -> Array:
     return motions
 
 
-def scatter_left(fits: PoseFits, normal: Array, gradient: Array) -> float:
+def _scatter_left(fits: PoseFits, normal: Array, gradient: Array) -> float:
     """Reduced chi-square, at least 1, that the best step of what frames share will leave: the dots' own scatter.
 
     Before that step, dots declared in wrong places look like noise a hundred times the pixels', and hold it up.
@@ -318,61 +383,9 @@ def scatter_left(fits: PoseFits, normal: Array, gradient: Array) -> float:
     return max(1.0, float(chi_square - explained) / max(float(freedom), 1.0))
 
 
-def _information_scale(covariance: Array, used: Mask) -> float:
-    """Factor on the data's information: n frames of sigma count at most as (sigma / SYSTEMATIC_PX)^2 frames."""
+def _information_scale(covariance: Array, used: Mask, repeats: float) -> float:
+    """Factor on the data's information: n frames of sigma count at most as (sigma / repeats)^2 frames."""
+    if not repeats:
+        return 1.0
     variance = float(np.median(0.5 * np.trace(covariance, axis1=-2, axis2=-1)[used]))
-    independent = variance / SYSTEMATIC_PX**2
-    n = len(used)
-    return 1.0 / (1.0 + n / max(independent, 1e-9))
-
-
-def shared_normal_equations(
-    observed: Array,
-    covariance: Array,
-    used: Mask,
-    rig: StereoRig,
-    disc: Disc,
-    R: Array,
-    t: Array,
-    free: Mask,
-    further: Array | None = None,
-    workers: int = 1,
-) -> tuple[Array, Array]:
-    """Normal matrix (k, k) and gradient (k,) of what the frames share, every frame's pose eliminated.
-
-    free : (30 + 2m,) which of RIG_PARAMETERS and of the dots' places are asked for; after them `further`,
-    (n, 2, m, 2, j) derivatives of the pixels by anything else, so that k = free.sum() + j; workers: threads
-    """
-    extra = np.zeros((*observed.shape, 0)) if further is None else further
-    size = int(free.sum()) + extra.shape[-1]
-    m = disc.n_markers
-
-    def of(block: NDArray[np.intp]) -> Array:
-        """Sums (k, k + 1) over some frames: of the normal matrix, and of the gradient."""
-        pixels, P = marker_pixels(R[block], t[block], rig, disc.marker_centres_body)
-        # d pixel / d point of the body = d pixel / d translation turned into body axes
-        d_body = P[..., :3] @ R[block][:, None, None]
-        C = np.zeros((len(block), 2, m, 2, N_RIG + 2 * m))
-        if free[:N_RIG].any():
-            points = disc.marker_centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None]
-            C[..., :N_RIG] = rig.project_with_jacobians(points)[2]
-        for k in range(m):
-            C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
-        seen = used[block]
-        W = np.where(seen[..., None, None], whitening(np.where(seen[..., None, None], covariance[block], np.eye(2))), 0)
-        r = np.where(seen[..., None], observed[block] - pixels, 0.0)[..., None]
-        rows = np.concatenate([P, C[..., free], extra[block], r], axis=-1)
-        whitened = np.empty_like(rows)  # W is a triangle
-        np.multiply(W[..., 0, 0, None], rows[..., 0, :], out=whitened[..., 0, :])
-        np.multiply(W[..., 1, 1, None], rows[..., 1, :], out=whitened[..., 1, :])
-        whitened[..., 1, :] += W[..., 1, 0, None] * rows[..., 0, :]
-        whitened = whitened.reshape(len(block), -1, 6 + size + 1)
-        J, S = whitened[..., :6], whitened[..., 6:-1]
-        JtJ = np.swapaxes(J, 1, 2) @ J + 1e-12 * np.eye(6)
-        projected = S - J @ np.linalg.solve(JtJ, np.swapaxes(J, 1, 2) @ S)
-        return inner_products(projected.reshape(-1, size), whitened[..., 6:].reshape(-1, size + 1))
-
-    blocks = np.array_split(np.arange(len(R)), max(1, len(R) // _AT_ONCE))
-    sums = np.sum(side_by_side(of, blocks, workers), axis=0)
-    normal, gradient = sums[:, :-1], sums[:, -1]
-    return 0.5 * (normal + normal.T), gradient
+    return 1.0 / (1.0 + len(used) * repeats**2 / max(variance, 1e-9 * repeats**2))

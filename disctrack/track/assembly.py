@@ -10,6 +10,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from calibration.cameras.causes import causes
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.least_squares import normal_of_rows
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.as_printed import AsBuilt, motions_of_pattern, pattern_place, refine_as_built, share_of_places
@@ -19,7 +20,6 @@ from disctrack.track.exposure import Exposure, exposure_by_smear, exposure_of, s
 from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.gleam import shift_by_gleam
 from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
-from disctrack.track.least_squares import step_to_minimum
 from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
@@ -244,7 +244,9 @@ def _outlying(tables: Tables, rig: StereoRig, disc: Disc, workers: int) -> Mask:
             tables.R[rows],
             tables.t[rows],
         )
-        step = step_to_minimum(r.reshape(len(r), -1), J.reshape(len(J), -1, 6))
+        rows_of_each = np.concatenate([J, r[..., None]], axis=-1).reshape(len(r), -1, 7)
+        # a trace of damping costs a tenth of the pseudo-inverse where data leave a combination open
+        step = normal_of_rows(rows_of_each, 6).step(1e-10)[1]
         residuals[rows] = np.where(known[..., None], r - (J @ step[:, None, None, :, None])[..., 0], np.nan)
 
     side_by_side(fill, range(0, n, FITTED_AT_ONCE), workers)

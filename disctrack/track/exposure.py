@@ -30,7 +30,6 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
-from disctrack.track.least_squares import inner_products
 from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import side_by_side
 from disctrack.track.template_pull import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
@@ -245,7 +244,7 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     for _ in range(4):
         told = use.copy()
         A = design[told] / scale
-        products = inner_products(A, np.column_stack([A, y[told]]))
+        products = A.T @ np.column_stack([A, y[told]])
         inverse = np.linalg.pinv(products[:, :-1], rcond=ALIKE**2, hermitian=True)
         solution = inverse @ products[:, -1]
         residual = y - design / scale @ solution

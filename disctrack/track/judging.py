@@ -11,11 +11,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
-from disctrack.track.least_squares import chance_beyond
 from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import side_by_side
 from disctrack.trajectory import FrameStatus
@@ -30,8 +30,6 @@ COMPANIONS = 1.0  # the same for the other dots of an image in which something i
 HIDDEN_SHARE = 2.0
 CHANCE = 1e-6  # of a frame without fault to be refused by its chi-square: one in a thousand recordings of a thousand
 SUSPECT = 1e-3  # below this chance a frame's covariance follows its residuals
-# What chi-square of six degrees of freedom exceeds by that chance.
-_OF_SIX = {0.5: 5.348120627447118, SUSPECT: 22.457744484825323, CHANCE: 38.25833637720969}
 OUTLYING = 6.0  # times the median reduced chi-square: of 18 degrees of freedom one in 10^14
 GREATEST_BLOW = 3.0  # [m/s] by which the disc's velocity may change between two frames: a fall from half a metre
 MOST_STRUCK = 0.2  # part of a frame's dots that may be struck as outliers: more, and it is open which are right
@@ -186,7 +184,7 @@ def judge_poses(
     usual = np.clip(np.nan_to_num(_usual(reduced[:, None])[0][:, 0], nan=middle), 1.0, OUTLYING * middle)
     with np.errstate(invalid="ignore"):
         square = fits.chi_square / usual
-        chance = np.where(freedom > 0, chance_beyond(square, np.maximum(freedom, 1)), 1.0)
+        chance = np.where(freedom > 0, scipy.special.chdtrc(np.maximum(freedom, 1), square), 1.0)
         factor = np.where(chance < SUSPECT, square / np.maximum(freedom, 1), 1.0)
     total = fits.used.sum(axis=(1, 2)) + struck
     contradicted = (chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))
@@ -202,7 +200,7 @@ def judge_poses(
     inner = np.fmin.reduce([*one_sided, both])
     moved = np.where(np.isnan(both), moved, inner / _quiet(inner, rest))
     with np.errstate(invalid="ignore"):
-        jumped = moved > _OF_SIX[CHANCE] * 2.0  # the smallest of three, in motion that is not quite steady
+        jumped = moved > _of_six(CHANCE) * 2.0  # the smallest of three, in motion that is not quite steady
     status[jumped | torn] = FrameStatus.JUMPED
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
@@ -210,11 +208,16 @@ def judge_poses(
     return Verdicts(status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0))
 
 
+def _of_six(chance: float) -> float:
+    """What chi-square of six degrees of freedom exceeds by that chance."""
+    return float(scipy.special.chdtri(6, chance))
+
+
 def _quiet(moved: Array, rest: Mask) -> Array:
     """(n,) how many times farther than noise makes them, at least once, poses usually are from where others lead."""
     # a disc at rest does not tell how smooth its motion will be
     usual = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
-    return np.fmax(usual / _OF_SIX[0.5], 1.0)
+    return np.fmax(usual / _of_six(0.5), 1.0)
 
 
 def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
@@ -327,7 +330,7 @@ def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
 def _at_rest(fits: PoseFits) -> Mask:
     """(n,) True where the poses before and after differ by no more than their noise: then a repeat shows no fault."""
     with np.errstate(invalid="ignore"):
-        rest = departure(fits, ACROSS) < _OF_SIX[SUSPECT]
+        rest = departure(fits, ACROSS) < _of_six(SUSPECT)
     if len(rest) > 1:
         rest[-1] = rest[-2]
     return np.asarray(rest)

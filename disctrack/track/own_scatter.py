@@ -6,21 +6,15 @@ is what remains after a free refinement of the two cameras, the dots' places and
 one pose per frame: nothing slow or systematic can pass it, and it needs no model of the motion.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
 from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
-from disctrack.track.as_printed import (
-    DOT_SIGMA,
-    declared_places_kept,
-    places_sigma,
-    scatter_left,
-    shared_normal_equations,
-)
-from disctrack.track.pose import PoseFits, fit_poses, whitening
+from disctrack.track.as_printed import DOT_SIGMA, DotsInFrames, declared_places_kept, fit_shared, places_sigma
+from disctrack.track.pose import PoseFits, whitening
 
 _AT_ONCE = 4096  # frames
 MIN_FRAMES = 20
@@ -75,39 +69,18 @@ def without_shared_faults(
     wide = np.concatenate([_wide_rig(), np.full(2 * m, DOT_SIGMA), [_WIDE_DELAY]])
     estimated = np.concatenate([np.diag(rig.covariance)[:_N_RELATIVE] > 0, np.zeros(N_RIG - _N_RELATIVE, bool)])
     free = np.concatenate([estimated, np.ones(2 * m + 1, bool)])
-    shift = np.zeros(len(wide))
-    covariance, Rs, ts = markers_covariance_px2[rows], R[rows], t[rows]
-    for iteration in range(ITERATIONS + 1):
-        now_rig = rig.perturbed(shift[:N_RIG])
-        now_disc = _with_shifted_dots(disc, shift[N_RIG:-1])
-        observed = markers_px[rows] - shift[-1] * by_delay
-        fits = fit_poses(
-            observed, covariance, now_rig, now_disc.marker_centres_body, Rs, ts,
-            reject_outliers=iteration > 0, with_sensitivity=False,
-        )  # fmt: skip
-        ok = fits.converged
-        Rs = np.where(ok[:, None, None], fits.R_world_body, Rs)
-        ts = np.where(ok[:, None], fits.t_world_body, ts)
-        if iteration == ITERATIONS:
-            break
-        used = fits.used & ok[:, None, None]
-        normal, gradient = shared_normal_equations(
-            observed, covariance, used, now_rig, now_disc, Rs, ts, free[:-1], by_delay[..., None], workers
-        )
-        noise = scatter_left(fits, normal, gradient)
-        # in units of the wide sigmas, for the sake of the conditioning
-        unit = wide[free]
-        matrix = normal * np.outer(unit, unit) / noise + np.eye(len(unit))
-        rhs = gradient * unit / noise - shift[free] / unit
-        shift[free] += unit * np.linalg.solve(matrix, rhs)
-    dots = slice(-2 * m - 1, -1)
-    places = np.asarray(np.linalg.inv(matrix)[dots, dots] * np.outer(unit[dots], unit[dots]), float)
+    frames = DotsInFrames(
+        rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows], by_delay[..., None]
+    )
+    joint = fit_shared(frames, free, np.diag(wide[free] ** -2), ITERATIONS, workers=workers)
+    shift, dots = joint.shift, slice(N_RIG, N_RIG + 2 * m)
+    _, fits = joint.frames.posed(shift, reject=True)
     reduced = trimmed_reduced_chi_square(fits)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     return SharedFaults(
         reduced_chi_square=reduced * spent / max(spent - int(free.sum()), 1),
-        marker_shift=declared_places_kept(disc, shift[N_RIG:-1].reshape(m, 2)),
-        marker_shift_sigma=places_sigma(disc, places),
+        marker_shift=declared_places_kept(disc, shift[dots].reshape(m, 2)),
+        marker_shift_sigma=places_sigma(disc, joint.covariance[dots, dots]),
         delay=float(shift[-1]),
         n_frames=len(rows),
     )
@@ -187,9 +160,3 @@ def _wide_rig() -> Array:
     camera = [_WIDE[name] for name in INTRINSIC_PARAMETERS]
     pose = [_WIDE_ROTATION] * 3 + [_WIDE_TRANSLATION] * 3
     return np.array([*camera, *camera, *pose, *pose])
-
-
-def _with_shifted_dots(disc: Disc, shift: Array) -> Disc:
-    moved = disc.marker_centres_body.copy()
-    moved[:, :2] += shift.reshape(-1, 2)
-    return replace(disc, marker_centres_body=moved)

@@ -23,12 +23,12 @@ This is geometry alone. A table that is not level leans in the world and against
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
 from calibration.kit.arrays import Array
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.track.least_squares import chance_beyond
 from disctrack.track.pose import PoseFits
 
 SOURCES = ("both", "board", "disc")
@@ -125,7 +125,7 @@ def table_from_disc(
         told_board,
         applied,
         (height, slope_x, slope_y),
-        float(chance_beyond(difference, 3)),
+        float(scipy.special.chdtrc(3, difference)),
         scatter,
         n,
     )

@@ -18,7 +18,6 @@ PHYSICS = (
     "analyse.contact",
     "analyse.energy",
     "analyse.analysis",
-    "track.least_squares",
     "track.pose",
 )
 PACKAGES = ("calibration", "disctrack")
