@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from calibration.board.target import Board, CharucoBoard, Target
 from calibration.judge.tolerances import BoardTolerances
@@ -18,6 +18,7 @@ from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml
 
 FILE_NAME = RECORDING_FILE
+_T = TypeVar("_T")
 
 # Every key that a recording.toml may hold, in the order of the reference example.
 KEYS: dict[str, tuple[str, ...]] = {
@@ -274,7 +275,7 @@ class _Section:
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
-    def get(self, key: str, convert: Callable[[Any], Any]) -> Any:
+    def get(self, key: str, convert: Callable[[object], _T]) -> _T:
         where = f"[{self.name}] {key}" if self.name else key
         if key not in self.values:
             names = _missing(self.declared)
@@ -298,7 +299,7 @@ class _Unfit(Exception):
     """The text says what was expected instead."""
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # integers of thousands of digits, arrays in arrays in arrays
@@ -306,77 +307,76 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _number(value: Any, least: float = -math.inf, most: float = math.inf) -> float:
+def _number(value: object, least: float = -math.inf, most: float = math.inf) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
         raise _Unfit(f"a number from {least:g} to {most:g}")
     return float(value)
 
 
-def _index(value: Any) -> int:
+def _index(value: object) -> int:
     if type(value) is not int or not 0 <= value <= RANGES["view"][1]:
         raise _Unfit(f"a whole number from 0 to {RANGES['view'][1]:g}")
     return value
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if not isinstance(value, str) or not value.strip():
         raise _Unfit('text in quotes, e.g. "rec_a"')
     return value
 
 
-def _pattern(value: Any) -> str:
+def _pattern(value: object) -> str:
     if not isinstance(value, str) or not value.strip() or "\0" in value:
         raise _Unfit('a file pattern in quotes, e.g. "left/*.png"')
     return value
 
 
-def _part(value: Any) -> tuple[int, int, int, int]:
-    if (
-        not isinstance(value, list)
-        or len(value) != 4
-        or not all(type(n) is int and 0 <= n < MOST_COLUMNS for n in value)
-    ):
-        raise _Unfit(f"[x, y, width, height] in pixels below {MOST_COLUMNS}, e.g. [640, 0, 640, 512]")
-    x, y, width, height = value
+def _whole_numbers(value: object, n: int, least: int, most: int) -> list[int]:
+    """The value as a list of n whole numbers in a range; an empty list where it is anything else."""
+    fits = isinstance(value, list) and len(value) == n and all(type(x) is int and least <= x <= most for x in value)
+    return list(value) if fits and isinstance(value, list) else []
+
+
+def _part(value: object) -> tuple[int, int, int, int]:
+    x, y, width, height = _whole_numbers(value, 4, 0, MOST_COLUMNS) or [0, 0, 0, 0]
     if not (width and height):
-        raise _Unfit("a width and a height above 0")
+        raise _Unfit(f"[x, y, width, height] in pixels up to {MOST_COLUMNS}, a width and a height above 0")
     return x, y, width, height
 
 
-def _table_source(value: Any) -> str:
+def _table_source(value: object) -> str:
     if value not in ("board", "disc", "both"):
         raise _Unfit('"board", "disc" or "both"')
     return str(value)
 
 
-def _counts_of(what: str) -> Callable[[Any], tuple[int, int]]:
-    def convert(value: Any) -> tuple[int, int]:
-        whole = isinstance(value, list) and len(value) == 2 and all(type(n) is int for n in value)
-        if not whole or not all(1 <= n <= MOST_CELLS for n in value):
+def _counts_of(what: str) -> Callable[[object], tuple[int, int]]:
+    def convert(value: object) -> tuple[int, int]:
+        numbers = _whole_numbers(value, 2, 1, MOST_CELLS)
+        if not numbers:
             raise _Unfit(f"two whole numbers from 1 to {MOST_CELLS}, {what}, e.g. [9, 6]")
-        return value[0], value[1]
+        return numbers[0], numbers[1]
 
     return convert
 
 
-def _target_kind(value: Any) -> str:
+def _target_kind(value: object) -> str:
     if not isinstance(value, str) or value not in TARGET_KEYS:
         raise _Unfit("one of " + ", ".join(f'"{name}"' for name in TARGET_KEYS))
     return value
 
 
-def _centres(value: Any) -> list[list[float]]:
-    pairs = isinstance(value, list) and all(isinstance(centre, list) and len(centre) == 2 for centre in value)
+def _centres(value: object) -> list[list[float]]:
+    least, most = RANGES["centres_mm"]
     try:
-        if not pairs or not 3 <= len(value) <= MOST_DOTS:
-            raise _Unfit
-        return [[_number(x, *RANGES["centres_mm"]) for x in centre] for centre in value]
-    except _Unfit as error:
-        least, most = RANGES["centres_mm"]
-        raise _Unfit(
-            f"a list of [x, y] pairs, at least 3 and at most {MOST_DOTS} of them, each number from {least:g} to "
-            f"{most:g}, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
-        ) from error
+        if isinstance(value, list) and 3 <= len(value) <= MOST_DOTS:
+            return [[_number(x, least, most), _number(y, least, most)] for x, y in value]
+    except (_Unfit, TypeError, ValueError):  # not a number, not a list, not two of them
+        pass
+    raise _Unfit(
+        f"a list of [x, y] pairs, at least 3 and at most {MOST_DOTS} of them, each number from {least:g} to {most:g}, "
+        "e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
+    )
 
 
 def _exposure(cameras: _Section) -> float:

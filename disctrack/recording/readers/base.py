@@ -1,8 +1,9 @@
 """The interface of all readers, and which files they read."""
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -88,6 +89,24 @@ class Frames:
         return np.empty(shape, self.dtype)
 
 
+class Changed:
+    """Frames of another reader that are changed after they are read; in all else that reader."""
+
+    def __init__(self, reader: FrameReader, by: str) -> None:
+        """By : all that tells how they are changed, for the digest of the content."""
+        self._reader, self._by = reader, by
+
+    def __len__(self) -> int:
+        return len(self._reader)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._reader, name)
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """Of the frames and of how they are changed."""
+        return hashlib.sha256(f"{self._reader.content_sha256(start, stop)} {self._by}".encode()).hexdigest()
+
+
 _T = TypeVar("_T")
 
 
@@ -100,6 +119,13 @@ def first_readable(n: int, camera: str, decoded: Callable[[int], _T]) -> _T:
         except RecordingError as error:
             problem = problem or error
     raise RecordingError(f"none of the {n} {camera} frames can be read; the first: {problem}")
+
+
+def only_file(files: Sequence[Path], camera: str) -> Path:
+    """The one file that a camera's pattern may match, where a file holds all its frames."""
+    if len(files) != 1:
+        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one recording.")
+    return files[0]
 
 
 def split_member(pattern: str) -> tuple[str, str]:

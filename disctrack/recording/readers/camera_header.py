@@ -3,7 +3,6 @@
 import dataclasses
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
@@ -23,14 +22,14 @@ class CameraHeader:
     device: str  # make, model, number
     frame_rate: float  # [Hz] of the frames in the file
     step: int  # one frame in so many of those recorded is in the file
-    exposure: float | None  # [s]
-    trigger: str  # trigger mode
-    first_frame: int | None  # the camera's own number of frame 0; trigger modes differ in what is counted from
-    first_time: float | None  # [s] from the trigger to frame 0, by the camera's clock
-    trigger_time: float | None  # [s] since 1970, UTC, by the camera's clock
-    locked_clock: bool  # to a common time signal (IRIG)
-    recorded: datetime | None  # by the clock of the camera or its computer
     saturation: int  # largest grey value that a pixel can have
+    exposure: float | None = None  # [s]
+    trigger: str = ""  # trigger mode
+    first_frame: int | None = None  # the camera's own number of frame 0; trigger modes differ in what is counted from
+    first_time: float | None = None  # [s] from the trigger to frame 0, by the camera's clock
+    trigger_time: float | None = None  # [s] since 1970, UTC, by the camera's clock
+    locked_clock: bool = False  # to a common time signal (IRIG)
+    recorded: datetime | None = None  # by the clock of the camera or its computer
 
     @property
     def rate(self) -> str:
@@ -51,7 +50,7 @@ class CameraHeader:
             parts.append(f"{self.recorded:%Y-%m-%d %H:%M:%S}")
         return ", ".join(part for part in parts if part)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """What the header says, of JSON's types, without the file's place."""
         fields = dataclasses.asdict(self)
         del fields["file"]

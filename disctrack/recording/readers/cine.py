@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
+from disctrack.recording.readers.base import only_file
 from disctrack.recording.readers.camera_frames import (
     PIXELS_PER_GROUP,
     CameraFrames,
@@ -54,9 +55,7 @@ _PACKED = {256: 10, 1024: 12}
 
 def open_cine(files: Sequence[Path], camera: str) -> CameraFrames:
     """Frames of one camera. Raises RecordingError if the file is damaged, compressed or of colours."""
-    if len(files) != 1:
-        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one recording.")
-    file = RawFile(files[0])
+    file = RawFile(only_file(files, camera))
     cine = _read_headers(file)
     layout = _layout(cine)
     starts = _image_table(cine, camera)
@@ -278,7 +277,6 @@ def _header(cine: _Cine, layout: PixelLayout, times: Array | None) -> CameraHead
         frame_rate=rate / step,
         step=step,
         exposure=exposure if 0 < exposure * rate <= 1.001 else None,
-        trigger="",
         first_frame=cine.first_image,
         first_time=None if times is None else float(times[0]),
         trigger_time=trigger_time if second else None,

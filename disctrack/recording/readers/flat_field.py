@@ -12,7 +12,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from calibration.kit.stuck_pixels import repair
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
+from disctrack.recording.readers.base import IMAGE_SUFFIXES, Changed, FrameReader, split_member
 from disctrack.recording.readers.files import match_files
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
@@ -64,29 +63,19 @@ def _stored(bit_depth: int) -> type[np.uint8] | type[np.uint16]:
     return np.uint8 if bit_depth == 8 else np.uint16
 
 
-class FlatFielded:
-    """A camera's frames with its pixels' offsets and gains taken out; in all else the reader that it wraps."""
+class FlatFielded(Changed):
+    """A camera's frames with its pixels' offsets and gains taken out."""
 
     def __init__(self, reader: FrameReader, field: FlatField) -> None:
         """Reader of the frames as the camera wrote them."""
-        self._reader, self._field = reader, field
+        super().__init__(reader, field.sha256)
+        self._field = field
         self.notes = (*reader.notes, *field.notes)
         self.bit_depth = 16
-
-    def __len__(self) -> int:
-        return len(self._reader)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._reader, name)
 
     def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, corrected."""
         return self._field.corrected(self._reader.read(index), out)
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        """Of frames and of the images by which they are corrected."""
-        frames = self._reader.content_sha256(start, stop)
-        return hashlib.sha256(f"{frames} {self._field.sha256}".encode()).hexdigest()
 
 
 FlatFields = tuple[FlatField | None, FlatField | None]  # of the left and of the right camera

@@ -18,7 +18,7 @@ import numpy as np
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._inflate import inflated
-from disctrack.recording.readers.base import FrameReader, Frames
+from disctrack.recording.readers.base import FrameReader, Frames, only_file
 from disctrack.recording.readers.raw import RawFile, RawFrames, check_frame_size
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
@@ -31,9 +31,7 @@ _SMALL = 1 << 12  # bytes: what deflate may add to what it cannot compress
 
 def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
     """Reader of one data set. Raises RecordingError if there is none, or several and none is named."""
-    if len(files) != 1:
-        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one HDF5 file.")
-    file = files[0]
+    file = only_file(files, camera)
     try:
         handle = h5py.File(file, "r", rdcc_nbytes=_LARGEST_CACHE, rdcc_w0=1.0)
     except OSError as error:
@@ -49,11 +47,11 @@ def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameRead
         raise RecordingError(f"{file}: the HDF5 file is damaged ({error}). Copy it again.") from error
 
 
-def _is_stack(item: Any) -> bool:
+def _is_stack(item: object) -> bool:
     return isinstance(item, h5py.Dataset) and item.ndim == 3 and item.dtype.kind == "u" and item.dtype.itemsize <= 2
 
 
-def _named(handle: Any, member: str, file: Path) -> Any:
+def _named(handle: h5py.File, member: str, file: Path) -> h5py.Dataset:
     item = handle.get(member)
     if _is_stack(item):
         return item
@@ -67,7 +65,7 @@ def _named(handle: Any, member: str, file: Path) -> Any:
     )
 
 
-def _only_stack(handle: Any, file: Path) -> Any:
+def _only_stack(handle: h5py.File, file: Path) -> h5py.Dataset:
     stacks = stacks_of(handle)
     if len(stacks) == 1:
         return stacks[0]
@@ -77,12 +75,12 @@ def _only_stack(handle: Any, file: Path) -> Any:
     raise RecordingError(f"{file}: holds several stacks of frames: {names}. Name one: {file.name}:{stacks[0].name}")
 
 
-def stacks_of(handle: Any) -> list[Any]:
+def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
     """Data sets that may be frames; links to other files are not followed."""
-    found: list[Any] = []
+    found: list[h5py.Dataset] = []
     seen = 0
 
-    def look(name: str, item: Any) -> bool | None:
+    def look(name: str, item: object) -> bool | None:
         nonlocal seen
         seen += 1
         if _is_stack(item):
@@ -93,7 +91,7 @@ def stacks_of(handle: Any) -> list[Any]:
     return found
 
 
-def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
+def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> FrameReader:
     n, height, width = stack.shape
     where = f"{file}:{stack.name}"
     check_frame_size(width, height, where)
@@ -129,7 +127,7 @@ def _open(handle: Any, stack: Any, file: Path, camera: str) -> FrameReader:
     return Hdf5Frames(file, handle, stack, camera, **common)
 
 
-def _frames_stored(stack: Any) -> int:
+def _frames_stored(stack: h5py.Dataset) -> int:
     """Most frames that can have been written, by the space they take."""
     if stack.is_virtual or stack.external:
         return int(stack.shape[0])
@@ -138,13 +136,13 @@ def _frames_stored(stack: Any) -> int:
     return int(stack.id.get_num_chunks()) * int(stack.chunks[0])
 
 
-def _fills_its_bytes(stack: Any) -> bool:
+def _fills_its_bytes(stack: h5py.Dataset) -> bool:
     """False where a pixel's bits lie somewhere within its bytes: the library brings them to where they belong."""
     kind = stack.id.get_type()
     return bool(kind.get_precision() == 8 * kind.get_size() and kind.get_offset() == 0)
 
 
-def _check_other_files(stack: Any, file: Path, where: str) -> None:
+def _check_other_files(stack: h5py.Dataset, file: Path, where: str) -> None:
     """Raise RecordingError where pixels lie in other files that are not there: the library would deliver zeros."""
     if stack.is_virtual:
         for name in sorted({source.file_name for source in stack.virtual_sources()} - {"."}):
@@ -163,12 +161,12 @@ def _check_other_files(stack: Any, file: Path, where: str) -> None:
         )
 
 
-def _filters(stack: Any) -> set[int]:
+def _filters(stack: h5py.Dataset) -> set[int]:
     plist = stack.id.get_create_plist()
     return {int(plist.get_filter(i)[0]) for i in range(plist.get_nfilters())}
 
 
-def _attribute(stack: Any, name: str) -> float | None:
+def _attribute(stack: h5py.Dataset, name: str) -> float | None:
     """A number among the attributes of the data set or of its group."""
     for owner in (stack, stack.parent):
         if name in owner.attrs:
@@ -178,7 +176,7 @@ def _attribute(stack: Any, name: str) -> float | None:
     return None
 
 
-def _timestamps(stack: Any, n: int, where: str) -> Array | None:
+def _timestamps(stack: h5py.Dataset, n: int, where: str) -> Array | None:
     stamps = stack.attrs.get("timestamps", stack.parent.get("timestamps"))
     if stamps is None or (isinstance(stamps, h5py.Dataset) and stamps.shape != (n,)):
         if isinstance(stamps, h5py.Dataset) and stamps.ndim == 1:
@@ -200,8 +198,8 @@ class Hdf5Frames(Frames):
     def __init__(
         self,
         file: Path,
-        handle: Any,
-        stack: Any,
+        handle: h5py.File,
+        stack: h5py.Dataset,
         camera: str,
         bit_depth: int | None,
         timestamps: Array | None,

@@ -12,6 +12,7 @@ import numpy as np
 
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import MOST_TEXT, read_regular
+from disctrack.recording.readers.base import only_file
 from disctrack.recording.readers.camera_frames import (
     PIXELS_PER_GROUP,
     CameraFrames,
@@ -80,10 +81,7 @@ def _as_stored(file: RawFile, layout: PixelLayout, saturation: int) -> tuple[Pix
 
 def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     """Header and frames, from one of them or both. PFV writes either header, or both alike: .cihx is taken."""
-    stems = {file.with_suffix("") for file in files}
-    if len(stems) > 1:
-        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one recording.")
-    stem = stems.pop()
+    stem = only_file(sorted({file.with_suffix("") for file in files}), camera)
     try:
         beside = {file.suffix.lower(): file for file in stem.parent.iterdir() if file.with_suffix("") == stem}
     except OSError as error:
@@ -242,9 +240,6 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
         exposure=exposure,
         trigger=entries.text("Trigger Mode")[:40],
         first_frame=int(first) if re.fullmatch(r"-?[0-9]{1,15}", first) else None,
-        first_time=None,
-        trigger_time=None,
-        locked_clock=False,
         recorded=_date(entries.text("Date"), entries.text("Time")),
         saturation=saturation,
     )

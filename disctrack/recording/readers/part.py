@@ -1,9 +1,7 @@
 """A part of every image as the images of a camera: of one sensor behind mirrors, or of two images stored in one."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
-from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.base import Changed, FrameReader
 
 
 @dataclass(frozen=True)
@@ -46,19 +44,14 @@ def image_parts(declared: Sequence[tuple[int, int, int, int] | None]) -> ImagePa
     return left, right
 
 
-class FramesInPart:
-    """A camera's frames where they are a part of the file's; in all else the reader that it wraps."""
+class FramesInPart(Changed):
+    """A camera's frames where they are a part of the file's."""
 
     def __init__(self, reader: FrameReader, part: ImagePart) -> None:
         """Reader of the whole images."""
-        self._reader, self._part = reader, part
+        super().__init__(reader, str(part))
+        self._part = part
         self.image_size = (part.width, part.height)
-
-    def __len__(self) -> int:
-        return len(self._reader)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._reader, name)
 
     def read(self, index: int, out: Image | None = None) -> Image:
         """The part of frame `index`."""
@@ -67,10 +60,6 @@ class FramesInPart:
             return image
         out[...] = image
         return out
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        """Of frames and part."""
-        return hashlib.sha256(f"{self._reader.content_sha256(start, stop)} {self._part}".encode()).hexdigest()
 
 
 def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> list[FrameReader]:

@@ -12,37 +12,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.raw import MOST_PIXELS, check_claim, check_frame_size
+from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_claim, check_frame_size
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
 
-_REDUCED_IMAGE = 1  # bit of a page's subfile type: a thumbnail of another page
-_WHITE_IS_ZERO, _PALETTE = 0, 3
-_COMPRESSIONS = {1: "none", 5: "LZW", 7: "JPEG", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
-_OTHERS = {
-    2: "fax", 3: "fax", 4: "fax", 34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 34933: "PNG", 34934: "JPEG XR",
-    22610: "JPEG XR", 50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL",
-}  # fmt: skip
+_READ = frozenset((1, 5, 7, 8, 32773, 32946))  # compressions: none, LZW, JPEG, deflate, PackBits, deflate
 # Tags by which the pixels of two pages are decoded alike.
 _LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
-
-
-class Source(Protocol):
-    """What a file must give to be read as TIFF: a RawFile, or TiffContent."""
-
-    path: Path
-    size: int
-
-    def bytes_at(self, offset: int, size: int, where: str) -> bytes:
-        """Bytes from an offset on. Raises RecordingError where there are fewer."""
-        ...
 
 
 class TiffContent:
@@ -56,6 +38,9 @@ class TiffContent:
         if offset < 0 or size < 0 or offset + size > self.size:
             raise RecordingError(f"{where}: {size} bytes at byte {offset} are announced, but there are {self.size}.")
         return self._content[offset : offset + size]
+
+
+Source = RawFile | TiffContent
 
 
 @dataclass(frozen=True)
@@ -88,7 +73,7 @@ class Page:
     def plain_offset(self) -> int:
         """Where grey values of whole bytes lie, upright, one after the other and as they are; -1 if they do not."""
         page, size = self.like, self.width * self.height * self.dtype.itemsize
-        grey = page.photometric == 1 and page.samplesperpixel == 1 and page.fillorder == 1
+        grey = page.photometric == tifffile.PHOTOMETRIC.MINISBLACK and page.samplesperpixel == 1 and page.fillorder == 1
         whole = page.bitspersample in (8, 16) and self.dtype.kind == "u"
         if not (grey and whole) or page.compression != 1 or page.is_tiled or _orientation(page) != 1:
             return -1
@@ -114,7 +99,7 @@ def pages_of(source: Source) -> Iterator[Page]:
                 raise TypeError("no page of its own")
             seen.add(page.offset)
             found = _page(page, layouts)
-            if not page.subfiletype & _REDUCED_IMAGE:
+            if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
                 yield found
         link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source.path))
         if any(link):
@@ -177,8 +162,8 @@ def _checked_pieces(source: Source, page: Page, where: str) -> list[bytes]:
     """Compressed strips or tiles, of a page whose numbers fit each other and the file."""
     like = page.like
     check_frame_size(page.width, page.height, where)
-    if like.compression not in _COMPRESSIONS:
-        name = _OTHERS.get(like.compression, "unknown")
+    if like.compression not in _READ:
+        name = getattr(like.compression, "name", "unknown")
         raise RecordingError(
             f"{where}: its pixels are compressed by a method ({int(like.compression)}, {name}) that is not read; LZW "
             "and deflate are. Export this image again."
@@ -204,9 +189,9 @@ def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> NDArray:
         room[...] = part[0, : room.shape[0], : room.shape[1]]
     image = pixels[0, 0] if len(pixels) == 1 else np.moveaxis(pixels[:, 0, :, :, 0], 0, -1)
     image = image[..., 0] if image.shape[-1] == 1 else image
-    if page.photometric == _WHITE_IS_ZERO and image.dtype.kind == "u":
+    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and image.dtype.kind == "u":
         image = (2**page.bitspersample - 1) - image
-    if page.photometric == _PALETTE:
+    if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
         image = (np.asarray(page.colormap) >> 8).astype(np.uint8).T[image]
     orientation = _orientation(page)
     if orientation in (5, 6, 7, 8):  # the sides at which row 0 and column 0 lie (TIFF 6.0, section 8)

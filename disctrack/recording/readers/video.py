@@ -9,7 +9,7 @@ import threading
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,14 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._ffv1 import checksums_hold
-from disctrack.recording.readers.base import Frames, first_readable
+from disctrack.recording.readers.base import Frames, first_readable, only_file
 from disctrack.recording.readers.decoding import as_grey
 from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size
+
+if TYPE_CHECKING:  # an optional package
+    import av
+    from av.container import InputContainer
+    from av.video.plane import VideoPlane
 
 # Nothing but containers for frames: a play list under a video's name could make the library open other files.
 _CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
@@ -28,14 +33,14 @@ _MOST_CURSORS = 2  # stretches of a recording that may be read side by side
 _LOOKED_AT = 8  # packets: one with a right checksum among the first tells that there are checksums
 _DECODED_ON = 8  # frames: opening the file anew and seeking costs more than to decode these and drop them
 
-_Decoded = tuple[int, Any, str]  # index of a frame, the frame or None, what is wrong with it
+_Decoded: TypeAlias = (
+    "tuple[int, av.VideoFrame | None, str]"  # index of a frame, the frame or None, what is wrong with it
+)
 
 
 def open_video(files: Sequence[Path], camera: str) -> VideoFile:
     """Reader of one video. Raises RecordingError if PyAV is not installed or the file is no video."""
-    if len(files) != 1:
-        raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one video.")
-    return VideoFile(files[0], camera)
+    return VideoFile(only_file(files, camera), camera)
 
 
 class VideoFile(Frames):
@@ -58,7 +63,7 @@ class VideoFile(Frames):
             codec_name = str(codec.name)
             self._index = _index(container, codec_name, file)
 
-        def looked_at(index: int) -> tuple[Any, Image]:
+        def looked_at(index: int) -> tuple[av.VideoFrame, Image]:
             frame = self._frame(index, self.describe(index))
             return frame, _luma(frame, self.describe(index))
 
@@ -95,7 +100,7 @@ class VideoFile(Frames):
                 self._digest = b"unreadable" + os.urandom(16)
         return hashlib.sha256(self._digest + f"{start}:{stop}".encode()).hexdigest()
 
-    def _frame(self, index: int, where: str) -> Any:
+    def _frame(self, index: int, where: str) -> av.VideoFrame:
         try:
             cursor = self._cursor_near(index)
         except RecordingError as error:  # the file is opened anew to go back
@@ -130,7 +135,7 @@ class _Index:
         return int(self.key_frames[np.searchsorted(self.key_frames, index, side="right") - 1])
 
 
-def _index(container: Any, codec: str, file: Path) -> _Index:
+def _index(container: InputContainer, codec: str, file: Path) -> _Index:
     """Times of all packets; in containers without usable times, their numbers, and one key frame: the first."""
     import av
 
@@ -183,7 +188,7 @@ class _Cursor:
         self._frames.close()
         self._container.close()
 
-    def frame(self, index: int, where: str) -> Any:
+    def frame(self, index: int, where: str) -> av.VideoFrame:
         """The decoded frame `index`, which must not lie before `next`."""
         self.next = index + 1
         position, frame, problem = self._held or (-1, None, "")
@@ -227,14 +232,14 @@ class _Cursor:
                 yield position, None if problem else frame, problem
                 count = position + 1
 
-    def _position(self, item: Any, count: int) -> int:
+    def _position(self, item: av.Packet | av.VideoFrame, count: int) -> int:
         """Index of a packet or frame by its time; by counting where the container has no times."""
         if not self._index.timed or item.pts is None:
             return count
         return int(np.searchsorted(self._index.times, item.pts))
 
 
-def _opened(file: Path, camera: str) -> Any:
+def _opened(file: Path, camera: str) -> InputContainer:
     try:
         import av
     except ImportError as error:
@@ -265,12 +270,12 @@ def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
     return [f"the video's clock skips after frame {shown}: {lost} frame(s) seem to be lost, and time shifts there"]
 
 
-def _depth(frame: Any) -> int:
+def _depth(frame: av.VideoFrame) -> int:
     """Significant bits of the grey values."""
     return int(frame.format.components[0].bits)
 
 
-def _format_notes(frame: Any) -> list[str]:
+def _format_notes(frame: av.VideoFrame) -> list[str]:
     """What the user should know of the pixel format."""
     name, notes = frame.format.name, []
     if name.startswith("yuvj") or (name.startswith("yuv") and frame.color_range == 2):
@@ -282,27 +287,27 @@ def _format_notes(frame: Any) -> list[str]:
     return notes
 
 
-def _varies(plane: Any) -> bool:
+def _varies(plane: VideoPlane) -> bool:
     rows = _rows(plane, plane.height)[:, : plane.width]
     return bool((rows != rows[0, 0]).any())
 
 
-def _rows(plane: Any, height: int) -> NDArray[np.uint8]:
+def _rows(plane: VideoPlane, height: int) -> NDArray[np.uint8]:
     """Bytes of a plane's rows (height, bytes), the upper first; a view of its memory where that begins with them."""
     size = abs(plane.line_size)
     if plane.line_size >= 0:
-        return np.frombuffer(plane, np.uint8)[: size * height].reshape(height, size)
+        return np.frombuffer(memoryview(plane), np.uint8)[: size * height].reshape(height, size)
     first = plane.buffer_ptr + (height - 1) * plane.line_size  # bottom up: the plane says where the upper row lies
     return np.frombuffer(ctypes.string_at(first, size * height), np.uint8).reshape(height, size)[::-1]
 
 
-def _without_palette(frame: Any) -> bool:
+def _without_palette(frame: av.VideoFrame) -> bool:
     """True where all entries are alike: a recorder of grey values left the palette out, and all would be black."""
-    colours = np.frombuffer(frame.planes[1], np.uint8)[:1024].reshape(256, 4)[:, :3]
+    colours = np.frombuffer(memoryview(frame.planes[1]), np.uint8)[:1024].reshape(256, 4)[:, :3]
     return bool((colours == colours[0]).all())
 
 
-def _luma(frame: Any, where: str) -> Image:
+def _luma(frame: av.VideoFrame, where: str) -> Image:
     """Grey values (h, w) of a decoded frame without conversion; a view of its memory where possible."""
     name = frame.format.name
     component = frame.format.components[0]

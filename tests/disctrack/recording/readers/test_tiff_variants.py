@@ -79,9 +79,7 @@ def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orienta
 
 
 @pytest.mark.parametrize("written", [as_files, as_pages])
-@pytest.mark.parametrize(
-    ("code", "name"), [(34712, "JPEG 2000"), (34933, "PNG"), (50000, "Zstandard"), (40000, "unkn")]
-)
+@pytest.mark.parametrize(("code", "name"), [(34712, "JPEG2000"), (34933, "PNG"), (50000, "ZSTD"), (40000, "unkn")])
 def test_pixels_by_an_unknown_method_are_refused_by_name_and_never_black(tmp_path, written, code, name):
     folder = written(tmp_path / "frames", FRAMES[8], compression="zlib")
     for file in folder.iterdir():
