@@ -2,7 +2,7 @@
 
 python tests/docs/pictures.py CLIP SECRET [FOLDER]
 
-CLIP : results of `disctrack run sample_data/clip`; SECRET : results of the tour's recording, diagnosed with --figures;
+CLIP : results of `disctrack check` and `run` of sample_data/clip; SECRET : results of the tour's recording, diagnosed with --figures;
 FOLDER : where the pictures go (default: `disctrack/docs/pictures`)
 """
 
@@ -52,6 +52,7 @@ def make(clip: Path, secret: Path, folder: Path) -> list[Path]:
         "coordinates.png": clip / "coordinates.png",
         "check.jpg": clip / "check.png",
         "diagnosis_residuals.png": secret / "trajectory_diagnosis" / "figures" / "02_residuals.png",
+        "diagnosis_free_run.png": secret / "trajectory_diagnosis" / "figures" / "04_free_run.png",
         "diagnosis_candidates.png": secret / "trajectory_diagnosis" / "figures" / "07_candidates.png",
     }
     for name, source in copies.items():
