@@ -2,7 +2,7 @@
 
 python tests/docs/pictures.py CLIP SECRET [FOLDER]
 
-CLIP : results of `disctrack check` and `run` of sample_data/clip; SECRET : results of the tour's recording, diagnosed with --figures;
+CLIP : results of `disctrack check` and `run` of sample_data/clip; SECRET : of the tour, diagnosed with --figures;
 FOLDER : where the pictures go (default: `disctrack/docs/pictures`)
 """
 
