@@ -34,9 +34,9 @@ _HOME = {
     "disctrack.calibrate.stage": ("calibrate_recording",),
     "calibration.rig_file": ("read_rig", "write_rig"),
     "disctrack.disc": ("Disc",),
-    "disctrack.track.stage": ("open_pairs", "measure", "Measurement", "trajectory_provenance"),
-    "disctrack.track.arrays": ("measure_pairs",),
-    "disctrack.track.live": ("Tracker", "LivePose"),
+    "disctrack.track.measurement": ("open_pairs", "measure", "Measurement", "trajectory_provenance"),
+    "disctrack.track.in_memory": ("measure_pairs",),
+    "disctrack.track.follow.live": ("Tracker", "LivePose"),
     "disctrack.trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
     "disctrack.trajectory.file": (
         "Provenance",
@@ -46,7 +46,7 @@ _HOME = {
         "write_group",
         "read_group",
     ),
-    "disctrack.track.overlay": ("write_overlay",),
+    "disctrack.track.video_overlay": ("write_overlay",),
     "disctrack.analyse.derivatives": ("differentiate",),
     "disctrack.analyse.stage": ("run_analyse",),
     "disctrack.analyse.analysis": ("Analysis",),
@@ -91,14 +91,14 @@ if TYPE_CHECKING:
     from disctrack.rolling import steady_precession as steady_precession
     from disctrack.synthetic import run_render as run_render
     from disctrack.synthetic.simulation import run_simulate as run_simulate
-    from disctrack.track.arrays import measure_pairs as measure_pairs
-    from disctrack.track.live import LivePose as LivePose
-    from disctrack.track.live import Tracker as Tracker
-    from disctrack.track.overlay import write_overlay as write_overlay
-    from disctrack.track.stage import Measurement as Measurement
-    from disctrack.track.stage import measure as measure
-    from disctrack.track.stage import open_pairs as open_pairs
-    from disctrack.track.stage import trajectory_provenance as trajectory_provenance
+    from disctrack.track.follow.live import LivePose as LivePose
+    from disctrack.track.follow.live import Tracker as Tracker
+    from disctrack.track.in_memory import measure_pairs as measure_pairs
+    from disctrack.track.measurement import Measurement as Measurement
+    from disctrack.track.measurement import measure as measure
+    from disctrack.track.measurement import open_pairs as open_pairs
+    from disctrack.track.measurement import trajectory_provenance as trajectory_provenance
+    from disctrack.track.video_overlay import write_overlay as write_overlay
     from disctrack.trajectory import FrameStatus as FrameStatus
     from disctrack.trajectory import MarkerStatus as MarkerStatus
     from disctrack.trajectory import Trajectory as Trajectory

@@ -38,8 +38,8 @@ from disctrack.errors import AnalysisError, DiscTrackError, OutputError
 from disctrack.files.whole import write_whole
 from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.track.stage import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
-from disctrack.track.summary import file_lines
+from disctrack.track.measurement import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
+from disctrack.track.run_summary import file_lines
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
 from disctrack.trajectory.file import Provenance

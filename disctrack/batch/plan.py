@@ -10,7 +10,7 @@ from disctrack.batch.find import FOLDER, RESULTS, FoundRecordings
 from disctrack.batch.reasons import reason_of
 from disctrack.calibrate.stage import source_of
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.track.stage import open_pairs
+from disctrack.track.measurement import open_pairs
 
 # Work in units of one tracked pair, from timings; it only sets how the progress bar is divided.
 _START, _NUMBERS, _REPORT, _DIAGNOSIS, _CALIBRATION = 100.0, 200.0, 1500.0, 4000.0, 2500.0

@@ -21,7 +21,7 @@ from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import whole_file
 from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording
-from disctrack.track import summary
+from disctrack.track import run_summary as summary
 from disctrack.trajectory.file import Provenance
 
 

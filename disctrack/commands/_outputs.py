@@ -24,10 +24,10 @@ from disctrack.files.whole import write_whole
 from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
-from disctrack.track import summary
-from disctrack.track.overlay import shown_rows, write_overlay
-from disctrack.track.stage import ImagePairs, check_rig, measure, trajectory_provenance
-from disctrack.track.tracking import TrackingSettings
+from disctrack.track import run_summary as summary
+from disctrack.track.follow.tracking import TrackingSettings
+from disctrack.track.measurement import ImagePairs, check_rig, measure, trajectory_provenance
+from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
 
@@ -156,7 +156,7 @@ def _companions(
         yield path.with_suffix(".csv")
     if options.figures:
         from disctrack.pages.figures import save_figure
-        from disctrack.track.figures import FIGURES
+        from disctrack.track.pictures import FIGURES
 
         pictures = {path.with_name(f"{prefix}{name}.png"): make for name, make in FIGURES.items()}
         missing = [picture for picture in pictures if fresh or not picture.exists()]

@@ -13,8 +13,8 @@ from disctrack.commands._outputs import pair_of, tell_stale, write_times
 from disctrack.errors import RecordingError
 from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
-from disctrack.track.overlay import draw_pair
-from disctrack.track.stage import open_pairs
+from disctrack.track.measurement import open_pairs
+from disctrack.track.video_overlay import draw_pair
 from disctrack.trajectory.file import read_provenance
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 

@@ -7,7 +7,7 @@ from disctrack.batch import BatchOptions, BatchOutcome, Shard, run_batch, summar
 from disctrack.commands import DONE, FAILED, INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.files.text import printable
-from disctrack.track import summary
+from disctrack.track import run_summary as summary
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
-from disctrack.track import summary
+from disctrack.track import run_summary as summary
 
 VIEWS = ("--left", "--right", "--corners", "--square-mm")
 TABLE = ("--table-view", "--board-thickness-mm")

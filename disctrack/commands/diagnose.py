@@ -12,7 +12,7 @@ from disctrack.errors import TrajectoryFileError
 from disctrack.progress import compiling, stage, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.rolling import _assembly as assembly
-from disctrack.track import summary
+from disctrack.track import run_summary as summary
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 

@@ -7,8 +7,8 @@ from disctrack.commands import _outputs as outputs
 from disctrack.files.inputs import refuse_input
 from disctrack.files.whole import write_whole
 from disctrack.recording.declaration import read_recording
-from disctrack.track import stage as pipeline
-from disctrack.track import summary
+from disctrack.track import measurement as pipeline
+from disctrack.track import run_summary as summary
 
 
 def run(arguments: argparse.Namespace) -> int:

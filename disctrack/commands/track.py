@@ -7,8 +7,8 @@ from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.recording.declaration import read_recording
-from disctrack.track import stage as pipeline
-from disctrack.track import summary
+from disctrack.track import measurement as pipeline
+from disctrack.track import run_summary as summary
 
 
 def run(arguments: argparse.Namespace) -> int:

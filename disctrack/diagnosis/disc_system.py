@@ -32,8 +32,8 @@ from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
 from disctrack.rolling.simulate import MAX_SLIP_STEPS
 from disctrack.track.pose import whitening
-from disctrack.track.table_contact import ASSUMED_THICKNESS as MICROMETER
-from disctrack.track.table_contact import thickness_tolerance
+from disctrack.track.refine.table_contact import ASSUMED_THICKNESS as MICROMETER
+from disctrack.track.refine.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 RTOL = 1e-10  # of the integration: a millionth of the noise

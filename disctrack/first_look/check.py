@@ -23,12 +23,12 @@ from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import PairBlock, iter_pair_blocks
-from disctrack.track.dots import locate_on_disc
-from disctrack.track.doubts import LIE_OFF, LOWEST_POINT, MISFIT
-from disctrack.track.own_scatter import without_shared_faults
-from disctrack.track.stage import ImagePairs, check_rig, open_pairs
-from disctrack.track.summary import left_out
-from disctrack.track.tracking import Tracking, TrackingSettings, track
+from disctrack.track.dots.template import locate_on_disc
+from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
+from disctrack.track.judge.doubts import LIE_OFF, LOWEST_POINT, MISFIT
+from disctrack.track.measurement import ImagePairs, check_rig, open_pairs
+from disctrack.track.refine.intrinsic_scatter import without_shared_faults
+from disctrack.track.run_summary import left_out
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # it is installed with the package

@@ -12,8 +12,8 @@ from calibration.board.chessboard import grey_values
 from disctrack.first_look.check import Check
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.decoding import decode
-from disctrack.track.figures import INK
-from disctrack.track.overlay import draw_pair
+from disctrack.track.pictures import INK
+from disctrack.track.video_overlay import draw_pair
 
 MOST_PIXELS = 900  # of a shown image's longer side
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disctrack.track._kernels import _copy, _dot_by_pose, _entry, _part, _rotate_from_left, _solve_in_place
+from disctrack.track.dots._kernels import _copy, _dot_by_pose, _entry, _part, _rotate_from_left, _solve_in_place
 
 MAX_DAMPING = 1e10
 _MAX_ITERATIONS = 60

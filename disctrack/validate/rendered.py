@@ -35,7 +35,7 @@ from disctrack.synthetic.description import (
     Scene,
 )
 from disctrack.synthetic.motion import SceneMotion, motion_of
-from disctrack.track.tracking import Tracking, TrackingSettings, track
+from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
 

@@ -51,8 +51,8 @@ from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import ONE_THREAD
 from disctrack.recording.readers.file_numbers import NumberedFiles
 from disctrack.recording.readers.images import ImageSequence
-from disctrack.track.arrays import measure_pairs
-from disctrack.track.stage import ImagePairs, measure, open_pairs
+from disctrack.track.in_memory import measure_pairs
+from disctrack.track.measurement import ImagePairs, measure, open_pairs
 from disctrack.trajectory import Trajectory
 from tests.oracles import camera_files
 

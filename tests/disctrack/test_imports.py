@@ -49,7 +49,8 @@ def test_importing_the_package_loads_nothing_heavy():
 @pytest.mark.statistical
 def test_a_measurement_waits_for_no_part_of_scipy():
     """Each takes from a tenth to half a second: more than following the disc through the sample recording."""
-    stages = "disctrack.calibrate.stage, disctrack.track.stage, disctrack.track.overlay, disctrack.analyse.declaration"
+    rooms = ("calibrate.stage", "track.measurement", "track.video_overlay", "analyse.declaration")
+    stages = ", ".join(f"disctrack.{room}" for room in rooms)
     parts = [f"scipy.{part}" for part in ("linalg", "optimize", "special", "stats")]
     for asked, expected in ((stages, "[]"), (f"{stages}, scipy.optimize", "['scipy.linalg', ")):
         done = run(f"import {asked}, sys; print([part for part in {parts} if part in sys.modules])")

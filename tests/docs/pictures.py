@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import disctrack
 from disctrack.pages.figures import panels, save_figure
 from disctrack.pages.palette import BLUE, INK
-from disctrack.track.overlay import draw_pair
+from disctrack.track.video_overlay import draw_pair
 
 FRAME = 60
 WIDTH = 900  # px of the copied figures: enough for a page, small enough for a repository

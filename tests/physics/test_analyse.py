@@ -14,7 +14,7 @@ from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError, TrajectoryFileError
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
-from disctrack.track.stage import at_full_length
+from disctrack.track.measurement import at_full_length
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance, read_group, read_trajectory, write_trajectory
 

@@ -24,7 +24,7 @@ from disctrack.batch.records import read_record
 from disctrack.batch.repeats import COMPARED
 from disctrack.cli import main
 from disctrack.files.whole import output_error
-from disctrack.track.tracking import prepare
+from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
 
 FAST = ["--no-report"]

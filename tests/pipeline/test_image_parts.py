@@ -14,7 +14,7 @@ from disctrack.errors import RecordingError
 from disctrack.first_look.sequences import Sequence, pair_cameras
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.track.stage import open_pairs
+from disctrack.track.measurement import open_pairs
 
 FRAMES, VIEWS, SIZE = 24, 18, 272
 HALVES = f"left_part = [0, 0, {SIZE}, {SIZE}]\nright_part = [{SIZE}, 0, {SIZE}, {SIZE}]"

@@ -12,7 +12,7 @@ import pytest
 import disctrack
 from disctrack.analyse.analysis import analyse
 from disctrack.analyse.motion_page import motion_html
-from disctrack.track.overlay import draw_pair
+from disctrack.track.video_overlay import draw_pair
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",

@@ -16,11 +16,11 @@ from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track.moved_camera import moved_camera
-from disctrack.track.own_scatter import MIN_FRAMES
-from disctrack.track.stage import open_pairs
-from disctrack.track.tracking import TrackingSettings, track
-from disctrack.track.unlike_declared import unlike_declared
+from disctrack.track.follow.tracking import TrackingSettings, track
+from disctrack.track.judge.moved_camera import moved_camera
+from disctrack.track.judge.wrong_declaration import unlike_declared
+from disctrack.track.measurement import open_pairs
+from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
 from tests.oracles.planted_faults import FAULTS, gleam
 

@@ -36,7 +36,7 @@ def test_a_result_counts_only_for_the_sources_that_made_it(tmp_path):
         with (tmp_path / "disctrack" / beside).open("a") as source:
             source.write("# a remark\n")
     assert run(code, tmp_path).split()[1] == first
-    for within in ("disctrack/track/_kernels.py", "calibration/cameras/camera.py"):
+    for within in ("disctrack/track/dots/_kernels.py", "calibration/cameras/camera.py"):
         with (tmp_path / within).open("a") as source:
             source.write("A_NUMBER = 1\n")
         _, changed = run(code, tmp_path).split()

@@ -10,8 +10,8 @@ from calibration.cameras.camera import normalised_maps
 from disctrack import frames
 from disctrack.synthetic import expected_disc, render_disc, rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track import _kernels as kernels
-from disctrack.track.dots import (
+from disctrack.track.dots import _kernels as kernels
+from disctrack.track.dots.template import (
     NoiseModel,
     locate_on_disc,
     locate_on_plane,

@@ -9,13 +9,13 @@ from scipy.ndimage import gaussian_filter
 from disctrack import frames, measure_pairs, read_recording, rolling
 from disctrack.errors import RecordingError
 from disctrack.synthetic import render_disc
-from disctrack.track import exposure as smears
-from disctrack.track import template_pull
-from disctrack.track.dots import NoiseModel, locate_on_plane
-from disctrack.track.exposure import shift_by_exposure
+from disctrack.track.dots import template_response as template_pull
+from disctrack.track.dots.template import NoiseModel, locate_on_plane
+from disctrack.track.dots.template_response import Pull
+from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.pose import marker_pixels
-from disctrack.track.template_pull import Pull
-from disctrack.track.tracking import TrackingSettings
+from disctrack.track.refine import exposure as smears
+from disctrack.track.refine.exposure import shift_by_exposure
 from disctrack.trajectory import FrameStatus
 
 RATE, EXPOSURE = 1000.0, 1e-3  # Hz, s

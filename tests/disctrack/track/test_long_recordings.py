@@ -10,12 +10,12 @@ from numpy.testing import assert_array_equal
 
 from disctrack import frames
 from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.track.as_printed import AsBuilt
-from disctrack.track.assembly import Taken, TrackingSettings, _fit_all, assemble
-from disctrack.track.dots import NoiseModel, TemplateLimits
-from disctrack.track.following import Follower, Law, TrackingSetup, empty_tables
+from disctrack.track.dots.template import NoiseModel, TemplateLimits
+from disctrack.track.follow.following import Follower, Law, TrackingSetup, empty_tables
+from disctrack.track.follow.tracking import MOST_STRETCHES, WAITED_FOR, stretch_edges
 from disctrack.track.pose import marker_pixels
-from disctrack.track.tracking import MOST_STRETCHES, WAITED_FOR, stretch_edges
+from disctrack.track.refine.assembly import Taken, TrackingSettings, _fit_all, assemble
+from disctrack.track.refine.self_calibration import AsBuilt
 from disctrack.trajectory import FrameStatus
 
 
@@ -70,7 +70,7 @@ def test_blocks_begin_at_the_breaks_and_hold_every_frame_once():
 
 
 def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_their_number(rendered_pairs, monkeypatch):
-    monkeypatch.setattr("disctrack.track.assembly.FITTED_AT_ONCE", 512)
+    monkeypatch.setattr("disctrack.track.refine.assembly.FITTED_AT_ONCE", 512)
     rig, disc = rendered_pairs.rig, rendered_pairs.disc
     R, t = frames.rotation_from_euler(*rendered_pairs.q[:, 3:].T), rendered_pairs.q[:, :3]
     pixels = rendered_pairs.true_pixels
@@ -93,7 +93,7 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
 
 
 def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_pairs, rng, monkeypatch):
-    monkeypatch.setattr("disctrack.track.assembly.FITTED_AT_ONCE", 50)
+    monkeypatch.setattr("disctrack.track.refine.assembly.FITTED_AT_ONCE", 50)
     rig, disc, m, n = rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.disc.n_markers, 230
     times = np.arange(n) / 1000.0
     angles = np.stack([0.1 + 9.0 * times, np.full(n, 0.35), 0.2 - 8.0 * times])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disctrack.errors import RecordingError
-from disctrack.track.motion_span import MARGIN, STRIDE, StillScene, find_motion
+from disctrack.track.follow.motion_span import MARGIN, STRIDE, StillScene, find_motion
 
 RATE = 200.0  # [Hz] so that the margin is 50 frames
 MARGIN_FRAMES = round(MARGIN * RATE)

@@ -12,8 +12,8 @@ from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, quaternion_from_rotation, rotation_from_euler
 from disctrack.pages.figures import DPI, save_figure
-from disctrack.track import figures as plots
-from disctrack.track import overlay
+from disctrack.track import pictures as plots
+from disctrack.track import video_overlay as overlay
 from disctrack.trajectory import FrameStatus, Trajectory
 
 SIZE = (160, 120)

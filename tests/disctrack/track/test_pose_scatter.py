@@ -5,7 +5,7 @@ import pytest
 
 from disctrack import frames
 from disctrack.track.pose import PoseFits
-from disctrack.track.pose_scatter import scatter_of_poses
+from disctrack.track.refine.pose_scatter import scatter_of_poses
 
 SIGMA = np.array([1e-6, 2e-6, 2e-6, 4e-5, 4e-5, 3e-5])  # [m, rad] that dots tell
 

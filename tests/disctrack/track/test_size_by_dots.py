@@ -8,7 +8,7 @@ import pytest
 from calibration.cameras.camera import Allowance
 from calibration.judge.tolerances import SIZE
 from disctrack.frames import rotation_from_quaternion
-from disctrack.track.as_printed import refine_as_built
+from disctrack.track.refine.self_calibration import refine_as_built
 from tests.oracles.measured_disc import measured
 
 SHORT = 1e-4  # relative, by which the rig takes all lengths for too short

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.cameras.camera import Camera, StereoRig
 from disctrack.disc import MA_2014
-from disctrack.track.as_printed import share_of_places
+from disctrack.track.refine.self_calibration import share_of_places
 from disctrack.trajectory import FrameStatus
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import point_laboratory

@@ -15,11 +15,11 @@ from disctrack.frames import (
     unwrap_euler,
 )
 from disctrack.synthetic.description import Faults
-from disctrack.track import table_contact
-from disctrack.track.as_printed import motions_of_pattern
-from disctrack.track.doubts import off_the_table_in_words
+from disctrack.track.judge.doubts import off_the_table_in_words
 from disctrack.track.pose import fit_poses
-from disctrack.track.table_contact import table_from_disc
+from disctrack.track.refine import table_contact
+from disctrack.track.refine.self_calibration import motions_of_pattern
+from disctrack.track.refine.table_contact import table_from_disc
 from tests.oracles.measured_disc import measured
 
 TURN, HEIGHT = (6e-4, -4e-4), 60e-6

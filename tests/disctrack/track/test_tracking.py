@@ -10,8 +10,8 @@ from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.synthetic import render_disc
-from disctrack.track import _kernels as kernels
-from disctrack.track.tracking import STUCK_FRAMES, TrackingSettings, _as_one_sensor, track
+from disctrack.track.dots import _kernels as kernels
+from disctrack.track.follow.tracking import STUCK_FRAMES, TrackingSettings, _as_one_sensor, track
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 N = 60
@@ -105,8 +105,8 @@ def test_a_prediction_lacks_what_the_acceleration_changes_by(rolling, rng):
 def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pairs, monkeypatch):
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 20)
-    monkeypatch.setattr("disctrack.track.tracking.WAITED_FOR", 0)  # alike, as the blocks are
+    monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
+    monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     one, two = (
         track(blocks_of(images, size=15), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=workers)
         for workers in (1, 2)
@@ -125,8 +125,8 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
 
 
 def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
-    monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 4)
-    monkeypatch.setattr("disctrack.track.tracking.WAITED_FOR", 0)  # alike, as the blocks are
+    monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 4)
+    monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     images = rolling[0].copy()
     images[:20] = 85  # no disc in the first of four stretches of 15 pairs, nor at the start of the second
     runs = [
@@ -142,12 +142,12 @@ def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first
 
 def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rolling, rendered_pairs, monkeypatch):
     """Without the dot that breaks the symmetry, the search takes the layout as it comes; the motion tells better."""
-    from disctrack.track import following, tracking
+    from disctrack.track.follow import following, tracking
 
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    monkeypatch.setattr("disctrack.track.tracking.SHORTEST_SPLIT", 20)
-    monkeypatch.setattr("disctrack.track.tracking.WAITED_FOR", 0)  # alike, as the blocks are
+    monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
+    monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     found, third = following.acquire, np.array([[-0.5, -np.sqrt(0.75), 0], [np.sqrt(0.75), -0.5, 0], [0, 0, 1.0]])
     starts = {images[k, 0].tobytes() for k in (30, 31)}
 
@@ -168,7 +168,7 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
 
 
 def test_an_empty_scene_is_seldom_searched_and_a_disc_put_there_is_found_at_once(rolling, rendered_pairs, monkeypatch):
-    from disctrack.track import following
+    from disctrack.track.follow import following
 
     searched = []
     found = following.acquire

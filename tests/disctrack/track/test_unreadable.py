@@ -7,7 +7,7 @@ import pytest
 
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.recording.readers.blocks import Unreadable
-from disctrack.track.stage import refuse_unreadable
+from disctrack.track.measurement import refuse_unreadable
 
 RECORDING = SimpleNamespace(folder=Path("rec"))
 

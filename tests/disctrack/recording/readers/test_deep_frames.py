@@ -12,8 +12,8 @@ from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic import render_disc, rig_of
 from disctrack.synthetic.description import Scene, load_scene
 from disctrack.synthetic.motion import motion_of
-from disctrack.track.overlay import draw_pair
-from disctrack.track.tracking import Tracking, track
+from disctrack.track.follow.tracking import Tracking, track
+from disctrack.track.video_overlay import draw_pair
 
 N = 24
 

@@ -12,7 +12,7 @@ from disctrack.first_look import check
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.flat_field import flat_fields
-from disctrack.track.stage import open_pairs
+from disctrack.track.measurement import open_pairs
 from tests.oracles import imperfect_laboratory as laboratory
 
 SIZE, FRAMES, FLATS = 64, 64, 40

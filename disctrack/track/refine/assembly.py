@@ -13,20 +13,26 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import normal_of_rows
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.track.as_printed import AsBuilt, motions_of_pattern, pattern_place, refine_as_built, share_of_places
-from disctrack.track.dots import NoiseModel, TemplateLimits
-from disctrack.track.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
-from disctrack.track.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
-from disctrack.track.following import Follower, Tables, TrackingSetup, repeats
-from disctrack.track.gleam import shift_by_gleam
-from disctrack.track.judging import Verdicts, judge_poses, outlying_frames, unexpected_misfit
-from disctrack.track.own_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
+from disctrack.track.dots.template import NoiseModel, TemplateLimits
+from disctrack.track.dots.template_response import Pull
+from disctrack.track.follow.following import Follower, Tables, TrackingSetup, repeats
+from disctrack.track.judge.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
+from disctrack.track.judge.dropped_frames import LEFT_OUT, delay_of_right, slips_in_words
+from disctrack.track.judge.outlier_tests import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import PoseFits, fit_poses, misses
-from disctrack.track.pose_scatter import PoseScatter, scatter_of_poses
+from disctrack.track.refine.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
+from disctrack.track.refine.glare import shift_by_gleam
+from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
+from disctrack.track.refine.pose_scatter import PoseScatter, scatter_of_poses
+from disctrack.track.refine.self_calibration import (
+    AsBuilt,
+    motions_of_pattern,
+    pattern_place,
+    refine_as_built,
+    share_of_places,
+)
+from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
 from disctrack.track.side_by_side import side_by_side
-from disctrack.track.slips import LEFT_OUT, delay_of_right, slips_in_words
-from disctrack.track.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
-from disctrack.track.template_pull import Pull
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 MIN_GOOD_DOT_IMAGES = 6

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.track.dots import NoiseModel
+from disctrack.track.dots.template import NoiseModel
 
 BAND = 3.0  # blurs
 ACROSS, AROUND = 60, 32  # nodes of an edge

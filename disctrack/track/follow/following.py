@@ -19,9 +19,9 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Array32, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
-from disctrack.track import _kernels as kernels
-from disctrack.track.acquisition import acquire
-from disctrack.track.dots import (
+from disctrack.track.dots import _kernels as kernels
+from disctrack.track.dots.acquisition import acquire
+from disctrack.track.dots.template import (
     TYPICAL_BLUR_PX,
     NoiseModel,
     TemplateLimits,
@@ -31,7 +31,7 @@ from disctrack.track.dots import (
     no_more_than_left,
     typical_noise,
 )
-from disctrack.track.motion_span import StillScene
+from disctrack.track.follow.motion_span import StillScene
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]

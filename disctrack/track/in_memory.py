@@ -12,8 +12,8 @@ from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track.stage import Measurement, Progress, findings_of
-from disctrack.track.tracking import TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.follow.tracking import TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.measurement import Measurement, Progress, findings_of
 
 Images = NDArray[Any]  # uint8 or uint16
 

@@ -21,11 +21,9 @@ from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track import following, pose
-from disctrack.track.arrangement import arrangement_found
-from disctrack.track.assembly import Taken, Tracking, TrackingSettings, assemble
-from disctrack.track.doubts import LIE_OFF, LOWEST_POINT, MOVED, ONE_SIDED
-from disctrack.track.following import (
+from disctrack.track import pose
+from disctrack.track.follow import following
+from disctrack.track.follow.following import (
     Follower,
     Image,
     Law,
@@ -36,9 +34,12 @@ from disctrack.track.following import (
     empty_tables,
     follow_block,
 )
-from disctrack.track.moved_camera import moved_camera
-from disctrack.track.slips import LEFT_OUT
-from disctrack.track.unlike_declared import unlike_declared
+from disctrack.track.judge.doubts import LIE_OFF, LOWEST_POINT, MOVED, ONE_SIDED
+from disctrack.track.judge.dropped_frames import LEFT_OUT
+from disctrack.track.judge.image_arrangement import arrangement_found
+from disctrack.track.judge.moved_camera import moved_camera
+from disctrack.track.judge.wrong_declaration import unlike_declared
+from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc

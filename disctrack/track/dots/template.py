@@ -22,7 +22,7 @@ from calibration.cameras.camera import Camera, normalised_maps, project
 from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
-from disctrack.track import _kernels as kernels
+from disctrack.track.dots import _kernels as kernels
 from disctrack.trajectory import MarkerStatus
 
 TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet

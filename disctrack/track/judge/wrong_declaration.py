@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
-from disctrack.track.acquisition import (
+from disctrack.track.dots.acquisition import (
     EPIPOLAR_PX,
     MIN_EXPLAINED,
     SIDE_TOLERANCE,
     rigid_motions,
     seen_by_one_camera,
 )
-from disctrack.track.as_printed import declared_places_kept
-from disctrack.track.doubts import misplaced_in_words
+from disctrack.track.judge.doubts import misplaced_in_words
+from disctrack.track.refine.self_calibration import declared_places_kept
 
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
 UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}

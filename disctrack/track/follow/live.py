@@ -14,11 +14,11 @@ from calibration.kit.arrays import Array, Image, Mask
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS
-from disctrack.track.assembly import MIN_GOOD_DOT_IMAGES, TrackingSettings
-from disctrack.track.dots import dot_centres
-from disctrack.track.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
+from disctrack.track.dots.template import dot_centres
+from disctrack.track.follow.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
+from disctrack.track.follow.tracking import check_images
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
-from disctrack.track.tracking import check_images
+from disctrack.track.refine.assembly import MIN_GOOD_DOT_IMAGES, TrackingSettings
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc, has_mirror_axis
 from disctrack.frames import CAMERAS
-from disctrack.track.acquisition import acquire
+from disctrack.track.dots.acquisition import acquire
 
 Turn = Callable[[NDArray], NDArray]
 MIRRORED: dict[str, Turn] = {

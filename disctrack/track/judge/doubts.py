@@ -7,10 +7,10 @@ import numpy as np
 from calibration.kit.arrays import Array, Mask
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
-from disctrack.track.following import Follower
-from disctrack.track.own_scatter import Scatter, SharedFaults
-from disctrack.track.pose_scatter import GROUPS, PoseScatter
-from disctrack.track.table_contact import TableFromDisc
+from disctrack.track.follow.following import Follower
+from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
+from disctrack.track.refine.pose_scatter import GROUPS, PoseScatter
+from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
 MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disctrack.track import slips
+from disctrack.track.judge import dropped_frames as slips
 
 
 @pytest.mark.parametrize(

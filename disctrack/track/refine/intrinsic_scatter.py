@@ -13,8 +13,14 @@ import numpy as np
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
 from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
-from disctrack.track.as_printed import DOT_SIGMA, DotsInFrames, declared_places_kept, fit_shared, places_sigma
 from disctrack.track.pose import PoseFits, whitening
+from disctrack.track.refine.self_calibration import (
+    DOT_SIGMA,
+    DotsInFrames,
+    declared_places_kept,
+    fit_shared,
+    places_sigma,
+)
 
 _AT_ONCE = 4096  # frames
 MIN_FRAMES = 20

@@ -25,8 +25,8 @@ from disctrack.recording.readers.file_numbers import check_same_numbers
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.part import frames_in_parts, image_parts
 from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
-from disctrack.track.motion_span import MotionSpan, find_motion
-from disctrack.track.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.follow.motion_span import MotionSpan, find_motion
+from disctrack.track.follow.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 from disctrack.trajectory.file import Provenance
 

@@ -10,9 +10,9 @@ from scipy.optimize import minimize
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_euler, rotation_from_quaternion, rotation_from_vector, vector_from_rotation
 from disctrack.synthetic.description import CameraFault, Faults
-from disctrack.track.as_printed import declared_places_kept, motions_of_pattern, pattern_place
-from disctrack.track.own_scatter import split_scatter, without_shared_faults
 from disctrack.track.pose import fit_poses
+from disctrack.track.refine.intrinsic_scatter import split_scatter, without_shared_faults
+from disctrack.track.refine.self_calibration import declared_places_kept, motions_of_pattern, pattern_place
 from tests.oracles.measured_disc import SIGMA_PX, measured
 
 N = 160

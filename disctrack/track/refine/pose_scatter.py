@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
-from disctrack.track.judging import sums_over_time
+from disctrack.track.judge.outlier_tests import sums_over_time
 from disctrack.track.pose import PoseFits
 
 # The frame itself first: turns are taken from there.

@@ -30,9 +30,9 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS
+from disctrack.track.dots.template_response import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import side_by_side
-from disctrack.track.template_pull import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
 OF_SMEAR = 500  # frames at most that the smear is taken from

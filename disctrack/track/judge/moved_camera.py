@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig
 from disctrack.disc import Disc
 from disctrack.frames import vector_from_rotation
-from disctrack.track.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
-from disctrack.track.as_printed import MIN_FRAMES, refine_as_built
+from disctrack.track.dots.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
 from disctrack.track.pose import fit_poses
+from disctrack.track.refine.self_calibration import MIN_FRAMES, refine_as_built
 
 BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without anybody's notice: prior sigmas

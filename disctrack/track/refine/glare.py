@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
+from disctrack.track.dots.template_response import Pull, plane_to_image, pulls_by_contrast, turned_to_axes
 from disctrack.track.pose import marker_pixels
-from disctrack.track.template_pull import Pull, plane_to_image, pulls_by_contrast, turned_to_axes
 
 DEGREE = 4  # of the polynomial: a gleam as wide as the disc's path
 POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]

@@ -1,0 +1,1 @@
+"""Where the dots are: in one image, and without any prior in two."""

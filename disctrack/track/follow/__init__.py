@@ -1,0 +1,1 @@
+"""The disc followed through blocks of image pairs."""

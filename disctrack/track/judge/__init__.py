@@ -1,0 +1,1 @@
+"""Which dots, poses and declarations are to be believed."""

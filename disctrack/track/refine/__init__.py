@@ -1,0 +1,1 @@
+"""What all frames share is refined over the whole sequence."""
