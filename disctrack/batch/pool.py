@@ -197,7 +197,8 @@ class _Worker:
         """Said : file for whatever its libraries print"""
         context = _Spawn()
         self.share: c_double = context.RawValue("d", 0.0)  # without a lock: one writes, and nobody waits for the dead
-        self.executor = ProcessPoolExecutor(1, context, _prepare, (self.share, said))
+        with _STARTING, _quietly():  # with the first one Python starts its process that clears up semaphores
+            self.executor = ProcessPoolExecutor(1, context, _prepare, (self.share, said))
         self._context, self._said = context, said
 
     @property

@@ -166,19 +166,35 @@ def test_a_batch_killed_at_fifty_instants_leaves_only_whole_results_and_can_go_o
 
 
 @pytest.mark.statistical
-def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_path):
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_path, kind):
     day = a_day(recording, tmp_path / "day", tuple("abcdefgh"))  # more than are done while this process looks
     process = start(day)
     wait_until(lambda: begun(day), process)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes
+    os.killpg(process.pid, kind)  # as a terminal does: to all processes
     said, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130
+    assert process.returncode == 128 + kind
     assert "interrupted before it was done" in said
-    assert errors.splitlines()[-1].startswith("disctrack: interrupted")
+    word = "interrupted" if kind == signal.SIGINT else f"ended by {kind.name}"
+    assert any(line.startswith(f"disctrack: {word}") for line in errors.splitlines())
     assert "Traceback" not in errors
     assert not list(day.rglob("*.part*"))  # a lock's file may stay: it has no effect without its holder
     statuses = json.loads((day / "batch_results" / "summary.json").read_text())["counts"]
     assert statuses["not measured"] > 0
+
+
+@pytest.mark.statistical
+def test_processes_end_with_a_batch_that_is_killed(recording, tmp_path):
+    """Only the batch itself, as when memory runs out: the recording at work must not stay locked."""
+    day = a_day(recording, tmp_path / "day", tuple("abcdefgh"))
+    process = start(day)
+    wait_until(lambda: begun(day), process)
+    process.kill()
+    process.communicate(timeout=PATIENCE)
+    for name in NAMES:
+        (day / name / "results").mkdir(exist_ok=True)
+        with locked(day / name / "results" / LOCK, wait=30.0):
+            pass
 
 
 @pytest.mark.statistical
