@@ -36,7 +36,8 @@ _N_NODES = 8
 _SQRT_HALF = math.sqrt(0.5)
 
 # What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices
-# assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop.
+# assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop. A literal
+# is given as a number of NumPy's: numba compiles a function once for each literal, and once for its type.
 _OPTIONS: dict[str, Any] = {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _part = njit(**_OPTIONS)
 
@@ -201,7 +202,7 @@ def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance
     L = np.zeros((N_CORNER, N_CORNER))
     covariance[:] = np.nan
     weights = np.empty((max(int(window[3] - window[2]) + 1, 1), max(int(window[1] - window[0]) + 1, 1)))
-    sums = normal_equations(image, window, p, known, noise, weights, True, H, g)
+    sums = normal_equations(image, window, p, known, noise, weights, np.bool_(True), H, g)
     if sums[1] < 4 * N_CORNER:
         return sums, False
     damping, converged = 1e-3, False
@@ -221,7 +222,7 @@ def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance
         reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
         accepted = reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
         if accepted:
-            sums_new = normal_equations(image, window, trial, known, noise, weights, False, H_new, g_new)
+            sums_new = normal_equations(image, window, trial, known, noise, weights, np.bool_(False), H_new, g_new)
             accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
         if accepted:
             blur_step = trial[4] - p[4]  # as clamped: edges sharper than the pixel hold it at its lower bound

@@ -210,7 +210,7 @@ def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
     psi, theta = y[2], y[3]
     s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
     w1, w2, w3 = y[5], y[6], y[7]
-    k.time, k.x, k.y, k.psi, k.theta, k.phi = t[0], y[0], y[1], psi, theta, y[4]
+    k.time, k.x, k.y, k.psi, k.theta, k.phi = t, y[0], y[1], psi, theta, y[4]
     k.sin_theta, k.cos_theta, k.thetadot, k.omega2, k.omega3 = s, c, w1, w2, w3
     arm, normal, k.z = _contact(body, k)
     turn = _cross((w1, w2, w3), arm)  # omega x r_OA
@@ -326,6 +326,15 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
 
 
 @_part
+def _state(regime: int, y: Any) -> Any:
+    """All twelve components; zeros for those that a regime does not have: so that all below is compiled once."""
+    zero = 0.0 * y[0]
+    v_x, v_y = (y[8], y[9]) if regime != ROLLING else (zero, zero)
+    z, v_z = (y[10], y[11]) if regime == FLYING else (zero, zero)
+    return (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], v_x, v_y, z, v_z)
+
+
+@_part
 def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
     load = _course_of_load(t, y, table, body, kin, wrench)
     slide = _creeping(t, y, table, body, kin, wrench)
@@ -382,23 +391,20 @@ def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any
     nothing = 0.0 * y[0]
     if body.compliance == 0.0 or table[0] == FLYING:
         return nothing, nothing, nothing
-    slips = table[0] == SLIPPING
-    v_x, v_y = (y[8], y[9]) if slips else (nothing, nothing)
-    here = (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], v_x, v_y, nothing, nothing)
     held = (nothing, nothing, nothing)
-    if slips and body.inverse_friction != 0.0:
+    if table[0] == SLIPPING and body.inverse_friction != 0.0:
         # slip that creeps follows its force at once, and turns any way within LOAD_STEP: its direction is held then
-        _kinematics(table[0], t, here, body, kin)
+        _kinematics(table[0], t, y, body, kin)
         slow = 3.0 * LOAD_STEP * kin.gravity / body.inverse_friction
         speed2, slow2 = kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m, slow * slow
         held = (kin.slip_n, kin.slip_m, slow2 * slow2 / (slow2 * slow2 + speed2 * speed2))
-    first = _flow((t[0],), here, held, table, body, kin, wrench)
+    first = _flow(t, y, held, table, body, kin, wrench)
     now, h = wrench.F_z, LOAD_STEP
-    middle = _flow((t[0] + 0.5 * h,), _moved(here, 0.5 * h, first), held, table, body, kin, wrench)
-    _flow((t[0] + h,), _moved(here, h, middle), held, table, body, kin, wrench)
+    middle = _flow(t + 0.5 * h, _moved(y, 0.5 * h, first), held, table, body, kin, wrench)
+    _flow(t + h, _moved(y, h, middle), held, table, body, kin, wrench)
     after = wrench.F_z
-    middle = _flow((t[0] - 0.5 * h,), _moved(here, -0.5 * h, first), held, table, body, kin, wrench)
-    _flow((t[0] - h,), _moved(here, -h, middle), held, table, body, kin, wrench)
+    middle = _flow(t - 0.5 * h, _moved(y, -0.5 * h, first), held, table, body, kin, wrench)
+    _flow(t - h, _moved(y, -h, middle), held, table, body, kin, wrench)
     before = wrench.F_z
     return now, (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
 
@@ -423,17 +429,16 @@ def _creeping(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> A
     if body.creep == 0.0 or table[0] != ROLLING:
         return nothing, nothing, nothing, nothing
     c, h = body.creep, LOAD_STEP
-    here = (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], nothing, nothing, nothing, nothing)
     f, a_x, a_y, j_x, j_y = (nothing, nothing), nothing, nothing, nothing, nothing
     # the force that accelerates what creeps is part of the force by which it creeps
     for _ in range(CREEP_PASSES):
-        f, first = _pull(t, here, a_x, a_y, table, body, kin, wrench)
-        half = (t[0] + 0.5 * h,), _moved(here, 0.5 * h, first), a_x + 0.5 * j_x, a_y + 0.5 * j_y
+        f, first = _pull(t, y, a_x, a_y, table, body, kin, wrench)
+        half = t + 0.5 * h, _moved(y, 0.5 * h, first), a_x + 0.5 * j_x, a_y + 0.5 * j_y
         _, middle = _pull(half[0], half[1], half[2], half[3], table, body, kin, wrench)
-        after, _ = _pull((t[0] + h,), _moved(here, h, middle), a_x + j_x, a_y + j_y, table, body, kin, wrench)
-        half = (t[0] - 0.5 * h,), _moved(here, -0.5 * h, first), a_x - 0.5 * j_x, a_y - 0.5 * j_y
+        after, _ = _pull(t + h, _moved(y, h, middle), a_x + j_x, a_y + j_y, table, body, kin, wrench)
+        half = t - 0.5 * h, _moved(y, -0.5 * h, first), a_x - 0.5 * j_x, a_y - 0.5 * j_y
         _, middle = _pull(half[0], half[1], half[2], half[3], table, body, kin, wrench)
-        before, _ = _pull((t[0] - h,), _moved(here, -h, middle), a_x - j_x, a_y - j_y, table, body, kin, wrench)
+        before, _ = _pull(t - h, _moved(y, -h, middle), a_x - j_x, a_y - j_y, table, body, kin, wrench)
         a_x, a_y = -c * (after[0] - before[0]) / (2.0 * h), -c * (after[1] - before[1]) / (2.0 * h)
         j_x, j_y = -c * (after[0] - 2.0 * f[0] + before[0]) / h, -c * (after[1] - 2.0 * f[1] + before[1]) / h
     return -c * f[0], -c * f[1], a_x, a_y
@@ -441,8 +446,9 @@ def _creeping(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> A
 
 def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
     """Time derivative of the state; fills kinematics and wrench on the way."""
-    found, slide = _evaluate(t, y, table, body, kin, wrench)
-    rate = _rates_of(y, kin, found)
+    state = _state(table[0], y)
+    found, slide = _evaluate(t[0], state, table, body, kin, wrench)
+    rate = _rates_of(state, kin, found)
     ydot[0], ydot[1], ydot[2], ydot[3], ydot[4] = rate[0] + slide[0], rate[1] + slide[1], rate[2], rate[3], rate[4]
     ydot[5], ydot[6], ydot[7] = rate[5], rate[6], rate[7]
     if table[0] != ROLLING:
@@ -458,7 +464,7 @@ def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, 
     theta_end: nutation above its end. load: N, or in flight the gap. grip: rolling N - |F_t|/mu, slipping the slip
     speed. upright: the lower rim alone touches; beyond pi/2 it would be the other one.
     """
-    _evaluate(t, y, table, body, kin, wrench)
+    _evaluate(t[0], _state(table[0], y), table, body, kin, wrench)
     margin[0] = kin.theta - body.theta_end
     margin[3] = 0.5 * np.pi - kin.theta
     margin[1] = wrench.N

@@ -140,7 +140,7 @@ def _stages(
 def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, box: Any, y_new: Any) -> None:
     """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
     A, B, C, _, _, _ = tableau
-    _stages(rates, args, t, y, h, 1, B.size, A, C, K, box)
+    _stages(rates, args, t, y, h, np.int64(1), B.size, A, C, K, box)  # a literal is a type of its own
     for k in range(y.size):
         total = B[0] * K[0, k]
         for i in range(1, B.size):
@@ -314,7 +314,7 @@ def _dop853(
         size[0] = max(size[0], abs(y[k].imag) / atol[k])
     _call(rates, t, y, K[0], box[1], args)
     _call(margins, t, y, margin, box[1], args)
-    h_next, i_grid = _first_step(y, K[0], atol), 0
+    h_next, i_grid = _first_step(y, K[0], atol), np.int64(0)
     for steps in range(max_steps):
         t_last[0] = t
         _assign(y_last, y)
