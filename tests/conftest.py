@@ -2,6 +2,8 @@
 
 import os
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +33,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the inner loops once, before each of several workers does."""
+    if getattr(session.config.option, "numprocesses", None) and not session.config.option.collectonly:
+        subprocess.run([sys.executable, "-m", "disctrack", "warm-up"], cwd=REPOSITORY, check=True, capture_output=True)
 
 
 @pytest.hookimpl(wrapper=True)
