@@ -254,7 +254,7 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=_seed, help="of the first recording; the others count up from it")
     parser.add_argument("-j", "--jobs", type=_positive, default=1, help="processes (%(default)s)")
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path("validation"), help="folder for tables and pictures (%(default)s)"
+        "-o", "--output", type=Path, default=Path("validation"), help="folder for the tables (%(default)s)"
     )
     parser.add_argument("--write", type=Path, metavar="FILE", help="also put the tables into this Markdown page")
     parser.add_argument("--quiet", action="store_true", help="do not tell of every recording")

@@ -4,20 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from calibration.kit.arrays import Array
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.validate.errors import (
     QUANTITIES,
     Consistency,
-    ErrorStatistics,
     PoseErrors,
     calibration_consistency,
     joined,
     mean_errors,
     noise_consistency,
-    spread,
 )
 from disctrack.validate.rendered import EXPOSURE, IMPERFECT, STATIC, STRATA_DEG, RenderedOutcome
 from disctrack.validate.tables import Table, Validation
@@ -34,17 +31,16 @@ Pair = tuple[PoseErrors, PoseErrors]  # through the own calibration, through the
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """Errors of one quantity: everything, and its two shares measured on the same images."""
+    """Errors of one quantity [m or rad]: everything, and its two shares measured on the same images."""
 
     quantity: str
-    total: ErrorStatistics  # through the recordings' own calibrations
-    noise: ErrorStatistics  # through the true cameras
-    calibration: ErrorStatistics  # the difference of the two
-
-    @property
-    def unit(self) -> tuple[float, str]:
-        """Factor and name of the unit on a page."""
-        return (_UM, "um") if self.quantity in "xyz" else (_MDEG, "mdeg")
+    n: int
+    bias: float
+    scatter: float  # about the bias
+    within_95: float  # 95 % of |error| lie within
+    largest: float
+    noise_rms: float  # through the true cameras
+    calibration_rms: float  # difference of the recordings' own and the true cameras
 
     @property
     def claim(self) -> float:
@@ -54,7 +50,7 @@ class AccuracyRow:
     @property
     def holds(self) -> bool:
         """95 % of the errors lie within the claim."""
-        return self.total.within_95 <= self.claim
+        return self.within_95 <= self.claim
 
 
 @dataclass(frozen=True)
@@ -121,8 +117,16 @@ def _rows(pairs: Sequence[Pair]) -> tuple[AccuracyRow, ...]:
         at = regular if name in ("psi", "phi") and regular.any() else both
         e, f = own.part(at).of(name), true.part(at).of(name)
         difference = e - f if name in "xyz" else np.angle(np.exp(1j * (e - f)))
-        rows.append(AccuracyRow(name, spread(e), spread(f), spread(difference)))
+        rows.append(AccuracyRow(name, len(e), *_spread(e), _rms(f), _rms(difference)))
     return tuple(rows)
+
+
+def _spread(errors: Array) -> tuple[float, float, float, float]:
+    """Mean, standard deviation, 95 % and largest of the sizes; NaN where there is no error."""
+    if not errors.size:
+        return float("nan"), float("nan"), float("nan"), float("nan")
+    size = np.abs(errors)
+    return float(errors.mean()), float(errors.std()), float(np.quantile(size, 0.95)), float(size.max())
 
 
 def _sight(own: PoseErrors, cameras: int) -> SightCount:
@@ -138,8 +142,8 @@ def _rms(errors: Array) -> float:
 def verdict(accuracy: Accuracy) -> str:
     """Where the claim holds, where it cannot, and by which factor it is beaten; all from the numbers."""
     rows = {row.quantity: row for row in accuracy.rows[STATIC]}
-    position = max(rows[name].total.within_95 for name in "xyz")
-    rotation = rows["rotation"].total.within_95
+    position = max(rows[name].within_95 for name in "xyz")
+    rotation = rows["rotation"].within_95
     two, one, _ = accuracy.sights
     missed = two.n - two.found + two.gross
     held = {position <= CLAIM_POSITION, rotation <= CLAIM_ROTATION}
@@ -188,8 +192,7 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     accuracy, parts = sum_up(outcomes), _parts(outcomes)
     tables = [_accuracy_table(kind, rows) for kind, rows in accuracy.rows.items()]
     tables += [_strata_table(accuracy.law, parts[STATIC]), _sight_table(accuracy), _consistency_table(accuracy)]
-    picture, bad = error_figure(parts, accuracy.law), complaints(accuracy)
-    return Validation("validation", verdict(accuracy), tables, [accuracy], bad, accuracy.warnings, picture)
+    return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), accuracy.warnings)
 
 
 def _cells(*values: float) -> list[str]:
@@ -201,14 +204,15 @@ def _accuracy_table(kind: str, rows: Sequence[AccuracyRow]) -> Table:
             "calibration rms", "claim", "claim / 95 %"]  # fmt: skip
     lines = []
     for row in rows:
-        (k, unit), t = row.unit, row.total
-        figures = _cells(
-            *(k * v for v in (t.bias, t.scatter, t.within_95, t.largest, row.noise.rms, row.calibration.rms))
+        k, unit = (_UM, "um") if row.quantity in "xyz" else (_MDEG, "mdeg")
+        errors = (row.bias, row.scatter, row.within_95, row.largest, row.noise_rms, row.calibration_rms)
+        cells = _cells(*(k * error for error in errors))
+        lines.append(
+            [row.quantity, unit, str(row.n), *cells, f"{k * row.claim:.0f}", f"{row.claim / row.within_95:.1f}"]
         )
-        lines.append([row.quantity, unit, str(t.n), *figures, f"{k * row.claim:.0f}", f"{row.claim / t.within_95:.1f}"])
     note = "Rotation: the rotation vector between measured and true attitude."
     by_name = {row.quantity: row for row in rows}
-    if by_name["psi"].total.n < by_name["theta"].total.n:
+    if by_name["psi"].n < by_name["theta"].n:
         note = f"psi and phi from {REGULAR_DEG:.0f} deg of nutation on. {note}"
     if kind != STATIC:
         note += (
@@ -269,32 +273,3 @@ def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     note = "Mean error +- what is stated for it, in um and mdeg; scatter about the mean below."
     headline = f"Mean errors in {len(outcomes)} recordings of an imperfect laboratory."
     return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note)], found)
-
-
-def error_figure(parts: dict[str, list[Pair]], law: float) -> Figure:
-    """|error| of every pose seen by both cameras against nutation, with the claim and the law of psi and phi."""
-    from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, RED
-
-    chart = Figure(figsize=(13, 4.6), layout="constrained")
-    panels = chart.subplots(1, 3, sharex=True)
-    names = (("x", "y", "z"), ("rotation x", "y", "z"), ("psi", "theta", "phi"))
-    colours = ((BLUE, AMBER, RED), (BLUE, AMBER, RED), (PURPLE, MUTED, GREEN))
-    for k, panel in enumerate(panels):
-        scale, claim = (_UM, CLAIM_POSITION) if k == 0 else (180 / np.pi, CLAIM_ROTATION)
-        for part, pairs in parts.items():
-            own = joined([own for own, _ in pairs])
-            own = own.part(own.usable)
-            size = scale * np.abs(own.angles if k == 2 else own.error[:, 3 * k : 3 * k + 3])
-            for values, colour, name in zip(size.T, colours[k], names[k], strict=True):
-                label = name if part == STATIC else None
-                panel.plot(np.degrees(own.q[:, 4]), values, "o" if part == STATIC else ".", color=colour, label=label)
-        panel.axhline(scale * claim, color=INK, ls="--", label="claim")
-        panel.set(
-            xscale="log", yscale="log", xlabel="nutation (deg)", ylabel="|error| (µm)" if k == 0 else "|error| (deg)"
-        )
-    theta = np.geomspace(0.45, 90, 200)
-    panels[2].plot(theta, np.degrees(law) / np.sin(np.radians(theta)), color=INK, label="1 / sin(theta)")
-    for panel in panels:
-        panel.legend(fontsize=8)
-    chart.suptitle("Errors through the recordings' own calibrations (circles: static, dots: rolling)")
-    return chart

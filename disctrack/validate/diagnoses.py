@@ -51,7 +51,6 @@ class Verdict:
     case: HiddenCase
     n: int  # frames
     verdict: str
-    sentence: str
     found: tuple[str, ...]  # every effect claimed, its class after it in brackets
     named: bool  # every hidden effect is among those claimed, or in the class of one
     pull: float  # largest error of a coefficient in its sigmas; NaN where it is not named
@@ -129,7 +128,6 @@ def hide(case: HiddenCase) -> Verdict:
         case,
         len(trajectory),
         d.verdict,
-        result.sentence,
         tuple(_with_class(f.candidate.name, [r.candidate.name for r in f.cannot_be_told_from]) for f in d.found),
         named=None not in pulls,
         pull=max((p for p in pulls if p is not None), default=nan),
@@ -278,20 +276,12 @@ def _rates_table(verdicts: Sequence[Verdict]) -> Table:
     for hidden, group in groups.items():
         counts = ([v.can_be_told, v.named, v.within, v.at_noise, v.extra > 0] for v in group)
         shares = [f"{sum(column)}/{len(group)}" for column in zip(*counts, strict=True)]
-        medians = [np.median([f(v) for v in group]) for f in (_stands_out, found_from, _seconds)]
+        medians = np.median([(v.stands_out, found_from(v), v.seconds) for v in group], axis=0)
         names, sizes = zip(*hidden, strict=True)
         rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *map(figure, medians)])
     head = ["hidden", "size", "can be told", "named", "within 3 sigma", "noise left", "claim too many",
             "stands out by, sigma", "found from", "time, s"]  # fmt: skip
     return Table("What was hidden, and what became of it", head, rows, "Sizes in SI units; the last three are medians.")
-
-
-def _stands_out(v: Verdict) -> float:
-    return v.stands_out
-
-
-def _seconds(v: Verdict) -> float:
-    return v.seconds
 
 
 def _levels_table(p_values: Sequence[float]) -> Table:

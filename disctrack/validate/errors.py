@@ -53,9 +53,7 @@ class PoseErrors:
 
     def part(self, rows: Mask) -> PoseErrors:
         """The poses where `rows` (n,) is True."""
-        return PoseErrors(
-            self.q[rows], self.error[rows], self.angles[rows], self.covariance[rows], self.calibration_covariance[rows]
-        )
+        return PoseErrors(*(values[rows] for values in vars(self).values()))
 
 
 def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
@@ -74,34 +72,6 @@ def joined(parts: Sequence[PoseErrors]) -> PoseErrors:
     """All poses of several comparisons."""
     names = PoseErrors.__dataclass_fields__
     return PoseErrors(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-@dataclass(frozen=True)
-class ErrorStatistics:
-    """Statistics of one quantity's errors [m or rad]."""
-
-    n: int
-    bias: float  # mean
-    scatter: float  # standard deviation about the mean
-    rms: float
-    within_95: float  # 95 % of |error| lie within
-    largest: float
-
-
-def spread(errors: Array) -> ErrorStatistics:
-    """Statistics of errors (n,); NaN where there is none."""
-    errors = np.asarray(errors, float)
-    if errors.size == 0:
-        return ErrorStatistics(0, *5 * (float("nan"),))
-    size = np.abs(errors)
-    return ErrorStatistics(
-        int(errors.size),
-        float(errors.mean()),
-        float(errors.std()),
-        float(np.sqrt(np.mean(errors**2))),
-        float(np.quantile(size, 0.95)),
-        float(size.max()),
-    )
 
 
 @dataclass(frozen=True)

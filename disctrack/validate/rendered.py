@@ -287,23 +287,19 @@ def _inside(q: Array, rig: StereoRig, disc: Disc) -> bool:
     return bool(np.all((pixels > BORDER_PX) & (pixels < size - 1 - BORDER_PX)))
 
 
-def dots_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
-    """(n, 2 cameras) number of dots that geometry lets a camera resolve in the poses q (n, 6).
+def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
+    """(n,) cameras that see enough dots for a pose of their own, 2, 1 or 0, in the poses q (n, 6).
 
-    The upper face must be turned to the camera, and the dot's image, an ellipse of semi-minor axis
+    The upper face must be turned to the camera, and a dot's image, an ellipse of semi-minor axis
     f R cos(gamma) / distance, must not be flatter than SMALLEST_SEMI_MINOR_PX.
     """
-    R = rotation_from_euler(q[:, 3], q[:, 4], q[:, 5])
+    R = rotation_from_euler(*q[:, 3:].T)
     dots = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]
-    counts = []
+    cameras = np.zeros(len(q), np.int64)
     for camera, (R_cw, t_cw) in zip(rig.cameras, rig.camera_poses(), strict=True):
         ray = -R_cw.T @ t_cw - dots
         distance = np.linalg.norm(ray, axis=-1)
         cosine = np.einsum("nmi,ni->nm", ray, R[:, :, 2]) / distance
-        counts.append(np.sum(camera.fx * disc.marker_diameter / 2 * cosine / distance > SMALLEST_SEMI_MINOR_PX, axis=1))
-    return np.stack(counts, axis=1)
-
-
-def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
-    """(n,) cameras that see enough dots for a pose of their own: 2, 1 or 0."""
-    return np.sum(dots_in_sight(q, rig, disc) >= FEWEST_DOTS, axis=1)
+        semi_minor = camera.fx * disc.marker_diameter / 2 * cosine / distance
+        cameras += np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=1) >= FEWEST_DOTS
+    return cameras

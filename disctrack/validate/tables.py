@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from datetime import date
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
 from disctrack.files.whole import make_folder, write_whole
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Case = TypeVar("Case")
 Outcome = TypeVar("Outcome")
@@ -48,7 +45,6 @@ class Validation:
     outcomes: Sequence[object]  # dataclasses: one for each case, or sums over them
     complaints: Sequence[str] = ()  # what a validation must not show
     remarks: Sequence[str] = ()  # what a reader should look at
-    picture: "Figure | None" = None
 
     def markdown(self) -> str:
         """The headline, what is wrong, and all tables."""
@@ -71,17 +67,13 @@ def measure_all(measure: Callable[[Case], Outcome], cases: Sequence[Case], proce
 
 
 def write_validation(folder: Path, validation: Validation) -> list[Path]:
-    """Write NAME.md, NAME.json and NAME.png where there is a picture; returns the files. Raises OutputError."""
+    """Write NAME.md and NAME.json; returns the files. Raises OutputError."""
     make_folder(folder)
     files = [folder / f"{validation.name}.md", folder / f"{validation.name}.json"]
     write_whole(files[0], validation.markdown().encode())
     tree = {"units": "SI, radians", "headline": validation.headline, "complaints": validation.complaints}
     outcomes = [asdict(outcome) for outcome in validation.outcomes]  # type: ignore[call-overload]
     write_whole(files[1], json_file(tree | {"outcomes": outcomes}))
-    if validation.picture is not None:
-        from disctrack.pages.figures import save_figure
-
-        files.append(save_figure(validation.picture, folder / f"{validation.name}.png"))
     return files
 
 
