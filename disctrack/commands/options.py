@@ -230,15 +230,10 @@ def add_warm_up(parser: argparse.ArgumentParser) -> None:
 
 def add_validate(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack validate`."""
-    parser.add_argument(
-        "--recordings",
-        type=_positive,
-        metavar="N",
-        help="rendered recordings, each with its own cameras and chessboards (default: 3)",
-    )
+    parser.add_argument("--recordings", type=_positive, metavar="N", help="that are rendered and measured (default: 3)")
     parser.add_argument("--quick", action="store_true", help="small images and few of everything: half a minute")
     parser.add_argument(
-        "--imperfect", type=_positive, metavar="N", default=0, help="instead: N recordings of an imperfect laboratory"
+        "--imperfect", type=_positive, metavar="N", default=0, help="N of an imperfect laboratory instead"
     )
     parser.add_argument(
         "--diagnosis",
@@ -249,13 +244,11 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=_positive, default=6, help="recordings for each hidden effect (%(default)s)")
     parser.add_argument("--pairs", type=_positive, default=0, metavar="N", help="hide N pairs of effects instead")
     parser.add_argument(
-        "--frame-rate", type=_positive_number, default=1000.0, help="of recordings to diagnose, in Hz (%(default)s)"
+        "--frame-rate", type=_positive_number, default=1000.0, help="to diagnose at, in Hz (%(default)s)"
     )
     parser.add_argument("--seed", type=_seed, help="of the first recording; the others count up from it")
     parser.add_argument("-j", "--jobs", type=_positive, default=1, help="processes (%(default)s)")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("validation"), help="folder for the tables (%(default)s)"
-    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("validation"), help="folder of tables (%(default)s)")
     parser.add_argument("--write", type=Path, metavar="FILE", help="also put the tables into this Markdown page")
     parser.add_argument("--quiet", action="store_true", help="do not tell of every recording")
 

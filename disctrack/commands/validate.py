@@ -3,18 +3,13 @@
 import argparse
 import shlex
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
 
 from disctrack.commands import DONE, FAILED
 from disctrack.files.whole import make_folder
-from disctrack.validate import accuracy, diagnoses
-from disctrack.validate.rendered import ideal_case, imperfect_case, render_and_measure, scene_of
-from disctrack.validate.tables import Case, Outcome, Validation, measure_all, write_into, write_validation
-
-FIRST_SEED = {"poses": 2014, "diagnosis": 1}
-# static poses, frames of either stretch of rolling, all recordings together; a recording has at least FEWEST of each
-FULL, QUICK, FEWEST = (96, 90, 90), (40, 24, 24), 12
+from disctrack.validate.accuracy import accuracy_validation, imperfect_validation
+from disctrack.validate.diagnoses import diagnosis_validation, hidden_cases, hide
+from disctrack.validate.rendered import render_and_measure, rendered_cases
+from disctrack.validate.tables import Validation, measure_all, write_into, write_validation
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -33,29 +28,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _validation(a: argparse.Namespace) -> Validation:
-    first = FIRST_SEED["poses" if a.diagnosis is None else "diagnosis"] if a.seed is None else a.seed
+    say = (lambda text: None) if a.quiet else (lambda text: print(text, file=sys.stderr, flush=True))
     if a.diagnosis is not None:
-        seeds = range(first, first + a.seeds)
-        hidden = list(diagnoses.hidden_cases(a.diagnosis, seeds, a.pairs, a.frame_rate))
-        return diagnoses.diagnosis_validation(_outcomes(diagnoses.hide, hidden, a))
-    recordings = a.imperfect or a.recordings or (1 if a.quick else 3)
-    scenes = [scene_of(first + k, a.quick) for k in range(recordings)]
-    if a.imperfect:
-        cases = [imperfect_case(scene, 60 if a.quick else 200) for scene in scenes]
-        return accuracy.imperfect_validation(_outcomes(render_and_measure, cases, a))
-    share = [max(FEWEST, -(-total // recordings)) for total in (QUICK if a.quick else FULL)]
-    cases = [ideal_case(scene, *share) for scene in scenes]
-    return accuracy.accuracy_validation(_outcomes(render_and_measure, cases, a))
-
-
-def _outcomes(measure: Callable[[Case], Outcome], cases: Sequence[Case], a: argparse.Namespace) -> list[Outcome]:
-    began = time.perf_counter()
-
-    def told() -> Iterator[Outcome]:
-        for k, outcome in enumerate(measure_all(measure, cases, a.jobs), 1):
-            if not a.quiet:
-                said = f"{time.perf_counter() - began:6.0f} s  {k} of {len(cases)} recordings"
-                print(said, file=sys.stderr, flush=True)
-            yield outcome
-
-    return list(told())
+        first = 1 if a.seed is None else a.seed
+        hidden = hidden_cases(a.diagnosis, range(first, first + a.seeds), a.pairs, a.frame_rate)
+        return diagnosis_validation(measure_all(hide, list(hidden), a.jobs, say))
+    cases = rendered_cases(a.imperfect or a.recordings, 2014 if a.seed is None else a.seed, a.quick, a.imperfect > 0)
+    sum_up = imperfect_validation if a.imperfect else accuracy_validation
+    return sum_up(measure_all(render_and_measure, cases, a.jobs, say))

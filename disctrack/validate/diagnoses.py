@@ -24,12 +24,7 @@ from disctrack.validate.tables import Table, Validation, figure
 
 FRAME_RATE = 1000.0  # [Hz] of the reference recordings
 DURATION = (0.4, 0.9)  # [s]
-THETA_DEG = (3.0, 15.0)
-NUTATION_SHARE = (0.02, 0.1)  # of the nutation angle
-OMEGA3 = (-2.0, 3.0)  # [rad/s]
-K_M_DRAWN = (0.2e-7, 0.5e-7)  # [m s^2]
 FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
-DRAWS = 200
 ENOUGH = 3.0  # [sigma] a coefficient may be off
 AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
 LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
@@ -86,24 +81,21 @@ def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Filmed:
     """A motion that lasts as long as it is filmed, whatever is planted in it."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
-    for _ in range(DRAWS):
-        theta = float(rng.uniform(*THETA_DEG))
+    for _ in range(200):
+        theta = float(rng.uniform(3.0, 15.0))  # [deg]
         n = int(rate * rng.uniform(*DURATION))
-        nutation = theta * float(rng.uniform(*NUTATION_SHARE))
-        filmed = Filmed(
-            seed, n, theta, nutation, float(rng.uniform(*OMEGA3)), float(rng.uniform(*K_M_DRAWN)), declared_rate=rate
-        )
+        nutation = theta * float(rng.uniform(0.02, 0.1))
+        omega3 = float(rng.uniform(-2.0, 3.0))  # [rad/s]
+        filmed = Filmed(seed, n, theta, nutation, omega3, float(rng.uniform(0.2e-7, 0.5e-7)), declared_rate=rate)
         model = Model(disc).with_values({"km.k_m": filmed.k_m} | dict(planted.effects))
         try:
-            start = steady_precession(
-                np.radians(theta), disc, omega3=filmed.omega3, nutation_amplitude=np.radians(nutation)
-            )
+            start = steady_precession(np.radians(theta), disc, omega3=omega3, nutation_amplitude=np.radians(nutation))
             motion = simulate(model, start, duration=1.03 * n / rate + 0.01, rate=rate)
         except DiscTrackError:  # no such precession
             continue
         if len(motion) > 1.02 * n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
             return filmed
-    raise DiscTrackError(f"no motion of {DURATION[0]} s among {DRAWS} drawn: what is planted stops the disc at once")
+    raise DiscTrackError(f"no motion of {DURATION[0]} s among those drawn: what is planted stops the disc at once")
 
 
 def plant(case: HiddenCase) -> tuple[list[Planted], Trajectory]:

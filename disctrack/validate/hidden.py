@@ -6,7 +6,6 @@ theirs. `CONTROLS` hide nothing that may be claimed.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -14,12 +13,10 @@ from numpy.random import Generator
 from disctrack.diagnosis.systematic import DOT_SIGMA
 from disctrack.errors import DiscTrackError
 from disctrack.rolling import CATALOGUE
-from disctrack.synthetic.description import CameraFault
-from disctrack.validate.points import ORDINARY, STATION, Laboratory, Planted
+from disctrack.synthetic.description import CameraFault, Scene
+from disctrack.validate.points import ORDINARY, STATION, Fields, Laboratory, Planted
 
 Plant = Callable[[float, Generator], Planted]
-
-N_DOTS = 6
 
 
 @dataclass(frozen=True)
@@ -78,9 +75,10 @@ def _clock(size: float, rng: Generator) -> Planted:
 
 
 def _misprint(size: float, rng: Generator) -> Planted:
-    which = int(rng.integers(N_DOTS))
+    n_dots = Scene().declared_disc.n_markers
+    which = int(rng.integers(n_dots))
     x, y = _direction(size, rng, 2)
-    places = [(0.0, 0.0)] * N_DOTS
+    places = [(0.0, 0.0)] * n_dots
     places[which] = (1e3 * x, 1e3 * y)
     return Planted({f"misprint_{which}.x": x, f"misprint_{which}.y": y}, faults={"misprint_mm": tuple(places)})
 
@@ -90,7 +88,7 @@ def _fault(field: str, *keys: str, factor: float = 1.0, null: float = 0.0) -> Pl
 
     def plant(size: float, rng: Generator) -> Planted:
         one = [size * _sign(rng)] if len(keys) == 1 else _direction(size, rng, len(keys))
-        return Planted(dict(zip(keys, one, strict=True)), faults={field: _in_scene(one, factor, null)})
+        return Planted(dict(zip(keys, one, strict=True)), faults=_in_scene(field, one, factor, null))
 
     return plant
 
@@ -102,17 +100,15 @@ def _camera(field: str, *keys: str, factor: float = 1.0, null: float = 0.0) -> P
         which = "left" if rng.random() < 0.5 else "right"
         one = _direction(size, rng, len(keys))
         truth = {f"{which}_{key}": v for key, v in zip(keys, one, strict=True)}
-        return Planted(truth, faults={which: CameraFault(**{field: _in_scene(one, factor, null)})})
+        return Planted(truth, faults={which: CameraFault(**_in_scene(field, one, factor, null))})
 
     return plant
 
 
-def _in_scene(numbers: list[float], factor: float, null: float) -> Any:
+def _in_scene(field: str, numbers: list[float], factor: float, null: float) -> Fields:
     scaled = tuple(null + factor * number for number in numbers)
-    return scaled if len(scaled) > 1 else scaled[0]
+    return {field: scaled if len(scaled) > 1 else scaled[0]}
 
-
-DEGREES, MM = 180 / np.pi, 1e3
 
 HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _motion("table_tilt", np.radians(0.35), "rad", "table_tilt.tilt_x", "table_tilt.tilt_y"),
@@ -153,23 +149,23 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _motion("inertia_product", 1e-8, "kg m^2", "inertia_product.J_13", "inertia_product.J_23"),
     HiddenEffect("time_offset", 1e-4, "s", _fault("right_delay_s", "time_offset.delay")),
     HiddenEffect("turned", 2e-4, "rad", _camera(
-        "rotation_deg", *(f"turned.rotation_{axis}" for axis in "xyz"), factor=DEGREES)),
+        "rotation_deg", *(f"turned.rotation_{axis}" for axis in "xyz"), factor=180 / np.pi)),
     HiddenEffect("shifted", 2e-4, "m", _camera(
-        "translation_mm", *(f"shifted.translation_{axis}" for axis in "xyz"), factor=MM)),
+        "translation_mm", *(f"shifted.translation_{axis}" for axis in "xyz"), factor=1e3)),
     HiddenEffect("focal", 1e-3, "1", _camera("focal_scale", "focal.change", null=1.0)),
     HiddenEffect("principal_point", 0.3, "px", _camera(
         "principal_point_change_px", "principal_point.x", "principal_point.y")),
     HiddenEffect("distortion", 0.05, "1", _camera("k1_change", "distortion.k1")),
     HiddenEffect("misprint", 2e-5, "m", _misprint),
     HiddenEffect("pattern_offset", 2e-5, "m", _fault(
-        "pattern_offset_mm", "pattern_offset.x", "pattern_offset.y", factor=MM)),
+        "pattern_offset_mm", "pattern_offset.x", "pattern_offset.y", factor=1e3)),
     HiddenEffect("pattern_rotation", 1e-3, "rad", _fault(
-        "pattern_turn_deg", "pattern_rotation.angle", factor=DEGREES), visible=False),
+        "pattern_turn_deg", "pattern_rotation.angle", factor=180 / np.pi), visible=False),
     HiddenEffect("pattern_scale", 1e-3, "1", _fault("pattern_scale", "pattern_scale.change", null=1.0)),
-    HiddenEffect("pattern_height", 5e-5, "m", _fault("pattern_height_mm", "pattern_height.offset", factor=MM)),
+    HiddenEffect("pattern_height", 5e-5, "m", _fault("pattern_height_mm", "pattern_height.offset", factor=1e3)),
     HiddenEffect("table_plane", 2e-4, "rad", _fault(
-        "table_turn_deg", "table_plane.tilt_x", "table_plane.tilt_y", factor=DEGREES)),
-    HiddenEffect("table_height", 5e-5, "m", _fault("table_height_mm", "table_height.offset", factor=MM)),
+        "table_turn_deg", "table_plane.tilt_x", "table_plane.tilt_y", factor=180 / np.pi)),
+    HiddenEffect("table_height", 5e-5, "m", _fault("table_height_mm", "table_height.offset", factor=1e3)),
     HiddenEffect("exposure_blur", 2e-3, "s", lambda size, _: Planted(
         {"exposure_blur.T2": size**2}, faults={"exposure_s": size})),
     HiddenEffect("ellipse_centre", 1.0, "1", lambda size, _: Planted(

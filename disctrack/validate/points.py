@@ -29,6 +29,7 @@ from disctrack.synthetic.description import Faults, Scene
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
 
+Fields = Mapping[str, Any]  # of a dataclass of the scene
 Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
@@ -63,7 +64,7 @@ class Planted:
 
     truth: Mapping[str, float] = field(default_factory=dict)
     effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
-    faults: Mapping[str, Any] = field(default_factory=dict)  # of the measurement: fields of a scene's `Faults`
+    faults: Fields = field(default_factory=dict)  # of the measurement: fields of a scene's `Faults`
     clock: float = 0.0  # relative change of the frame rate
     laboratory: Laboratory = field(default_factory=Laboratory)
 

@@ -38,13 +38,14 @@ from disctrack.synthetic.motion import SceneMotion, motion_of
 from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
+from disctrack.validate.points import K_M
 
 STATIC = "static poses"
 ROLLING = "rolling at 8 to 12 deg"
 FINAL = "rolling to rest at 0.5 deg"
 IMPERFECT = "rolling in an imperfect laboratory"
 EXPOSURE = 0.5e-3  # [s] half the time between frames: rolling at 10 deg smears the outer dots over 0.6 px
-K_M = 0.381e-7  # friction coefficient of Ma et al. 2014, equation (5.3), alone: the disc then comes to rest by
+# With the friction coefficient k_m of Ma et al. 2014, equation (5.3), alone the disc comes to rest by
 TO_REST = (7.93, 1.5)  # (5.11): theta [deg] this time [s] before the end, and theta goes as time^(2/3)
 # Nutation [deg]: the error of psi and phi goes as 1/sin(theta), so the strata are about even in log(theta).
 STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, 85.0))
@@ -52,15 +53,6 @@ FIELD_RADIUS = 25e-3  # [m] of the disc's centre about the middle of the field, 
 BORDER_PX = 14  # a dot's window needs some pixels around it
 SMALLEST_SEMI_MINOR_PX = 3.2  # a dot seen flatter than this is all edge: its blurred middle shows no black
 FEWEST_DOTS = 3  # two numbers each, six unknowns
-ORDINARY_IMPERFECTIONS = ImperfectionSettings(
-    lens_field_px=0.02,
-    board_bow_mm=0.06,
-    board_stretch=2e-4,
-    pixel_gain=0.01,
-    column_offset_dn=0.3,
-    response_curve=0.03,
-)
-VIGNETTING, GLARE_DN = 0.15, 12.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +105,17 @@ def scene_of(seed: int, quick: bool = False) -> Scene:
     )
 
 
+def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: bool = False) -> list[RenderedCase]:
+    """Of n recordings (None: as many as it takes) with seeds that count up; quick: small images, few of everything."""
+    n = n or (1 if quick else 3)
+    scenes = [scene_of(seed + k, quick) for k in range(n)]
+    if imperfect:
+        return [imperfect_case(scene, 60 if quick else 200) for scene in scenes]
+    # static poses, frames of either stretch of rolling: shared out, but at least a dozen of each in a recording
+    totals = (40, 24, 24) if quick else (96, 90, 90)
+    return [ideal_case(scene, *(max(12, -(-total // n)) for total in totals)) for scene in scenes]
+
+
 def ideal_case(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> RenderedCase:
     """Static poses of every attitude, and two stretches of rolling (0 frames: none)."""
     rng = np.random.default_rng([scene.seed, 8])
@@ -130,16 +133,22 @@ def ideal_case(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> Ren
 def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
     """Rolling in a laboratory with what every one has and nobody declares; every second board is bowed downwards."""
     rng = np.random.default_rng([scene.seed, 11])
-    bow = (1 if scene.seed % 2 else -1) * ORDINARY_IMPERFECTIONS.board_bow_mm
     width, height = scene.cameras.image_size
     spots = tuple(
-        GlareSettings(name, (rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height), 0.18 * width, GLARE_DN)
+        GlareSettings(name, (rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height), 0.18 * width, 12.0)
         for name in CAMERAS
     )
     scene = replace(
         scene,
-        imperfections=replace(ORDINARY_IMPERFECTIONS, board_bow_mm=bow),
-        optics=replace(scene.optics, vignetting=VIGNETTING),
+        imperfections=ImperfectionSettings(
+            lens_field_px=0.02,
+            board_bow_mm=0.06 if scene.seed % 2 else -0.06,
+            board_stretch=2e-4,
+            pixel_gain=0.01,
+            column_offset_dn=0.3,
+            response_curve=0.03,
+        ),
+        optics=replace(scene.optics, vignetting=0.15),
         light=replace(scene.light, glare=spots),
     )
     rolling = rolling_scene(scene, rng.uniform(8, 16), frames, rng)

@@ -1,11 +1,12 @@
 """What a validation hands over, and its one writer: Markdown for people, JSON for programs, a section of a page."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from datetime import date
 from multiprocessing import get_context
 from pathlib import Path
+from time import perf_counter
 from typing import TypeVar
 
 import numpy as np
@@ -57,13 +58,16 @@ def figure(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if np.isfinite(value) else "-"
 
 
-def measure_all(measure: Callable[[Case], Outcome], cases: Sequence[Case], processes: int = 1) -> Iterator[Outcome]:
-    """Outcomes in the order of the cases, each as soon as it and those before are there."""
-    if processes == 1:
-        yield from map(measure, cases)
-        return
+def measure_all(
+    measure: Callable[[Case], Outcome], cases: Sequence[Case], processes: int, say: Callable[[str], object]
+) -> list[Outcome]:
+    """Outcomes in the order of the cases; `say` is told how far it is and since when."""
+    began, outcomes = perf_counter(), []
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(measure, cases)
+        for outcome in map(measure, cases) if processes == 1 else pool.map(measure, cases):
+            outcomes.append(outcome)
+            say(f"{perf_counter() - began:6.0f} s  {len(outcomes)} of {len(cases)} recordings")
+    return outcomes
 
 
 def write_validation(folder: Path, validation: Validation) -> list[Path]:
