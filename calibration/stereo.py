@@ -13,8 +13,9 @@ from calibration.board.target import Board, Target
 from calibration.cameras.camera import StereoRig
 from calibration.fit.lens_field import FieldFit
 from calibration.fit.model_choice import TermsTried
+from calibration.fit.pairing import count_once
 from calibration.fit.refinement import Refinement
-from calibration.fit.start import MIN_VIEWS, agreeing, pairs_by_order, start_camera, start_stereo
+from calibration.fit.start import MIN_VIEWS, start_stereo
 from calibration.fit.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
 from calibration.judge.assessment import (
     Assessment,
@@ -221,20 +222,24 @@ def calibrate_from_corners(
             progress(text, 0, 0)
 
     views = (list(left_views), list(right_views))
+    count_once(views, names, table_view)
     rejected, warnings = _views_not_found(views, names)
     _require_views(views, names, rejected, table_view)
-    if board.symmetry > 1:
-        views, note = _agree_on_order(views, board, names)
-        warnings.append(note)
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
+    start = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
+    warnings += start.notes
+    if board.symmetry > 1:
+        for v, order in start.orders.items():
+            view = views[1][v]
+            views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
+        warnings.append(_choice_of_origin(board))
     observations = _observations(views)
-    start, agrees, right_poses = start_stereo(observations, board.points, (sizes[0], sizes[1]), n_views)
-    wide = too_wide(observations, board.points, start.cameras)
-    left_poses = {v: (start.R_left_board[v], start.t_left_board[v]) for v in right_poses}
-    pairs = PairsJudged(start, right_poses, {}, {}, left_poses)
-    moved = camera_moved(observations, pairs, start, table_view)  # seen best by cameras that no pair has pulled yet
+    wide = too_wide(observations, board.points, start.model.cameras)
+    pairs = PairsJudged(start.model, start.right_poses, {}, {}, start.left_poses)
+    # seen best by cameras that no pair has pulled yet
+    moved = camera_moved(observations, pairs, start.model, table_view)
     if moved is None:
-        pairs = pairs_that_agree(observations, start, board.points, agrees, right_poses)
+        pairs = pairs_that_agree(observations, start.model, board.points, start.agrees, start.right_poses)
     else:
         pairs = moved.set_apart(pairs)
     report("refining")
@@ -315,6 +320,12 @@ def _require_fitted(
         raise CalibrationError(
             f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
         )
+    for name, camera in zip(CAMERA_NAMES, fit.refinement.model.cameras, strict=True):
+        if not min(camera.fx, camera.fy) > 0.0:
+            raise CalibrationError(
+                f"{name} camera: focal lengths {camera.fx:.1f} and {camera.fy:.1f} px are those of no camera: the "
+                "views contradict each other. Are they of one board, and left and right of one moment?"
+            )
 
 
 def _views_not_found(
@@ -395,29 +406,12 @@ def _observations(views: tuple[list[CornerView | BoardNotFound], list[CornerView
     return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _agree_on_order(
-    views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]],
-    board: Target,
-    names: Sequence[tuple[str, str]],
-) -> tuple[tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]], str]:
-    """Turn the right views so that all pairs tell of one stereo pose: for boards whose colouring is symmetric."""
-    observations = _observations(views)
-    orders = board.orders
-    sizes = [next(v.image_size for v in side if isinstance(v, CornerView)) for side in views]
-    poses = [start_camera(observations, c, board.points, sizes[c])[1] for c in (0, 1)]
-    both = sorted(poses[0].keys() & poses[1].keys())
-    agree = agreeing(*pairs_by_order(poses, board.points, orders))
-    right = list(views[1])
-    for v, fits in zip(both, agree, strict=True):
-        view = right[v]
-        if fits.any() and isinstance(view, CornerView):
-            right[v] = view.reordered(orders[int(np.argmax(fits))])
-    note = (
+def _choice_of_origin(board: Target) -> str:
+    return (
         f"{board} looks the same after a turn: the two cameras were made to agree, but which corner is the lab "
         "frame's origin is a choice (i points to the right in the left image). "
         + ("An odd by an even count leaves no choice." if isinstance(board, Board) else "A ChArUco board has none.")
     )
-    return (views[0], right), note
 
 
 def _told_apart(fit: JointFit, names: Sequence[tuple[str, str]], wide: bool, table_view: int | None) -> list[str]:

@@ -1,13 +1,14 @@
 """Rough cameras and poses to start the refinement from: OpenCV per camera, then the pair that most views agree on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import mirror_symmetries
 from calibration.cameras.camera import Camera, rotation_from_vector
+from calibration.fit.pairing import FLOOR, Names, Pose, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
@@ -47,7 +48,7 @@ def start_camera(
                 objects, images, image_size, guess.copy(), np.zeros(5), flags=flags | plainer
             )
             k1 = float(np.ravel(distortion)[0])
-            if np.isfinite(K).all() and abs(k1) < MOST_K1:
+            if np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and abs(k1) < MOST_K1:
                 break
         else:
             raise CalibrationError(f"{name} camera: the views do not determine the focal length; tilt the board more")
@@ -65,68 +66,6 @@ def start_camera(
     return camera, poses
 
 
-def rotation_angle(R: Array) -> Array:
-    """Angle [rad] of rotations (..., 3, 3)."""
-    return np.arccos(np.clip(0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1), -1, 1))
-
-
-def common_pair(rotations: Array, translations: Array) -> tuple[int, Mask]:
-    """Index of the stereo pose that most others agree with, and who agrees: within 5 deg and 10 % of the baseline."""
-    angle = rotation_angle(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
-    shift = np.linalg.norm(translations[:, None] - translations[None], axis=-1)
-    length = np.linalg.norm(translations, axis=-1)
-    agree = (angle < np.radians(5)) & (shift < 0.1 * length[:, None] + 1e-9)
-    cost = np.sum(np.minimum(angle / np.radians(5), 1) + np.minimum(shift / (0.1 * length[:, None] + 1e-9), 1), axis=1)
-    best = int(np.argmin(cost))
-    return best, agree[best]
-
-
-def pairs_by_order(
-    poses: Sequence[Mapping[int, tuple[Array, Array]]],
-    nominal: Array,
-    orders: Sequence[NDArray[np.intp]],
-    mirrored: bool = False,
-) -> tuple[Array, Array]:
-    """Stereo pose by each of n views that both see, with the right points in each of k orders: (n, k, 3, 3), (n, k, 3).
-
-    poses : of the left and of the right camera, by view; orders : point orders[k][i] takes place i
-    mirrored : the right images show the world in a mirror, and the orders mirror the points
-    """
-    views, middle = sorted(poses[0].keys() & poses[1].keys()), nominal.mean(0)
-    left, right = ((np.stack([side[v][0] for v in views]), np.stack([side[v][1] for v in views])) for side in poses)
-    d, image = nominal - middle, np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0])
-    rotations, translations = [], []
-    for order in orders:
-        U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])
-        turn = np.eye(3)
-        turn[:2, :2] = U @ Vt  # the order turns the points by this about their middle
-        R = right[0] @ turn
-        t = right[1] + right[0] @ middle - R @ middle
-        rotations.append(image @ R @ np.swapaxes(left[0], 1, 2))
-        translations.append(t @ image - np.einsum("nij,nj->ni", rotations[-1], left[1]))
-    return np.stack(rotations, axis=1), np.stack(translations, axis=1)
-
-
-def agreeing(rotations: Array, translations: Array) -> Mask:
-    """Which stereo poses (n, k) agree with the one that most do; see `common_pair`."""
-    agree = common_pair(rotations.reshape(-1, 3, 3), translations.reshape(-1, 3))[1]
-    return agree.reshape(rotations.shape[:2])
-
-
-def _refuse_mirrored(poses: Sequence[Mapping[int, tuple[Array, Array]]], nominal: Array, agree: Mask) -> None:
-    """Raise CalibrationError where the pairs agree if one camera sees in a mirror, and else do not."""
-    orders = mirror_symmetries(nominal[:, :2])
-    if 2 * agree.sum() >= len(agree) or not orders:
-        return
-    n = int(agreeing(*pairs_by_order(poses, nominal, orders, mirrored=True)).any(axis=1).sum())
-    if n >= max(MIN_VIEWS, 0.5 * len(agree), 2 * agree.sum()):
-        raise CalibrationError(
-            f"the images of one of the two cameras are mirrored: if they are, {n} of {len(agree)} pairs tell of one "
-            f"place of the cameras, as stored {agree.sum()}. Switch the mirroring off where that camera's images are "
-            "exported, or flip all of them, those of the motion too; so, too, if it looks through a mirror"
-        )
-
-
 def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
     """Raise CalibrationError where both cameras stand in one place: then no distance can be told."""
     apart, distance = float(np.linalg.norm(t_pair)), float(np.median(np.linalg.norm(boards, axis=-1)))
@@ -137,34 +76,60 @@ def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
         )
 
 
-def start_stereo(
-    observations: Observations, nominal: Array, image_sizes: tuple[tuple[int, int], tuple[int, int]], n_views: int
-) -> tuple[StereoModel, Mask, dict[int, tuple[Array, Array]]]:
-    """Start model, which views (n_views,) agree with it or were seen by one camera only, and {view: (R, t)} of pairs.
+@dataclass(frozen=True)
+class Start:
+    """Rough cameras and boards, and what the pairs say of them."""
 
-    The latter are poses of the board in the left camera's axes by the right image alone.
+    model: StereoModel
+    agrees: Mask  # (n_views,) views that agree with the model, or were seen by one camera only
+    right_poses: dict[int, Pose]  # of pairs: the board in the left camera's axes by the right image alone
+    left_poses: dict[int, Pose]
+    orders: dict[int, NDArray[np.intp]]  # of pairs: in which the right image shows the target's points, see `Target`
+    notes: tuple[str, ...]
+
+
+def start_stereo(
+    observations: Observations,
+    nominal: Array,
+    image_sizes: tuple[tuple[int, int], tuple[int, int]],
+    names: Names,
+    orders: Sequence[NDArray[np.intp]] | None = None,
+) -> Start:
+    """Rough cameras, how they stand to each other, and which images are pairs.
+
+    names : (left, right) of all views; orders : in which the target looks the same; only as it is without
+    Raises CalibrationError where the images do not tell a camera, or are no pairs; see `pairing`.
     """
-    left, left_poses = start_camera(observations, 0, nominal, image_sizes[0])
-    right, right_poses = start_camera(observations, 1, nominal, image_sizes[1])
-    both = sorted(left_poses.keys() & right_poses.keys())
-    if not both:
-        raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
-    as_stored = pairs_by_order((left_poses, right_poses), nominal, [np.arange(len(nominal))])
-    rotations, translations = as_stored[0][:, 0], as_stored[1][:, 0]
-    best, agree = common_pair(rotations, translations)
-    _refuse_mirrored((left_poses, right_poses), nominal, agree)
-    R_pair, t_pair = rotations[best], np.median(translations[agree], axis=0)
-    _refuse_one_place(t_pair, [left_poses[v][1] for v in both])
-    usable = np.ones(n_views, bool)
-    usable[[v for v, ok in zip(both, agree, strict=True) if not ok]] = False
-    by_right = {v: (R_pair.T @ right_poses[v][0], R_pair.T @ (right_poses[v][1] - t_pair)) for v in both}
+    orders, n_views = orders or [np.arange(len(nominal))], len(names)
+    cameras, poses, places = [], [], []
+    for index in (0, 1):
+        camera, seen = start_camera(observations, index, nominal, image_sizes[index])
+        mine = observations[observations.camera == index]
+        places.append(places_of(seen, {v: nominal[mine.point[mine.view == v]] for v in seen}, nominal, camera))
+        cameras.append(camera)
+        poses.append(seen)
+    floor = FLOOR * max(max(size) for size in image_sizes)
+    pairs, notes = paired((places[0], places[1]), (list(poses[0]), list(poses[1])), nominal, orders, floor, names)
+    both = [v for v in poses[0] if v in poses[1]]
+    R_pair, t_pair = pairs.R_right_left, pairs.t_right_left
+    _refuse_one_place(t_pair, [poses[0][v][1] for v in both])
+    usable, turns, middle = np.ones(n_views, bool), board_turns(nominal, orders), nominal.mean(0)
+    usable[[v for v, ok in zip(both, pairs.agrees, strict=True) if not ok]] = False
+    by_right = {}
+    for v, (R, t) in poses[1].items():
+        turn = turns[pairs.order[both.index(v)]] if v in both else np.eye(3)
+        by_right[v] = R_pair.T @ R @ turn, R_pair.T @ (t + R @ (middle - turn @ middle) - t_pair)
     R_board, t_board = np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1))
     for view in range(n_views):
-        if view in left_poses:
-            R_board[view], t_board[view] = left_poses[view]
-        elif view in right_poses:
-            R, t = right_poses[view]
-            R_board[view], t_board[view] = R_pair.T @ R, R_pair.T @ (t - t_pair)
+        if view in poses[0] or view in by_right:
+            R_board[view], t_board[view] = poses[0].get(view) or by_right[view]
         else:
             usable[view] = False
-    return StereoModel((left, right), R_pair, t_pair, R_board, t_board, nominal.copy()), usable, by_right
+    return Start(
+        StereoModel((cameras[0], cameras[1]), R_pair, t_pair, R_board, t_board, nominal.copy()),
+        usable,
+        {v: by_right[v] for v in both},
+        {v: poses[0][v] for v in both},
+        {v: orders[k] for v, k in zip(both, pairs.order, strict=True)},
+        notes,
+    )

@@ -282,8 +282,10 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, r
     )
     scene = replace(scene, model=replace(scene.model, cameras=cameras))
     o = scene.observations(0.02, rng)
-    start, usable, _ = start_stereo(o, scene.board.points, (cameras[0].image_size, cameras[1].image_size), 10)
-    assert usable.all()
+    sizes = cameras[0].image_size, cameras[1].image_size
+    begun = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
+    start = begun.model
+    assert begun.agrees.all()
     found = refine_stereo(o, start, scene.board.points, FULL)
     assert_allclose(found.model.cameras[0].fy / found.model.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3)
 
@@ -293,8 +295,9 @@ def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
     basis = board_basis(flat.board.points, "warped")
     scene = scene_maker(n_views=12, deviation=basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3, 0.0, 0.0]))
     o = scene.observations(0.02, rng)
-    start, usable, _ = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), 12)
-    assert usable.all()
+    begun = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
+    start = begun.model
+    assert begun.agrees.all()
     found, table = choose_board(o, start, scene.board.points, ("flat", "warped"))
     assert found.terms.board == "warped"
     assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
@@ -336,4 +339,4 @@ def test_equal_aspect_ties_the_focal_lengths(scene_maker, rng):
 def test_too_few_views_are_an_error_that_says_so(scene_maker):
     scene = scene_maker(n_views=2)
     with pytest.raises(CalibrationError, match="at least 3"):
-        start_stereo(scene.observations(0.02), scene.board.points, ((512, 512), (512, 512)), 2)
+        start_stereo(scene.observations(0.02), scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 2)

@@ -1,0 +1,302 @@
+"""Which images of the two cameras show the board in one place: as stored, turned, mirrored, in another order, late.
+
+Each image alone, by a rough camera, has the board at a place, and a pair of them tells how the cameras stand. Right
+pairs tell of one place of the cameras, wrong ones of as many as there are; so every hypothesis of which image belongs
+to which is as likely as the places that its pairs tell of lie together. Distances are in pixels, by the covariance of
+the two places of the board: what a pair tells badly (a shift along the axis) counts as little as it is known. As some
+boards were moved, errors have long tails: a pair's evidence is minus the logarithm of its squared distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.chessboard import BoardNotFound, CornerView
+from calibration.board.target import mirror_symmetries
+from calibration.cameras.camera import Camera, by_turning, project_with_jacobians
+from calibration.kit.arrays import Array, Mask
+from calibration.kit.errors import CalibrationError
+
+FLOOR = 1e-3  # of the image's longer side: rough cameras put boards no better
+SAME_PLACE = 1e-3  # of the image's longer side: lenses and boards err alike where corners differ by less
+NEARER = 3.0  # times that the pairs of another hypothesis lie together better than those stored, to be believed
+TOO_FAR = 5.0  # times the usual distance: of another place
+MOST_LATE = 8  # views by which the two cameras may differ
+LEAST_PAIRS = 4  # of a hypothesis
+TRIED = 30  # pairs whose place is tried for all
+Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in a camera's axes
+Names = Sequence[tuple[str, str]]
+Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where one camera alone has the board in n images, and how well it knows."""
+
+    R: Array  # (n, 3, 3) board to camera
+    middle: Array  # (n, 3) [m] of the board
+    covariance: Array  # (n, 6, 6) of a turn and a shift of the middle, times the points, by a pixel of scatter
+
+    def __getitem__(self, index: NDArray) -> Places:
+        return Places(self.R[index], self.middle[index], self.covariance[index])
+
+    def turned(self, turn: Array, mirror: bool = False) -> Places:
+        """With the board turned about its middle (3, 3), and the camera's x reversed."""
+        F = np.diag([-1.0 if mirror else 1.0, 1.0, 1.0])
+        B = _both(-F if mirror else F, F)  # a turn is an axial vector
+        return Places(F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
+
+
+def count_once(views: Views, names: Names, table_view: int | None) -> None:
+    """Leave out, in place, views that show the board where another one does: they say no more of cameras than that one.
+
+    Copies of a file, and frames of a video in which the board rests, are such. Raises CalibrationError where one
+    camera's images show the board in one place and the other's do not.
+    """
+    found = [[v for v in side if isinstance(v, CornerView)] for side in views]
+    limits = [SAME_PLACE * max(max(v.image_size) for v in side) if side else 0.0 for side in found]
+    first: list[int] = []
+    numbers = range(len(names))
+    for v in sorted(numbers, key=lambda v: v != table_view):
+        pair = [side[v] for side in views]
+        if all(isinstance(one, BoardNotFound) for one in pair):
+            continue
+        for u in first:
+            if all(_near(one, side[u], limit) for one, side, limit in zip(pair, views, limits, strict=True)):
+                for side, name in zip(views, names[u], strict=True):
+                    side[v] = BoardNotFound(f"shows the board where {name} does, and counts once")
+                break
+        else:
+            first.append(v)
+    both = [v for v in first if all(isinstance(side[v], CornerView) for side in views)]
+    for camera, (side, limit) in enumerate(zip(views, limits, strict=True)):
+        for u in both:
+            same = [v for v in both if _near(side[v], side[u], limit)]
+            if len(same) >= max(LEAST_PAIRS, 0.5 * len(both)):
+                name, other = ("left", "right")[camera], ("right", "left")[camera]
+                raise CalibrationError(
+                    f"{len(same)} {name} images show the board in one place, {names[same[0]][camera]} to "
+                    f"{names[same[-1]][camera]}, where the {other} ones show it in as many: are they copies of one? "
+                    "Every pair must be two images of one moment"
+                )
+
+
+def _near(one: CornerView | BoardNotFound, other: CornerView | BoardNotFound, limit: float) -> bool:
+    """Whether two images of a camera show the board in one place, to `limit` [px] rms; or both do not show it."""
+    if isinstance(one, BoardNotFound) or isinstance(other, BoardNotFound):
+        return isinstance(one, BoardNotFound) and isinstance(other, BoardNotFound)
+    seen = one.accepted & other.accepted
+    square = np.sum((one.points - other.points)[seen] ** 2, axis=1)
+    return len(square) > 0 and float(np.mean(square)) < limit**2
+
+
+def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: Array, camera: Camera) -> Places:
+    """Of images whose poses are known; points : (k, 3) [m] of the target that each shows."""
+    middle = nominal.mean(0)
+    found: list[tuple[Array, Array, Array]] = []
+    for view, (R, t) in poses.items():
+        seen, at = points[view] @ R.T + t, R @ middle + t
+        d_point = project_with_jacobians(seen, camera)[1]
+        J = np.concatenate([by_turning(d_point, seen - at), d_point], axis=-1).reshape(-1, 6)
+        information = J.T @ J / len(seen)
+        information += 1e-9 * np.diag(np.diag(information))  # of points on a line, one turn is not seen at all
+        found.append((R, at, np.linalg.inv(information)))
+    return Places(*(np.stack(part) for part in zip(*found, strict=True)))
+
+
+def apart(left: Places, right: Places, R_pair: Array, t_pair: Array) -> Array:
+    """(m, n) [px] by which n pairs are off m places of the right camera against the left: (m, 3, 3) and (m, 3) [m]."""
+    back = np.swapaxes(R_pair, 1, 2)[:, None]
+    turn = _vectors(back @ right.R @ np.swapaxes(left.R, 1, 2))
+    shift = (back @ (right.middle - t_pair[:, None])[..., None])[..., 0] - left.middle
+    B = np.zeros((len(R_pair), 1, 6, 6))
+    B[..., :3, :3] = B[..., 3:, 3:] = back
+    step = np.concatenate([turn, shift], axis=-1)
+    known = np.linalg.solve(left.covariance + B @ right.covariance @ np.swapaxes(B, 2, 3), step[..., None])[..., 0]
+    return np.asarray(np.sqrt(np.maximum(np.sum(step * known, axis=-1), 0.0)), np.float64)
+
+
+def told_by(left: Places, right: Places) -> tuple[Array, Array]:
+    """How the cameras stand by each pair alone: R_right_left (n, 3, 3) and t_right_left (n, 3) [m]."""
+    R = right.R @ np.swapaxes(left.R, 1, 2)
+    return R, right.middle - np.einsum("nij,nj->ni", R, left.middle)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """The likeliest place of the right camera against the left one, and the pairs by it."""
+
+    R_right_left: Array  # (3, 3)
+    t_right_left: Array  # (3,) [m]
+    order: NDArray[np.intp]  # (n,) number of the board's turn in the right image of each pair
+    distance: Array  # (n,) [px]
+    evidence: float  # mean over the pairs, in units of the logarithm of a squared distance
+    floor: float  # [px]
+
+    @property
+    def usual(self) -> float:
+        """[px] Distance of pairs that agree: the best half of them."""
+        return max(float(np.quantile(self.distance, 0.25)), self.floor)
+
+    @property
+    def median(self) -> float:
+        """[px] Distance of half of the pairs."""
+        return float(np.median(self.distance))
+
+    @property
+    def agrees(self) -> Mask:
+        """(n,) pairs that tell of this place."""
+        return self.distance < TOO_FAR * self.usual
+
+
+def likeliest(left: Places, turns_of_right: Sequence[Places], floor: float) -> Pairing:
+    """The place of the cameras that pairs tell of; turns_of_right : with the board in each of its attitudes."""
+    n = len(left.R)
+    tried = np.unique(np.linspace(0, n - 1, min(n, TRIED)).astype(int))
+    told = [told_by(left[tried], right[tried]) for right in turns_of_right]
+    R, t = (np.concatenate(part) for part in zip(*told, strict=True))
+    distance = np.stack([apart(left, right, R, t) for right in turns_of_right])  # (orders, candidates, n)
+    nearest = distance.min(axis=0)
+    own = np.tile(tried, len(told))
+    likelihood = -np.log(floor**2 + nearest**2)
+    likelihood[np.arange(len(own)), own] = 0.0  # each lies at the place that it tells of
+    best = int(np.argmax(likelihood.sum(axis=1)))
+    order, near = distance[:, best].argmin(axis=0), nearest[best]
+    evidence = float(likelihood[best].sum() / max(n - 1, 1))
+    shifts = np.stack([told_by(left, right)[1] for right in turns_of_right])[order, np.arange(n)]
+    found = Pairing(R[best], t[best], order, near, evidence, floor)
+    return Pairing(R[best], np.median(shifts[found.agrees], axis=0), order, near, evidence, floor)
+
+
+def board_turns(nominal: Array, orders: Sequence[NDArray[np.intp]]) -> list[Array]:
+    """(3, 3) each: what an order of its points turns (or mirrors) the target by, about its middle."""
+    d, found = nominal - nominal.mean(0), []
+    for order in orders:
+        U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])
+        turn = np.eye(3)
+        turn[:2, :2] = U @ Vt
+        found.append(turn)
+    return found
+
+
+def paired(
+    sides: tuple[Places, Places],
+    views: tuple[Sequence[int], Sequence[int]],
+    nominal: Array,
+    orders: Sequence[NDArray[np.intp]],
+    floor: float,
+    names: Names,
+) -> tuple[Pairing, tuple[str, ...]]:
+    """The pairs as they are stored, and what is to be said of them. Raises CalibrationError where they are no pairs.
+
+    sides : where each camera alone has the board; views : the numbers of these images, ascending
+    names : (left, right) of all views; orders : of the target's points that look the same
+    """
+    left, right = sides
+    turns = [right.turned(turn) for turn in board_turns(nominal, orders)]
+    place = [{view: i for i, view in enumerate(side)} for side in views]
+    last = len(names) - 1
+
+    def by(step: int, late: int, tried: Sequence[Places]) -> tuple[list[int], Pairing] | None:
+        """Left view v with the right one v + late, or with last - v + late."""
+        partner = {v: (v if step > 0 else last - v) + late for v in views[0]}
+        both = [v for v in views[0] if partner[v] in place[1]]
+        if len(both) < (1 if (step, late) == (1, 0) else LEAST_PAIRS):
+            return None
+        a, b = np.array([place[0][v] for v in both]), np.array([place[1][partner[v]] for v in both])
+        return both, likeliest(left[a], [one[b] for one in tried], floor)
+
+    stored = by(1, 0, turns)
+    if stored is None:
+        raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
+    both, found = stored
+    n = len(both)
+    if n < LEAST_PAIRS - 1 or (found.agrees.all() and found.usual < TOO_FAR * floor):
+        return found, ()
+    mirrors = [right.turned(turn, True) for turn in board_turns(nominal, mirror_symmetries(nominal[:, :2]))]
+    mirrored = by(1, 0, mirrors) if mirrors else None
+    if mirrored and _is_likelier(mirrored[1], found):
+        raise CalibrationError(
+            f"the images of one of the two cameras are mirrored: if they are, {mirrored[1].agrees.sum()} of {n} pairs "
+            f"tell of one place of the cameras, as stored {found.agrees.sum()}. Switch the mirroring off where that "
+            "camera's images are exported, or flip all of them, those of the motion too; so, too, if it looks through "
+            "a mirror"
+        )
+    shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) <= n - LEAST_PAIRS]
+    others = {(step, k): by(step, k, turns) for step in (1, -1) for k in shifts if (step, k) != (1, 0)}
+    tried = {which: one for which, one in others.items() if one is not None}
+    if tried:
+        (step, late), (whose, best) = max(tried.items(), key=lambda item: item[1][1].evidence)
+        if _is_likelier(best, found):
+            v = whose[int(np.argmin(best.distance))]
+            partner = (v if step > 0 else last - v) + late
+            which = "in reversed order" if step < 0 else f"{abs(late)} {'late' if late > 0 else 'early'}"
+            raise CalibrationError(
+                f"the left and the right views are no pairs as they are stored: the right ones come {which}. So "
+                f"paired, they tell of one place of the cameras to {best.median:.2g} px, as stored to "
+                f"{found.median:.2g} px: {names[v][0]} shows the board where {names[partner][1]} does. A frame "
+                "was lost, or one camera began earlier: name or move the files so that pairs have one number"
+            )
+        chance = float(np.median([one.evidence for _, one in tried.values()]))
+        if n >= 2 * LEAST_PAIRS and found.evidence < chance + np.log(4.0) and found.usual > TOO_FAR * floor:
+            raise CalibrationError(
+                f"the {n} pairs tell of no common place of the cameras: they differ by {found.usual:.2g} px and more, "
+                f"as images do that are no pairs. Other orders, up to {MOST_LATE} views late or early, and mirrored "
+                "images do not fit either: left and right image of each number must show the board in one place"
+            )
+    notes = _late(left, turns, place, both, found, names)
+    if notes and 2 * found.agrees.sum() <= n:
+        raise CalibrationError(f"{'; '.join(notes)}. As stored {found.agrees.sum()} of {n} pairs are right")
+    return found, notes
+
+
+def _is_likelier(one: Pairing, stored: Pairing) -> bool:
+    return one.evidence > stored.evidence + 2.0 * np.log(NEARER) and 2 * int(one.agrees.sum()) > len(one.distance)
+
+
+def _late(
+    left: Places,
+    turns: Sequence[Places],
+    place: Sequence[Mapping[int, int]],
+    both: Sequence[int],
+    found: Pairing,
+    names: Names,
+) -> tuple[str, ...]:
+    """A warning about pairs that agree with the others if the right view is a later or an earlier one."""
+    runs: dict[int, list[int]] = {}
+    for v in (v for v, fits in zip(both, found.agrees, strict=True) if not fits):
+        for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs):
+            if k == 0 or v + k not in place[1]:
+                continue
+            a, b = np.array([place[0][v]]), np.array([place[1][v + k]])
+            here = [apart(left[a], one[b], found.R_right_left[None], found.t_right_left[None]).min() for one in turns]
+            if min(here) < TOO_FAR * found.usual:
+                runs.setdefault(k, []).append(v)
+                break
+    return tuple(
+        f"{names[which[0]][0]} to {names[which[-1]][0]}: {len(which)} pairs agree with the others if the right view "
+        f"{abs(k)} {'later' if k > 0 else 'earlier'} is taken ({names[which[0] + k][1]} in place of "
+        f"{names[which[0]][1]}): a frame was lost there. Name or move the files so that pairs have one number"
+        for k, which in runs.items()
+        if len(which) >= LEAST_PAIRS - 1
+    )
+
+
+def _both(turn: Array, shift: Array) -> Array:
+    B = np.zeros((6, 6))
+    B[:3, :3], B[3:, 3:] = turn, shift
+    return B
+
+
+def _vectors(R: Array) -> Array:
+    """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); of half turns, some vector as long as pi."""
+    v = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    sine = np.linalg.norm(v, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
+    along = np.where((sine > 1e-9)[..., None], v / np.maximum(sine, 1e-9)[..., None], [1.0, 0.0, 0.0])
+    small: Array = along * np.where((sine < 1e-9) & (angle < 1.0), 0.0, angle)[..., None]
+    return small

@@ -1,0 +1,126 @@
+"""Which images are pairs: views late, reversed, mixed, copied, turned or at rest are named, and cost no crash."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration import Board, BoardNotFound, CalibrationError, CalibrationSettings, calibrate_from_corners
+from calibration.cameras.camera import rotation_from_vector
+from calibration.fit.pairing import Pairing, _vectors
+from tests.calibration.test_stereo import BOARD, FLAT, corner_views, small_scene
+
+
+@pytest.fixture(scope="module")
+def views(scene_maker):
+    return corner_views(small_scene(scene_maker, n_views=12), np.random.default_rng(3))
+
+
+@pytest.mark.parametrize(
+    ("paired", "said"),
+    [
+        (lambda left, right: (left[:-1], right[1:]), "the right ones come 1 early"),
+        (lambda left, right: (left[2:], right[:-2]), "the right ones come 2 late"),
+        (lambda left, right: (left, right[::-1]), "in reversed order"),
+        (
+            lambda left, right: (left[:-1], right[:4] + right[5:]),
+            "come 1 early|agree with the others if the right view 1 earlier is taken",
+        ),
+        (lambda left, right: (left, right[5:] + right[2:5] + right[:2]), "tell of no common place|5 early"),
+        (
+            lambda left, right: (left, [right[0]] * 12),
+            "12 right images show the board in one place, right 0 to",
+        ),
+        (lambda left, right: ([left[3]] * 12, right), "12 left images show the board in one place"),
+    ],
+    ids=["late", "early", "reversed", "a lost frame", "mixed", "one right image", "one left image"],
+)
+def test_views_that_are_no_pairs_are_named(views, paired, said):
+    with pytest.raises(CalibrationError, match=said):
+        calibrate_from_corners(*paired(*views), BOARD, FLAT)
+
+
+def test_a_frame_that_was_lost_near_the_end_costs_the_pairs_behind_it_and_is_named(views):
+    left, right = views
+    found = calibrate_from_corners(left[:-1], [*right[:7], *right[8:]], BOARD, FLAT)
+    assert found.apart == (7, 8, 9, 10)
+    (text,) = [text for text in found.warnings if "a frame was lost there" in text]
+    # the right view of left 7 is lost itself
+    assert text.startswith("left 8 to left 10: 3 pairs agree with the others if the right view 1 earlier is taken")
+    assert found.rms_px < 0.05
+
+
+def test_pairs_as_they_should_be_are_not_said_to_be_late(views):
+    found = calibrate_from_corners(*views, BOARD, FLAT)
+    assert not any("frame was lost" in text for text in found.warnings)
+    assert not found.apart
+
+
+def test_boards_of_two_sizes_end_in_a_rig_or_a_sentence(views, scene_maker):
+    """Every other view shows a board of twice the size, twice as far away: each pair tells of twice the baseline."""
+    scene = small_scene(scene_maker, n_views=12)
+    m = scene.model
+    far = replace(m, points=1.5 * m.points, t_left_board=m.t_left_board + np.array([0, 0, 0.05]))
+    other = corner_views(replace(scene, model=far), np.random.default_rng(4))
+    mixed = [[b if v % 3 == 1 else a for v, (a, b) in enumerate(zip(*s, strict=True))] for s in zip(views, other)]  # noqa: B905
+    found = calibrate_from_corners(*mixed, BOARD, FLAT)
+    assert found.apart == (1, 4, 7, 10)
+    assert_allclose(found.rig.baseline, np.linalg.norm(m.t_right_left), rtol=0.01)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("counts", [(7, 7), (6, 6)])
+def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(scene_maker, rng, counts):
+    """Cameras near to each other: what a pair tells of their distance scatters by more than a tenth of it."""
+    board = Board(counts, 6e-3)
+    scene = scene_maker(n_views=16, inner_corners=counts, square=6e-3)
+    near = rotation_from_vector(np.array([0.0, -0.06, 0.0]))
+    m = replace(scene.model, R_right_left=near, t_right_left=np.array([-0.02, 0.0, 0.002]))
+    views = corner_views(replace(scene, model=m), rng, 0.1, board)
+    views = [[replace(view, image_size=(512, 512)) for view in side] for side in views]
+    for turned in (0, 1):  # and the right camera upside down
+        right = [view.reordered(board.orders[(turned + v // 3) % board.symmetry]) for v, view in enumerate(views[1])]
+        found = calibrate_from_corners(views[0], right, board, CalibrationSettings("k1", "flat"))
+        assert not found.apart
+        assert found.assessment.pairs == 16
+        assert found.rms_px < 0.2
+        assert min(found.rig.left.fy, found.rig.right.fy) > 0
+
+
+def test_views_of_one_place_count_once(scene_maker, views):
+    once = calibrate_from_corners(*views, BOARD, FLAT)
+    thrice = calibrate_from_corners(*[3 * side for side in views], BOARD, FLAT, table_view=14)
+    assert len(thrice.rejected_views) == 24
+    assert 14 not in thrice.rejected_views
+    assert thrice.rejected_views[2] == "left 2: shows the board where left 14 does, and counts once; " + (
+        "right 2: shows the board where right 14 does, and counts once"
+    )
+    assert thrice.assessment.pairs == once.assessment.pairs == 12
+    t = once.rig.t_right_left / once.rig.baseline
+    sigma = [float(np.sqrt(t @ f.rig.covariance[21:24, 21:24] @ t)) for f in (once, thrice)]
+    assert_allclose(sigma[1], sigma[0], rtol=1e-3)
+    # a board at rest in a video: other noise in every frame, the same place
+    scene = small_scene(scene_maker, n_views=12)
+    again = corner_views(scene, np.random.default_rng(9))
+    rest = calibrate_from_corners(*[a + b for a, b in zip(views, again, strict=True)], BOARD, FLAT)
+    assert len(rest.rejected_views) == 12
+
+
+def test_an_image_that_is_missing_makes_no_two_views_one(views):
+    left, right = views
+    left = [BoardNotFound("covered") if v == 3 else view for v, view in enumerate(left)]
+    assert not calibrate_from_corners(left, right, BOARD, FLAT).rejected_views
+
+
+def test_rotation_vectors_are_those_of_their_rotations(rng):
+    vectors = rng.normal(size=(200, 3))
+    vectors *= (rng.uniform(0, np.pi - 1e-3, 200) / np.linalg.norm(vectors, axis=1))[:, None]
+    assert_allclose(_vectors(rotation_from_vector(vectors)), vectors, atol=1e-8)
+    assert np.linalg.norm(_vectors(np.diag([-1.0, -1.0, 1.0]))) == pytest.approx(np.pi)
+    assert_allclose(_vectors(np.eye(3)), 0.0)
+
+
+def test_pairs_agree_as_far_as_the_best_of_them_do():
+    pairs = Pairing(np.eye(3), np.zeros(3), np.zeros(5, int), np.array([0.1, 1.0, 1.2, 4.9, 60.0]), 0.0, 0.5)
+    assert pairs.agrees.tolist() == [True, True, True, True, False]
