@@ -77,7 +77,7 @@ def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
 
 
 @dataclass(frozen=True)
-class Start:
+class StereoStart:
     """Rough cameras and boards, and what the pairs say of them."""
 
     model: StereoModel
@@ -94,7 +94,7 @@ def start_stereo(
     image_sizes: tuple[tuple[int, int], tuple[int, int]],
     names: Names,
     orders: Sequence[NDArray[np.intp]] | None = None,
-) -> Start:
+) -> StereoStart:
     """Rough cameras, how they stand to each other, and which images are pairs.
 
     names : (left, right) of all views; orders : in which the target looks the same; only as it is without
@@ -125,7 +125,7 @@ def start_stereo(
             R_board[view], t_board[view] = poses[0].get(view) or by_right[view]
         else:
             usable[view] = False
-    return Start(
+    return StereoStart(
         StereoModel((cameras[0], cameras[1]), R_pair, t_pair, R_board, t_board, nominal.copy()),
         usable,
         {v: by_right[v] for v in both},
