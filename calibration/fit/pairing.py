@@ -34,21 +34,21 @@ Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]
 
 
 @dataclass(frozen=True)
-class Places:
+class BoardPlaces:
     """Where one camera alone has the board in n images, and how well it knows."""
 
     R: Array  # (n, 3, 3) board to camera
     middle: Array  # (n, 3) [m] of the board
     covariance: Array  # (n, 6, 6) of a turn and a shift of the middle, times the points, by a pixel of scatter
 
-    def __getitem__(self, index: NDArray) -> Places:
-        return Places(self.R[index], self.middle[index], self.covariance[index])
+    def __getitem__(self, index: NDArray) -> BoardPlaces:
+        return BoardPlaces(self.R[index], self.middle[index], self.covariance[index])
 
-    def turned(self, turn: Array, mirror: bool = False) -> Places:
+    def turned(self, turn: Array, mirror: bool = False) -> BoardPlaces:
         """With the board turned about its middle (3, 3), and the camera's x reversed."""
         F = np.diag([-1.0 if mirror else 1.0, 1.0, 1.0])
         B = _both(-F if mirror else F, F)  # a turn is an axial vector
-        return Places(F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
+        return BoardPlaces(F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
 
 
 def count_once(views: Views, names: Names, table_view: int | None) -> None:
@@ -94,7 +94,7 @@ def _near(one: CornerView | BoardNotFound, other: CornerView | BoardNotFound, li
     return len(square) > 0 and float(np.mean(square)) < limit**2
 
 
-def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: Array, camera: Camera) -> Places:
+def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: Array, camera: Camera) -> BoardPlaces:
     """Of images whose poses are known; points : (k, 3) [m] of the target that each shows."""
     middle = nominal.mean(0)
     found: list[tuple[Array, Array, Array]] = []
@@ -105,10 +105,10 @@ def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: A
         information = J.T @ J / len(seen)
         information += 1e-9 * np.diag(np.diag(information))  # of points on a line, one turn is not seen at all
         found.append((R, at, np.linalg.inv(information)))
-    return Places(*(np.stack(part) for part in zip(*found, strict=True)))
+    return BoardPlaces(*(np.stack(part) for part in zip(*found, strict=True)))
 
 
-def apart(left: Places, right: Places, R_pair: Array, t_pair: Array) -> Array:
+def apart(left: BoardPlaces, right: BoardPlaces, R_pair: Array, t_pair: Array) -> Array:
     """(m, n) [px] by which n pairs are off m places of the right camera against the left: (m, 3, 3) and (m, 3) [m]."""
     back = np.swapaxes(R_pair, 1, 2)[:, None]
     turn = _vectors(back @ right.R @ np.swapaxes(left.R, 1, 2))
@@ -120,7 +120,7 @@ def apart(left: Places, right: Places, R_pair: Array, t_pair: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.sum(step * known, axis=-1), 0.0)), np.float64)
 
 
-def told_by(left: Places, right: Places) -> tuple[Array, Array]:
+def told_by(left: BoardPlaces, right: BoardPlaces) -> tuple[Array, Array]:
     """How the cameras stand by each pair alone: R_right_left (n, 3, 3) and t_right_left (n, 3) [m]."""
     R = right.R @ np.swapaxes(left.R, 1, 2)
     return R, right.middle - np.einsum("nij,nj->ni", R, left.middle)
@@ -153,7 +153,7 @@ class Pairing:
         return self.distance < TOO_FAR * self.usual
 
 
-def likeliest(left: Places, turns_of_right: Sequence[Places], floor: float) -> Pairing:
+def likeliest(left: BoardPlaces, turns_of_right: Sequence[BoardPlaces], floor: float) -> Pairing:
     """The place of the cameras that pairs tell of; turns_of_right : with the board in each of its attitudes."""
     n = len(left.R)
     tried = np.unique(np.linspace(0, n - 1, min(n, TRIED)).astype(int))
@@ -184,7 +184,7 @@ def board_turns(nominal: Array, orders: Sequence[NDArray[np.intp]]) -> list[Arra
 
 
 def paired(
-    sides: tuple[Places, Places],
+    sides: tuple[BoardPlaces, BoardPlaces],
     views: tuple[Sequence[int], Sequence[int]],
     nominal: Array,
     orders: Sequence[NDArray[np.intp]],
@@ -201,7 +201,7 @@ def paired(
     place = [{view: i for i, view in enumerate(side)} for side in views]
     last = len(names) - 1
 
-    def by(step: int, late: int, tried: Sequence[Places]) -> tuple[list[int], Pairing] | None:
+    def by(step: int, late: int, tried: Sequence[BoardPlaces]) -> tuple[list[int], Pairing] | None:
         """Left view v with the right one v + late, or with last - v + late."""
         partner = {v: (v if step > 0 else last - v) + late for v in views[0]}
         both = [v for v in views[0] if partner[v] in place[1]]
@@ -259,8 +259,8 @@ def _is_likelier(one: Pairing, stored: Pairing) -> bool:
 
 
 def _late(
-    left: Places,
-    turns: Sequence[Places],
+    left: BoardPlaces,
+    turns: Sequence[BoardPlaces],
     place: Sequence[Mapping[int, int]],
     both: Sequence[int],
     found: Pairing,
