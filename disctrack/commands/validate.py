@@ -20,7 +20,6 @@ def run(arguments: argparse.Namespace) -> int:
     files = write_validation(arguments.output, validation)
     if arguments.write is not None:
         write_into(arguments.write, validation, shlex.join(["disctrack", *sys.argv[1:]]))
-        files.append(arguments.write)
     print(f"Written: {', '.join(map(str, files))}")
     for line in validation.complaints:
         print(f"disctrack: validation: {line}", file=sys.stderr)
