@@ -6,6 +6,7 @@ Outliers are rejected and the noise that the points' own covariances leave unexp
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from calibration.fit.board_motion import BoardMotion, learnt, split
 from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
@@ -179,8 +180,5 @@ def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:
 
     if excess(0.0) <= 0:
         return 0.0
-    low, high = 0.0, float(np.sum(residuals**2)) / dof + 1e-12
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return 0.5 * (low + high)
+    most = 2.0 * float(np.sum(residuals**2)) / dof + 1e-12
+    return float(scipy.optimize.brentq(excess, 0.0, most, xtol=1e-12 * most))

@@ -308,10 +308,7 @@ def length_uncertainty(rig: StereoRig, points_world: Array) -> float:
     """
     middle, size = points_world.mean(0), float(np.sqrt(np.mean(np.var(points_world, axis=0)) * 3))
     ends = middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)])
-    _, d_world, d_rig = rig.project_with_jacobians(ends)
-    J = np.moveaxis(d_world, 0, 1).reshape(6, 4, 3)
-    K = np.moveaxis(d_rig, 0, 1).reshape(6, 4, -1)
-    shift = -np.linalg.solve(np.swapaxes(J, 1, 2) @ J, np.swapaxes(J, 1, 2) @ K)
+    shift = _shifts_of_points(rig, ends)
     along = np.stack([shift[axis, axis] - shift[axis + 3, axis] for axis in range(3)]) / size
     return float(np.sqrt(np.mean(np.einsum("ap,pq,aq->a", along, rig.covariance, along))))
 

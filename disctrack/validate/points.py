@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.cameras.camera import N_RIG, StereoRig
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
 from disctrack.frames import (
     continuous_quaternions,
@@ -90,18 +91,14 @@ def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
     nx, ny = board.inner_corners
     corners = np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), -1).reshape(-1, 2) * board.square_mm * 1e-3
     corners = np.column_stack([corners, np.zeros(len(corners))])
-    normal = np.zeros((N_RIG, N_RIG))
+    rows = []
     for number, (R, t) in enumerate(zip(*board_poses(scene, rig), strict=True)):
         arm = corners @ R.T
         _, by_point, by_rig = rig.project_with_jacobians(arm + t)
-        D = by_rig.reshape(-1, N_RIG)
-        normal += D.T @ D
-        if number:  # pose of this view is unknown
-            by_pose = np.concatenate([by_point, np.cross(arm[:, None], by_point)], axis=-1).reshape(-1, 6)
-            cross = by_pose.T @ D
-            normal -= cross.T @ np.linalg.solve(by_pose.T @ by_pose, cross)
-    scale = np.sqrt(np.diag(normal))
-    return np.asarray(CORNER_SIGMA_PX**2 * np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale))
+        by_pose = np.concatenate([by_point, np.cross(arm[:, None], by_point)], axis=-1)
+        by_pose = by_pose if number else 0.0 * by_pose  # of the first view the pose is known
+        rows.append(np.concatenate([by_pose, by_rig, np.zeros_like(by_rig[..., :1])], axis=-1).reshape(-1, N_RIG + 7))
+    return CORNER_SIGMA_PX**2 * normal_of_rows(np.stack(rows), 6).covariances()[0]
 
 
 def measured(
