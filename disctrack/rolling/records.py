@@ -12,7 +12,11 @@ State vector y (SI, radians), of which each regime integrates the first 8, 10 or
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import numpy as np
+
+Record: TypeAlias = "np.recarray[Any, Any]"  # the numbers of one kind below, read and written by name
 
 STATE_COMPONENTS = ("x", "y", "psi", "theta", "phi", "thetadot", "omega2", "omega3", "v_x", "v_y", "z", "v_z")
 ROLLING_COMPONENTS = STATE_COMPONENTS[:8]

@@ -1,10 +1,9 @@
 """The air: its density, the layer squeezed between disc and table, and drag on the disc as a whole."""
 
-from typing import Any
-
 import numpy as np
 
 from disctrack.rolling.effects.base import EffectParameter, effect, magnitude
+from disctrack.rolling.records import Record
 
 AIR_VISCOSITY = 1.81e-5  # [Pa s] at 20 degC; it does not depend on the density
 
@@ -16,7 +15,7 @@ AIR_VISCOSITY = 1.81e-5  # [Pa s] at 20 degC; it does not depend on the density
     belongs_to=("air",),
     candidate=False,  # one recording knows the product of density and coefficient only
 )
-def air(body: Any, p: Any) -> None:
+def air(body: Record, p: Record) -> None:
     """The density that every law of the air reads is another one than declared."""
     body.air_density = body.air_density * p.density
 
@@ -28,7 +27,7 @@ def air(body: Any, p: Any) -> None:
     belongs_to=("air",),
     counter_rotating=True,  # reads psidot, works on phidot
 )
-def air_moffatt(p: Any, s: Any, w: Any) -> None:
+def air_moffatt(p: Record, s: Record, w: Record) -> None:
     """Viscous air layer under the disc: power pi mu g r^2 / theta^2 on the adiabatic manifold."""
     layer = 0.25 * np.pi * AIR_VISCOSITY * s.radius * s.radius * s.radius
     w.M_m -= p.f * layer * s.psidot / (s.sin_theta * s.sin_theta)
@@ -41,7 +40,7 @@ def air_moffatt(p: Any, s: Any, w: Any) -> None:
     belongs_to=("air",),
     counter_rotating=True,
 )
-def air_bildsten(p: Any, s: Any, w: Any) -> None:
+def air_bildsten(p: Record, s: Record, w: Record) -> None:
     """Boundary layers on disc and table that are thinner than the gap: theta above about 0.5 deg."""
     r2 = s.radius * s.radius
     layer = np.sqrt(s.air_density * AIR_VISCOSITY) * r2 * r2  # rho sqrt(nu) = sqrt(rho mu)
@@ -55,7 +54,7 @@ def air_bildsten(p: Any, s: Any, w: Any) -> None:
     belongs_to=("air",),
     airborne=True,
 )
-def air_quadratic(p: Any, s: Any, w: Any) -> None:
+def air_quadratic(p: Record, s: Record, w: Record) -> None:
     """Free-air drag on the rotation, M = -a rho r^5 |Omega| Omega."""
     r2 = s.radius * s.radius
     rolling_m = -s.phidot * s.sin_theta
@@ -73,7 +72,7 @@ def air_quadratic(p: Any, s: Any, w: Any) -> None:
     belongs_to=("air", "disc"),
     airborne=True,
 )
-def air_spin(p: Any, s: Any, w: Any) -> None:
+def air_spin(p: Record, s: Record, w: Record) -> None:
     """Moment -a omega3 e3."""
     w.M_m += p.a * s.omega3 * s.sin_theta  # e3 = -sin(theta) m0 + cos(theta) k
     w.M_z -= p.a * s.omega3 * s.cos_theta
@@ -86,7 +85,7 @@ def air_spin(p: Any, s: Any, w: Any) -> None:
     belongs_to=("air", "disc"),
     airborne=True,
 )
-def drag_rotation(p: Any, s: Any, w: Any) -> None:
+def drag_rotation(p: Record, s: Record, w: Record) -> None:
     """Moment -c Omega on the whole disc."""
     w.M_n -= p.c * s.thetadot
     w.M_m += p.c * s.phidot * s.sin_theta
@@ -100,7 +99,7 @@ def drag_rotation(p: Any, s: Any, w: Any) -> None:
     belongs_to=("air", "disc"),
     airborne=True,
 )
-def drag_linear(p: Any, s: Any, w: Any) -> None:
+def drag_linear(p: Record, s: Record, w: Record) -> None:
     """Force -c v_O on the disc as a whole."""
     w.X_n -= p.c * s.v_n
     w.X_m -= p.c * s.v_m

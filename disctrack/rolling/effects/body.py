@@ -1,10 +1,9 @@
 """The disc, the table and gravity differ from what was declared."""
 
-from typing import Any
-
 import numpy as np
 
 from disctrack.rolling.effects.base import EffectParameter, effect
+from disctrack.rolling.records import Record
 
 
 @effect(
@@ -14,7 +13,7 @@ from disctrack.rolling.effects.base import EffectParameter, effect
     EffectParameter("tilt_y", "rad", 1e-3, "direction cosine of gravity along j", lower=-0.5, upper=0.5),
     belongs_to=("rig", "surface"),
 )
-def table_tilt(body: Any, p: Any) -> None:
+def table_tilt(body: Record, p: Record) -> None:
     """Gravity is not along k: the table descends towards (i, j) with these slopes."""
     g = -body.g_z
     body.g_x = g * p.tilt_x
@@ -28,7 +27,7 @@ def table_tilt(body: Any, p: Any) -> None:
     EffectParameter("g_error", "m/s^2", 0.01, "gravity minus the declared one", lower=-5.0, upper=5.0),
     belongs_to=("rig",),
 )
-def gravity(body: Any, p: Any) -> None:
+def gravity(body: Record, p: Record) -> None:
     """Gravity differs from the declared value; indistinguishable from a wrong frame rate."""
     g = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
     factor = 1.0 + p.g_error / g
@@ -43,7 +42,7 @@ def gravity(body: Any, p: Any) -> None:
     EffectParameter("c_3", "m", 1e-4, "along the axis of the disc, towards the upper face"),
     belongs_to=("disc",),
 )
-def centre_of_mass(body: Any, p: Any) -> None:
+def centre_of_mass(body: Record, p: Record) -> None:
     """The centre of mass is not the geometric centre; inertia is that about the centre of mass."""
     body.com_1 = body.com_1 + p.c_1
     body.com_2 = body.com_2 + p.c_2
@@ -56,7 +55,7 @@ def centre_of_mass(body: Any, p: Any) -> None:
     EffectParameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),
     belongs_to=("disc",),
 )
-def contact_radius(body: Any, p: Any) -> None:
+def contact_radius(body: Record, p: Record) -> None:
     """The circle of contact has another radius; mass and inertia stay."""
     body.radius = body.radius + p.r_error
 
@@ -67,7 +66,7 @@ def contact_radius(body: Any, p: Any) -> None:
     EffectParameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),
     belongs_to=("disc",),
 )
-def contact_height(body: Any, p: Any) -> None:
+def contact_height(body: Record, p: Record) -> None:
     """The contact circle lies at another distance below the centre; mass and inertia stay."""
     body.half_thickness = body.half_thickness + p.h_error
 
@@ -78,7 +77,7 @@ def contact_height(body: Any, p: Any) -> None:
     EffectParameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),
     belongs_to=("disc",),
 )
-def edge_radius(body: Any, p: Any) -> None:
+def edge_radius(body: Record, p: Record) -> None:
     """The edge is a quarter of a torus: the contact wanders over it with the nutation."""
     body.edge_radius = body.edge_radius + p.rho
 
@@ -91,7 +90,7 @@ def edge_radius(body: Any, p: Any) -> None:
     EffectParameter("slope_y", "rad", 1e-3, "kappa times the y of the lowest point", lower=-0.3, upper=0.3),
     belongs_to=("surface",),
 )
-def table_curved(body: Any, p: Any) -> None:
+def table_curved(body: Record, p: Record) -> None:
     """The table is a sphere: a hollow (positive curvature) or a dome, with any slope at the origin."""
     body.curvature = body.curvature + p.kappa
     body.slope_x, body.slope_y = body.slope_x + p.slope_x, body.slope_y + p.slope_y
@@ -106,7 +105,7 @@ def table_curved(body: Any, p: Any) -> None:
     EffectParameter("lobes_s", "m", 1e-5, "three waves, sine", lower=-1e-3, upper=1e-3),
     belongs_to=("disc",),
 )
-def rim(body: Any, p: Any) -> None:
+def rim(body: Record, p: Record) -> None:
     """The rim is no circle: its distance from the axis, tangent by tangent, has two and three waves around."""
     body.oval_c, body.oval_s = body.oval_c + p.oval_c, body.oval_s + p.oval_s
     body.lobes_c, body.lobes_s = body.lobes_c + p.lobes_c, body.lobes_s + p.lobes_s
@@ -121,7 +120,7 @@ def rim(body: Any, p: Any) -> None:
     belongs_to=("disc",),
     sought=True,
 )
-def rim_flat(body: Any, p: Any) -> None:
+def rim_flat(body: Record, p: Record) -> None:
     """A flat of the rim: over its width the contact nears the axis, and the disc dips once a turn."""
     body.flat_depth = body.flat_depth + p.depth
     body.flat_cos, body.flat_sin = np.cos(p.angle), np.sin(p.angle)
@@ -134,7 +133,7 @@ def rim_flat(body: Any, p: Any) -> None:
     EffectParameter("c", "m/N", 1e-6, "compliance", lower=0.0, upper=1e-3),
     belongs_to=("surface",),
 )
-def table_yielding(body: Any, p: Any) -> None:
+def table_yielding(body: Record, p: Record) -> None:
     """The table, or a mat on it, sinks in proportion to the load: under its mean, and with its course."""
     body.compliance = body.compliance + p.c
 
@@ -145,7 +144,7 @@ def table_yielding(body: Any, p: Any) -> None:
     EffectParameter("c", "m/s", 1e-5, "velocity of the contact over F_t / F_z", lower=0.0, upper=0.1),
     belongs_to=("disc", "surface"),
 )
-def creep(body: Any, p: Any) -> None:
+def creep(body: Record, p: Record) -> None:
     """The contact gives way to friction: it moves along the table, in proportion to the force over the load."""
     body.creep = body.creep + p.c
 
@@ -156,7 +155,7 @@ def creep(body: Any, p: Any) -> None:
     EffectParameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),
     belongs_to=("disc",),
 )
-def inertia_diametral(body: Any, p: Any) -> None:
+def inertia_diametral(body: Record, p: Record) -> None:
     """J1 = J2 differ from the homogeneous disc's."""
     body.J_11 = body.J_11 * (1.0 + p.e)
     body.J_22 = body.J_22 * (1.0 + p.e)
@@ -168,7 +167,7 @@ def inertia_diametral(body: Any, p: Any) -> None:
     EffectParameter("e", "1", 0.01, "relative change of J3", lower=-0.5, upper=1.0),
     belongs_to=("disc",),
 )
-def inertia_axial(body: Any, p: Any) -> None:
+def inertia_axial(body: Record, p: Record) -> None:
     """J3 differs from the homogeneous disc's."""
     body.J_33 = body.J_33 * (1.0 + p.e)
 
@@ -180,7 +179,7 @@ def inertia_axial(body: Any, p: Any) -> None:
     EffectParameter("J_23", "kg m^2", 1e-8, "moment of deviation between the second body axis and e3"),
     belongs_to=("disc",),
 )
-def inertia_product(body: Any, p: Any) -> None:
+def inertia_product(body: Record, p: Record) -> None:
     """Products of inertia with the axis: dynamic imbalance of a wedge-shaped disc."""
     body.J_13 = body.J_13 + p.J_13
     body.J_23 = body.J_23 + p.J_23
@@ -191,6 +190,6 @@ def inertia_product(body: Any, p: Any) -> None:
     "Coulomb's law at the contact",
     EffectParameter("mu", "1", 0.2, "coefficient of friction; infinite = never slips", null=np.inf, lower=1e-3),
 )
-def slip(body: Any, p: Any) -> None:
+def slip(body: Record, p: Record) -> None:
     """Coulomb friction of finite coefficient: the disc slips where rolling would need more."""
     body.inverse_friction = 1.0 / p.mu  # acts through the constraint force, not through the wrench of a law

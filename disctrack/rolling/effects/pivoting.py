@@ -1,10 +1,9 @@
 """Moments about the vertical that resist the pivoting of the contact."""
 
-from typing import Any
-
 import numpy as np
 
 from disctrack.rolling.effects.base import EffectParameter, effect, sign
+from disctrack.rolling.records import Record
 
 
 @effect(
@@ -15,7 +14,7 @@ from disctrack.rolling.effects.base import EffectParameter, effect, sign
         "omega_s", "rad/s", 1e-2, "pivoting rate below which it is not full", lower=1e-4, upper=10.0, is_shape=True
     ),
 )
-def kz(p: Any, s: Any, w: Any) -> None:
+def kz(p: Record, s: Record, w: Record) -> None:
     """M_z = -k_z F_z sgn(omega_z), the sign softened by creep: what the contact gives before it turns as a whole.
 
     How soft it is matters where the pivoting dies out: omega_s = 0.01 in place of 0.001 rad/s moves k_z by 0.2 %.
@@ -28,7 +27,7 @@ def kz(p: Any, s: Any, w: Any) -> None:
     "Coulomb-Contensou friction linearised in the pivoting rate, Leine and Glocker 2003",
     EffectParameter("k", "m s", 1e-5, "lever arm per pivoting rate", lower=0.0),
 )
-def pivoting_viscous(p: Any, s: Any, w: Any) -> None:
+def pivoting_viscous(p: Record, s: Record, w: Record) -> None:
     """M_z = -k F_z omega_z: pivoting superposed on slip or creep."""
     w.load_z -= p.k * s.omega_z
 
@@ -40,7 +39,7 @@ def pivoting_viscous(p: Any, s: Any, w: Any) -> None:
     EffectParameter("omega_s", "rad/s", 1.0, "pivoting rate below which creep dominates", lower=1e-2, is_shape=True),
     EffectParameter("a", "m", 75e-6, "radius of the contact", lower=1e-7, is_shape=True),
 )
-def pivoting_contensou(p: Any, s: Any, w: Any) -> None:
+def pivoting_contensou(p: Record, s: Record, w: Record) -> None:
     """M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2): at most k F_z, softened by creep and slip."""
     slip2 = (s.slip_n * s.slip_n + s.slip_m * s.slip_m) / (p.a * p.a)
     w.load_z -= p.k * s.omega_z / np.sqrt(s.omega_z * s.omega_z + p.omega_s * p.omega_s + slip2)

@@ -1,10 +1,9 @@
 """A tool, not a law of nature: an unknown moment and force during a short time, for reading residuals."""
 
-from typing import Any
-
 import numpy as np
 
 from disctrack.rolling.effects.base import EffectParameter, effect
+from disctrack.rolling.records import Record
 
 
 @effect(
@@ -17,7 +16,7 @@ from disctrack.rolling.effects.base import EffectParameter, effect
     passive=False,
     candidate=False,
 )
-def wrench_probe(p: Any, s: Any, w: Any) -> None:
+def wrench_probe(p: Record, s: Record, w: Record) -> None:
     """Contact moment and force with a Gaussian course in time; its sensitivities are the motion's impulse response."""
     u = (s.time - p.t_0) / p.width
     course = np.exp(-0.5 * u * u)

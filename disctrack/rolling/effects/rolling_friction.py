@@ -1,10 +1,9 @@
 """Moments that resist the rolling of the contact: the paper's laws and their rivals."""
 
-from typing import Any
-
 import numpy as np
 
 from disctrack.rolling.effects.base import EffectParameter, effect, magnitude, rolling_rates, sign
+from disctrack.rolling.records import Record
 
 
 @effect(
@@ -13,7 +12,7 @@ from disctrack.rolling.effects.base import EffectParameter, effect, magnitude, r
     EffectParameter("k_m", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),
     counter_rotating=True,  # reads psidot, works on phidot
 )
-def km(p: Any, s: Any, w: Any) -> None:
+def km(p: Record, s: Record, w: Record) -> None:
     """M_m = -k_m F_z psidot |psidot|: rolling friction growing with the square of the precession rate."""
     w.load_m -= p.k_m * s.psidot * magnitude(s.psidot)
 
@@ -23,7 +22,7 @@ def km(p: Any, s: Any, w: Any) -> None:
     "variant of Ma et al. 2014, (5.4): direction of the dissipative moment",
     EffectParameter("k", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),
 )
-def km_e2(p: Any, s: Any, w: Any) -> None:
+def km_e2(p: Record, s: Record, w: Record) -> None:
     """The paper's moment turned into the direction of e2, perpendicular to the axis."""
     moment = p.k * s.psidot * magnitude(s.psidot)
     w.load_m -= moment * s.cos_theta  # e2 = cos(theta) m0 + sin(theta) k
@@ -35,7 +34,7 @@ def km_e2(p: Any, s: Any, w: Any) -> None:
     "Ma et al. 2014, (5.3)",
     EffectParameter("k_n", "m s^2", 0.381e-7, "lever arm per squared nutation rate", lower=0.0),
 )
-def kn(p: Any, s: Any, w: Any) -> None:
+def kn(p: Record, s: Record, w: Record) -> None:
     """M_n = -k_n F_z thetadot |thetadot|."""
     w.load_n -= p.k_n * s.thetadot * magnitude(s.thetadot)
 
@@ -47,7 +46,7 @@ def kn(p: Any, s: Any, w: Any) -> None:
     EffectParameter("p", "1", 1.5, "exponent of the precession rate", lower=0.0, upper=4.0, is_shape=True),
     counter_rotating=True,
 )
-def rolling_power(p: Any, s: Any, w: Any) -> None:
+def rolling_power(p: Record, s: Record, w: Record) -> None:
     """M_m = -k F_z (|psidot| / 100 rad/s)^p sgn(psidot): the paper's law with a free exponent."""
     rate = magnitude(s.psidot) / 100.0
     w.load_m -= p.k * np.exp(p.p * np.log(rate)) * (s.psidot / magnitude(s.psidot))
@@ -58,7 +57,7 @@ def rolling_power(p: Any, s: Any, w: Any) -> None:
     "Leine 2009, Arch. Appl. Mech. 79:1063; power as in Easwar et al. 2002",
     EffectParameter("mu_c", "1", 1.06e-3, "coefficient of contour friction", lower=0.0),
 )
-def contour_dry(p: Any, s: Any, w: Any) -> None:
+def contour_dry(p: Record, s: Record, w: Record) -> None:
     """Generalised force -mu_c F_z r sgn(phidot) on phi: the contour slides dry past the contact."""
     w.load_m += p.mu_c * s.radius * sign(s.phidot, 1e-3) / s.sin_theta
 
@@ -68,7 +67,7 @@ def contour_dry(p: Any, s: Any, w: Any) -> None:
     "Leine 2009, Arch. Appl. Mech. 79:1063; power as in McDonald and McDonald 2001",
     EffectParameter("c", "N s/m", 1e-5, "viscous coefficient along the contour", lower=0.0),
 )
-def contour_viscous(p: Any, s: Any, w: Any) -> None:
+def contour_viscous(p: Record, s: Record, w: Record) -> None:
     """Generalised force -c r^2 phidot on phi, independent of the load."""
     w.M_m += p.c * s.radius * s.radius * s.phidot / s.sin_theta
 
@@ -78,7 +77,7 @@ def contour_viscous(p: Any, s: Any, w: Any) -> None:
     "Le Saux, Leine and Glocker 2005; Kessler and O'Reilly 2002",
     EffectParameter("delta", "m", 1e-5, "lever arm: half width of the contact", lower=0.0),
 )
-def rolling_classical(p: Any, s: Any, w: Any) -> None:
+def rolling_classical(p: Record, s: Record, w: Record) -> None:
     """Moment delta F_z against the horizontal angular velocity, independent of its size."""
     n, m, rate = rolling_rates(s)
     w.load_n -= p.delta * n / rate
@@ -90,7 +89,7 @@ def rolling_classical(p: Any, s: Any, w: Any) -> None:
     "Borisov, Kilin and Karavaev 2017, Phys.-Usp. 60:931",
     EffectParameter("c", "m s", 1e-6, "lever arm per rolling rate", lower=0.0),
 )
-def rolling_viscous(p: Any, s: Any, w: Any) -> None:
+def rolling_viscous(p: Record, s: Record, w: Record) -> None:
     """Moment against the horizontal angular velocity, proportional to it."""
     w.load_n -= p.c * s.thetadot
     w.load_m += p.c * s.phidot * s.sin_theta
@@ -101,7 +100,7 @@ def rolling_viscous(p: Any, s: Any, w: Any) -> None:
     "Kendall 1975, Wear 33:351: rolling friction and adhesion between smooth solids",
     EffectParameter("a", "N m", 2e-5, "moment", lower=0.0),
 )
-def rolling_adhesive(p: Any, s: Any, w: Any) -> None:
+def rolling_adhesive(p: Record, s: Record, w: Record) -> None:
     """Moment against the horizontal angular velocity that no load changes: what it costs to part the surfaces again."""
     n, m, rate = rolling_rates(s)
     w.M_n -= p.a * n / rate

@@ -1,10 +1,9 @@
 """Forces that the table and what stands on it exert: springs and threads, magnets below it, vibration."""
 
-from typing import Any
-
 import numpy as np
 
 from disctrack.rolling.effects.base import EffectParameter, effect
+from disctrack.rolling.records import Record
 
 
 @effect(
@@ -17,7 +16,7 @@ from disctrack.rolling.effects.base import EffectParameter, effect
     passive=False,  # a potential: it gives back what it takes
     airborne=True,
 )
-def spring(p: Any, s: Any, w: Any) -> None:
+def spring(p: Record, s: Record, w: Record) -> None:
     """A force towards a point of the table, in proportion to the distance: X = F - k (x, y), towards F / k."""
     X_x, X_y = p.F_x - p.k * s.x, p.F_y - p.k * s.y
     w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
@@ -35,7 +34,7 @@ def spring(p: Any, s: Any, w: Any) -> None:
     airborne=True,
     candidate=False,
 )
-def table_vibration(p: Any, s: Any, w: Any) -> None:
+def table_vibration(p: Record, s: Record, w: Record) -> None:
     """The table swings with one frequency, and the cameras with it: in their axes gravity swings.
 
     In a diagnosis it is found without being named beforehand, with its frequency, as a force that swings.
@@ -57,7 +56,7 @@ def table_vibration(p: Any, s: Any, w: Any) -> None:
     airborne=True,
     sought=True,
 )
-def table_shaken(p: Any, s: Any, w: Any) -> None:
+def table_shaken(p: Record, s: Record, w: Record) -> None:
     """The table swings with one frequency, and the cameras, which stand elsewhere, see it."""
     rate = 2 * np.pi * p.frequency
     c, d = np.cos(rate * s.time), np.sin(rate * s.time)
@@ -80,7 +79,7 @@ def table_shaken(p: Any, s: Any, w: Any) -> None:
     passive=False,
     airborne=True,
 )
-def table_settles(p: Any, s: Any, w: Any) -> None:
+def table_settles(p: Record, s: Record, w: Record) -> None:
     """The height of the table in the axes of the cameras changes with time, and no force with it but by a_z."""
     w.table_z += (p.v_z + 0.5 * p.a_z * s.time) * s.time
     w.table_vz += p.v_z + p.a_z * s.time
