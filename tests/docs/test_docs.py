@@ -239,10 +239,23 @@ def cells_of(notebook: Path) -> list[str]:
 
 
 def test_the_notebook_is_one_and_its_cells_compile():
-    nbformat = json.loads(text_of(DOCS / "tour.ipynb"))
+    nbformat = json.loads(text_of(DOCS / "notebook.ipynb"))
     assert nbformat["nbformat"] == 4
-    for cell in cells_of(DOCS / "tour.ipynb"):
+    for cell in cells_of(DOCS / "notebook.ipynb"):
         ast.parse(cell)
+
+
+def test_the_notebook_is_stored_with_what_its_cells_showed():
+    cells = [cell for cell in json.loads(text_of(DOCS / "notebook.ipynb"))["cells"] if cell["cell_type"] == "code"]
+    shown = [output for cell in cells for output in cell["outputs"]]
+    assert not any(output["output_type"] == "error" for output in shown)
+    assert sum("image/png" in output.get("data", {}) for output in shown) == 2
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+
+
+def test_every_public_name_is_in_the_reference():
+    shown = set(re.findall(r"^::: (?:\w+\.)*(\w+)$", text_of(DOCS / "reference.md"), re.MULTILINE))
+    assert shown == set(disctrack.__all__)
 
 
 @pytest.mark.slow
@@ -254,12 +267,12 @@ def test_the_notebook_runs_and_its_last_lines_show_themselves(workplace, monkeyp
     matplotlib.use("Agg")
     monkeypatch.chdir(workplace)
     scope: dict[str, object] = {}
-    for cell in cells_of(DOCS / "tour.ipynb"):
+    for cell in cells_of(DOCS / "notebook.ipynb"):
         tree = ast.parse(cell)
         last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
-        exec(compile(tree, "tour.ipynb", "exec"), scope)
+        exec(compile(tree, "notebook.ipynb", "exec"), scope)
         if last is not None:
-            shown = eval(compile(ast.Expression(last.value), "tour.ipynb", "eval"), scope)
+            shown = eval(compile(ast.Expression(last.value), "notebook.ipynb", "eval"), scope)
             assert len(repr(shown)) < 4000, cell
 
 
