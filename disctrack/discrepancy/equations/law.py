@@ -239,7 +239,8 @@ class _Competition:
         for law in self.laws:
             if all(law.variable not in _variables(self.system.formulas, c.name) for c in beside):
                 length, quantities = self._scanned(first, law, beside, values)
-                scans.append((length, law, quantities))
+                if np.isfinite(length):
+                    scans.append((length, law, quantities))
         scans.sort(key=lambda scan: scan[0])
         if not scans:
             return None
@@ -300,6 +301,8 @@ class _Competition:
             power = (U.T @ right) ** 2 / self.noise
             gain = (SIZES[:, None] * size * singular) ** 2 / self.noise
             found = np.sum(np.log1p(gain) - power * gain / (1 + gain), axis=1)
+            if not np.isfinite(found).all():  # columns of nothing: no size can be told from them
+                return np.inf, own
             best = int(np.argmin(found))
             priors.append(SIZES[best] * size * falls)
             lengths.append(float(right @ right) / self.noise + float(found[best]))
