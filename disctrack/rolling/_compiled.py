@@ -6,16 +6,35 @@ and a cached integrator can never hold an outdated copy of a law. The records' f
 changed layout recompiles what depends on it. A call by address costs about 3 ns.
 """
 
+import operator
 from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 from numba import from_dtype, types
-from numba.extending import register_jitable
+from numba.extending import lower_builtin, register_jitable
 
 from calibration.kit.compiled import cfunc, one_at_a_time
 from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
+
+
+@lower_builtin(operator.truediv, types.complex128, types.complex128)
+def _divided(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Complex division that is NaN where the divisor is zero: numba's own raises, which a C function cannot hand on."""
+
+    def ratio(a: complex, b: complex) -> complex:  # Smith 1962
+        if b.real == 0.0 and b.imag == 0.0:
+            return complex(np.nan, np.nan)
+        if abs(b.real) >= abs(b.imag):
+            r = b.imag / b.real
+            d = b.real + b.imag * r
+            return complex((a.real + a.imag * r) / d, (a.imag - a.real * r) / d)
+        r = b.real / b.imag
+        d = b.real * r + b.imag
+        return complex((a.real * r + a.imag) / d, (a.imag * r - a.real) / d)
+
+    return context.compile_internal(builder, ratio, signature, arguments)
 
 
 def _pointer(scalar: type) -> types.Type:

@@ -141,7 +141,7 @@ def test_false_alarms_are_rare():
 
 def test_settings_are_kept_with_the_answer():
     settings = Settings(false_alarm=1e-3, max_effects=1)
-    assert diagnose_trajectory(measured(seed=13, n=120), settings=settings).diagnosis.settings == settings
+    assert diagnose_trajectory(measured(seed=13, n=60), settings=settings).diagnosis.settings == settings
 
 
 @pytest.mark.slow
