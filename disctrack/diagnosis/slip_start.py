@@ -21,7 +21,7 @@ from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
-from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance, threshold
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
@@ -248,12 +248,18 @@ def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:
     return (f"the disc slips at first, with {1e3 * slip:.4g} mm/s at the contact, {until}",)
 
 
-def with_slip(diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
+def with_slip(system: DiscSystem, diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
     """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
     system_gain = (slip.without.cost - diagnosis.before.cost) / diagnosis.noise
     held = diagnosis.held_out_before
     held_gain = 2 * (held.log_density - slip.held_out.log_density) / diagnosis.noise if held else np.nan
-    found = Found(slip.candidate, float(system_gain), float(held_gain), _threshold(diagnosis), ())
+    found = Found(
+        slip.candidate,
+        float(system_gain),
+        float(held_gain),
+        threshold(system, diagnosis.settings, len(slip.candidate.names)),
+        (),
+    )
     tried = Tried(slip.candidate, float(system_gain), float(system_gain), float(held_gain), "chosen")
     verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
     return replace(
@@ -265,9 +271,3 @@ def with_slip(diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
         held_out_before=slip.held_out,
         tried=(tried, *diagnosis.tried),
     )
-
-
-def _threshold(diagnosis: Diagnosis) -> float:
-    from scipy import stats
-
-    return float(stats.chi2.isf(diagnosis.settings.false_alarm / max(len(diagnosis.tried), 1), 3))

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
 from calibration.kit.brief import Brief
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
@@ -34,7 +33,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.memory import inflation, with_memory
 from disctrack.discrepancy.score import Linearisation, score_all
-from disctrack.discrepancy.search import Diagnosis, Found, Settings
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, length, threshold
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.significance import price_of_a_number, wald
 from disctrack.discrepancy.system import System
@@ -98,7 +97,7 @@ def diagnose_trajectory(
         enlarged = learned.fit if kept else diagnosis.after
         diagnosis = replace(diagnosis, verdict="unexplained", found=kept, after=enlarged, reason=reason)
     if answer.slip is not None:
-        diagnosis = with_slip(diagnosis, answer.slip)
+        diagnosis = with_slip(system, diagnosis, answer.slip)
     held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
     assert held_before is not None
     assert held_after is not None
@@ -205,7 +204,7 @@ def _with_another_known(system: DiscSystem, diagnosis: Diagnosis, kinds: Collect
     best = diagnosis
     for s in score_all(Linearisation(judged, fitted, others), others)[:TRIED_BESIDE]:
         candidate = s.candidate
-        enough = float(stats.chi2.isf(settings.false_alarm / len(system.candidates), len(candidate.names)))
+        enough = threshold(system, settings, len(candidate.names))
         if s.gain / noise < enough:
             break
         quantities = {q.name: q for q in (*fitted.quantities, *candidate.quantities)}
@@ -326,10 +325,7 @@ def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequenc
 
 
 def _length(system: DiscSystem, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
-    """Chi-square with the price of the fitted numbers, and of having picked known effects among so many."""
-    numbers = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
-    picked = 2.0 * float(np.log(max(len(diagnosis.tried), 1))) * len(found)
-    return fitted.cost / diagnosis.noise + numbers * price_of_a_number(system.weights) + picked
+    return length(system, diagnosis.settings, diagnosis.noise, fitted, [f.candidate for f in found])
 
 
 def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> _Beside | None:

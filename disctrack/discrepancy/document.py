@@ -69,6 +69,14 @@ def tried_json(tried: Tried) -> dict[str, Any]:
     }
 
 
+def explanations_json(d: Diagnosis) -> list[dict[str, Any]]:
+    """Sets of effects that describe the data as shortly as the answer, with their odds against it."""
+    return [
+        {"effects": list(names), "longer_by": longer, "odds": float(np.exp(-0.5 * longer))}
+        for names, longer in d.explanations
+    ]
+
+
 def declared_json(fit: Fit) -> dict[str, Any]:
     """Numbers of the declared laws with their standard deviations."""
     laws = [q for q in fit.quantities if not q.is_initial and not np.isfinite(q.prior_sigma)]
@@ -111,6 +119,7 @@ def document(
         "before": fit_errors(d.before, d.held_out_before, d.noise) | dict(before),
         "after": fit_errors(d.after, d.held_out_after, d.noise) | dict(after),
         "noise_variance_over_stated": d.noise,
+        "explanations": explanations_json(d),
         "tried": [tried_json(t) for t in d.tried],
         "settings": vars(d.settings),
     }

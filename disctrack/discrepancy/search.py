@@ -1,11 +1,14 @@
-"""Which effects does the model lack? Forward search with refits, judged by information criterion and held-out data.
+"""Which effects does the model lack? Sets of terms compete by one length, in units of -2 log evidence.
 
-Guards against what is known to mislead: nothing is attributed before the base fit has converged; every candidate that
-counts is refitted together with all that the base fit moves, within its bounds; the gain must beat the best of as many
-candidates as were looked at; and a free run over data that the fit has not seen must become more probable.
+An explanation is a set of effects fitted together with all that the base fit moves. Its length is chi-square at the
+noise found, the price of its terms (of each pick among so many, and of each further number), and the surprise of their
+values; what no one would believe has none. Whatever linearisation says may be shorter is refitted: terms are added,
+exchanged and taken out, from each of the shortest few. The answer is the shortest explanation that also predicts data
+which its fit has not seen better than the shorter sets of its terms do, and whose terms stand out from the memory of
+what is left.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -20,7 +23,7 @@ from disctrack.discrepancy.held_out import TRAIN_FRACTION, HeldOut, held_out, tr
 from disctrack.discrepancy.memory import inflation
 from disctrack.discrepancy.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all, score_pairs
-from disctrack.discrepancy.significance import TWO_SIDED
+from disctrack.discrepancy.significance import TWO_SIDED, price_of_a_number
 from disctrack.discrepancy.system import (
     Candidate,
     Quantity,
@@ -29,8 +32,9 @@ from disctrack.discrepancy.system import (
     Values,
 )
 
-CLASS_GAIN = 10.0  # two explanations whose chi-square differs by less are not told apart (odds of e^5)
-OBVIOUS = 5.0  # times the gain that noise alone does not reach
+CLASS_GAIN = 10.0  # two explanations whose lengths differ by less are not told apart (odds of e^5)
+OBVIOUS = 5.0  # times its price: a gain that the fitted part alone may know
+WIDTH = 2  # explanations that are enlarged as long as none leaves noise
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_RIVALS = 12
@@ -48,8 +52,8 @@ class Settings:
 
     false_alarm: float = 0.005  # probability that noise alone brings a claim, over all candidates
     max_effects: int = 3
-    shortlist: int = 8  # candidates that are refitted in full in each round
-    judged: int = 3  # of them, that also have to stand a free run
+    shortlist: int = 8  # proposals of one term more that are refitted in full for each explanation
+    judged: int = 4  # explanations that may be put to the free run
     train_fraction: float = TRAIN_FRACTION
     at_noise: float = 1.1  # reduced chi-square over the noise found in the data, up to which nothing is left
     unexplained_share: float = UNEXPLAINED_SHARE
@@ -57,14 +61,17 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One more candidate fitted together with everything before it."""
+class Explanation:
+    """Effects fitted together with all that the base fit moves."""
 
-    candidates: tuple[Candidate, ...]  # all effects of the fit
+    candidates: tuple[Candidate, ...]
     fit: Fit
-    gain: float  # decrease of chi-square against the fit before, in units of the noise found
-    held_out: HeldOut | None = None  # not asked for where something else decides already
-    held_out_gain: float | None = None  # increase of 2 log density of the test data, in the same units
+    credible: bool = True  # a fit that has converged, to amounts that may be
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of its effects."""
+        return frozenset(c.name for c in self.candidates)
 
 
 @dataclass(frozen=True)
@@ -115,6 +122,8 @@ class Diagnosis(Outline):
     settings: Settings = field(default_factory=Settings)
     partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
     nearest: Fit | None = None  # with them
+    # sets of effects whose length does not tell them from the answer, the shortest first, and how much longer they are
+    explanations: tuple[tuple[tuple[str, ...], float], ...] = ()
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
@@ -144,6 +153,23 @@ def diagnose(
     return replace(_Search(judged, settings, rows, former).run(base), judged=judged)
 
 
+def threshold(system: System, settings: Settings, k: int) -> float:
+    """Gain with k quantities that noise reaches with the allowed probability, over all candidates."""
+    return float(stats.chi2.isf(settings.false_alarm / max(len(system.candidates), 1), k))
+
+
+def length(system: System, settings: Settings, noise: float, fitted: Fit, picked: Sequence[Candidate]) -> float:
+    """Of an explanation, in units of -2 log evidence, but for a constant of the system.
+
+    Chi-square of data and priors at this noise; Schwarz's price of every number without a prior; for every effect
+    picked from the catalogue, what the best of so many gains by noise beyond that; and how surprising its values are.
+    """
+    number = price_of_a_number(system.weights)
+    free = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
+    picks = len(picked) * (threshold(system, settings, 1) - number)
+    return fitted.cost / noise + free * number + picks + sum(_surprise(c, fitted) for c in picked)
+
+
 def noise_variance(system: System, fit_: Fit) -> float:
     """Variance of the fast part of the residual over that stated, from third differences in time.
 
@@ -168,9 +194,13 @@ class _Search:
         self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
-        self.refits: dict[str, Trial] = {}
         self.rough = system.several_minima
+        self.pool: dict[frozenset[str], Explanation] = {}
         self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
+        self.refused: set[frozenset[str]] = set()  # explanations that do not stand out from what they leave
+        self.expanded: set[frozenset[str]] = set()
+        self.first: dict[str, tuple[float, Explanation]] = {}  # by effect: gain of its first refit, and that
+        self.scored: dict[frozenset[str], tuple[Linearisation, list[Score]]] = {}
         self.free_runs: list[tuple[Fit, HeldOut]] = []
 
     def run(self, start: Fit) -> Diagnosis:
@@ -180,58 +210,167 @@ class _Search:
             if not base.converged:
                 return _refusal(base, self.settings)
         self.fits[frozenset()] = base
+        nothing = self.pool[frozenset()] = Explanation((), base)
         self.noise = self._noise(base)
-        current = Trial((), base, 0.0, self._held_out(base), 0.0)
-        before = current
-        linear = Linearisation(self.system, base, self.candidates)
-        scores = score_all(linear, self.candidates)
+        linear, scores = self._scored(nothing)
         by_chance = chance(linear, scores, self.noise) if scores else None
-        while len(current.candidates) < self.settings.max_effects:
-            better = self._next(current, linear, scores if not current.candidates else None)
-            if better is None:
+        self._explore()
+        rivals: list[list[Rival]] = []
+        while (best := self._shortest_that_stands()).candidates:
+            if not self._at_noise(best.fit) and not self._worth_naming(nothing, best):
+                answer = self._answer(nothing, nothing, (), scores, best.candidates)
+                return replace(answer, chance=by_chance, nearest=best.fit)
+            if (smaller := self._without_idle(best)) is not None:
+                self.refused.add(best.names)
+                self.pool.setdefault(smaller.names, smaller)
+                self._explore()
+                continue
+            rivals = [self._rivals(best, c) for c in best.candidates]
+            self._explore()
+            if self._shortest_that_stands() is best:
                 break
-            current = self._pruned(better)
-            # a large effect reaches into the fast part of the residual: with it in the model, the noise is seen better
-            self.noise = min(self.noise, self._noise(current.fit))
-            linear = Linearisation(self.system, current.fit, self.candidates)
-        if current.candidates and not self._worth_naming(before, current):
-            answer = self._answer(before, before, (), scores, partial=current)
-            return replace(answer, chance=by_chance, nearest=current.fit)
-        current = self._standing(current)
-        current, rivals = self._settled(current)
-        found = tuple(self._found(current, c, rivals[c.name]) for c in current.candidates)
-        return replace(self._answer(before, current, found, scores), chance=by_chance)
+        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals, strict=True))
+        return replace(self._answer(nothing, best, found, scores), chance=by_chance)
 
     def _noise(self, fit_: Fit) -> float:
         stated = self.settings.noise
         return max(noise_variance(self.system, fit_) if stated is None else stated, 1e-12)
 
-    def _worth_naming(self, before: Trial, after: Trial) -> bool:
+    def length(self, e: Explanation) -> float:
+        """As the function of that name; infinite for what cannot be believed."""
+        return length(self.system, self.settings, self.noise, e.fit, e.candidates) if e.credible else np.inf
+
+    def _price(self, candidates: Sequence[Candidate]) -> float:
+        """Of more terms, as in their length."""
+        numbers, one = len({n for c in candidates for n in c.names}), price_of_a_number(self.system.weights)
+        return len(candidates) * self.threshold(1) + (numbers - len(candidates)) * one
+
+    def threshold(self, k: int) -> float:
+        """As the function of that name."""
+        return threshold(self.system, self.settings, k)
+
+    def _ranked(self) -> list[Explanation]:
+        """Explanations that may be believed, shortest first."""
+        alive = [e for names, e in self.pool.items() if names not in self.refused and np.isfinite(self.length(e))]
+        return sorted(alive, key=self.length)
+
+    def _explore(self) -> None:
+        """Enlarge and shorten the shortest explanations, until none comes of it that is shorter."""
+        while True:
+            ranked = self._ranked()
+            best = ranked[0]
+            if best.candidates:
+                # a large effect reaches into the fast part of the residual: with it, the noise is seen better
+                self.noise = min(self.noise, self._noise(best.fit))
+            few = ranked[: 1 if self._at_noise(best.fit) else WIDTH]
+            new = next((e for e in few if e.names not in self.expanded), None)
+            if new is None:
+                return
+            self.expanded.add(new.names)
+            for extra in self._enlarged(new, new is best):
+                self._refit(new, extra)
+            if len(new.candidates) > 1:
+                for c in new.candidates:
+                    self._refit_without(new, c)
+
+    def _refit(self, e: Explanation, extra: tuple[Candidate, ...]) -> None:
+        together = (*e.candidates, *extra)
+        names = frozenset(c.name for c in together)
+        if names in self.pool and not self.rough:
+            return
+        # beyond thresholds the prediction has kinks and a refit is long: only where no other will do
+        if any(c.threshold for c in extra) and any(self._nearly_all(e, other) for other in self.pool.values()):
+            return
+        fitted = self._best_fit(e, extra)
+        if fitted is None:  # no start leads anywhere
+            return
+        gain = (e.fit.cost - fitted.cost) / self.noise
+        new = Explanation(together, fitted)
+        rough = self.rough and fitted.promised < ROUGH * gain
+        if not (fitted.converged or rough) or (self.length(new) < self.length(e) and self._incredible(new, extra)):
+            new = replace(new, credible=False)
+        if names not in self.pool or self.length(new) < self.length(self.pool[names]):
+            self.pool[names] = new
+        if len(extra) == 1:
+            self.first.setdefault(extra[0].name, (gain, new))
+
+    def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
+        rest = tuple(other for other in e.candidates if other is not c)
+        names = frozenset(other.name for other in rest)
+        if names not in self.pool:
+            fitted = self._fit(rest, _without(e.fit.values, c, rest))
+            self.pool[names] = Explanation(rest, fitted, fitted.converged)
+        return self.pool[names]
+
+    def _enlarged(self, e: Explanation, with_thresholds: bool) -> list[tuple[Candidate, ...]]:
+        """Terms, and pairs of them where one alone will not do, that are worth a refit beside those of `e`."""
+        if len(e.candidates) >= self.settings.max_effects:
+            return []
+        linear, scores = self._scored(e)
+        if not scores:
+            return []
+        ranked = sorted(scores, key=lambda s: self._price([s.candidate]) - s.gain / self.noise)
+        best = ranked[0].gain
+        # near noise the first order is exact; far from it, a nonlinear refit may do better than its score
+        worth = [
+            s
+            for i, s in enumerate(ranked[: self.settings.shortlist])
+            if s.gain / self.noise > 0.5 * self.threshold(len(s.candidate.names)) and (i < 4 or s.gain > 0.3 * best)
+        ]
+        proposed: list[tuple[Candidate, ...]] = [(s.candidate,) for s in worth]
+        if self._at_noise(e.fit, best):
+            return proposed
+        if worth and len(e.candidates) + 2 <= self.settings.max_effects:
+            proposed += self._pairs(linear, [s.candidate for s in ranked[:14] if s.visible])
+        if with_thresholds:
+            proposed += [(c,) for c in self.system.candidates if c.threshold and c.name not in e.names]
+        return proposed
+
+    def _scored(self, e: Explanation) -> tuple[Linearisation, list[Score]]:
+        """What each term more would gain to first order."""
+        if e.names not in self.scored:
+            linear = Linearisation(self.system, e.fit, self.candidates)
+            others = [c for c in self.candidates if c.name not in e.names]
+            self.scored[e.names] = linear, score_all(linear, others)
+        return self.scored[e.names]
+
+    def _pairs(self, linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
+        pairs = score_pairs(linear, candidates)
+        pairs.sort(key=lambda p: self._price(p[1:]) - p[0] / self.noise)
+        return [(a, b) for _, a, b in pairs[:3]]
+
+    def _shortest_that_stands(self) -> Explanation:
+        """The shortest explanation that predicts what was kept back better than shorter sets of its terms do."""
+        ranked = self._ranked()
+        for e in [e for e in ranked if e.candidates][: self.settings.judged]:
+            if self.length(e) > self.length(self.pool[frozenset()]):
+                break
+            parts = [other for other in ranked if other.names < e.names]
+            parent = parts[0] if parts else self.pool[frozenset()]
+            held = self._held_out_gain(parent, e)
+            enough = OBVIOUS * self._price([c for c in e.candidates if c.name not in parent.names])
+            obvious = held > -CLASS_GAIN and (parent.fit.cost - e.fit.cost) / self.noise > enough
+            if held > 0 or obvious:
+                return e
+        return self.pool[frozenset()]
+
+    def _held_out_gain(self, before: Explanation, after: Explanation) -> float:
+        """Of twice the log density of what was kept back, in units of the noise."""
+        gain = 2 * (self._held_out(after.fit).log_density - self._held_out(before.fit).log_density) / self.noise
+        return -np.inf if np.isnan(gain) else float(gain)  # neither predicts anything
+
+    def _worth_naming(self, before: Explanation, after: Explanation) -> bool:
         """Does what was found explain the residual, if not to noise then nearly all of it, in the free run too?
 
         In a residual that none of them makes, wrong effects gain a lot as well; they leave a good part of it.
         """
-        if self._at_noise(after.fit):
-            return True
-        excess = [trial.fit.chi_square / self.noise - trial.fit.degrees_of_freedom for trial in (before, after)]
-        held = [t.held_out for t in (before, after) if t.held_out]
+        excess = [e.fit.chi_square / self.noise - e.fit.degrees_of_freedom for e in (before, after)]
+        held = [self._held_out(e.fit) for e in (before, after)]
         free = [h.chi_square / self.noise - h.expected for h in held]
         # where next to nothing moves in what was kept back, no model errs there: what it lacks elsewhere is the measure
         at_stake = max(free[0], excess[0] * held[0].n_data / max(before.fit.n_data, 1))
         share = self.settings.unexplained_share
         return excess[1] < share * excess[0] and free[1] < share * at_stake
-
-    def threshold(self, k: int) -> float:
-        """Gain with k quantities that noise reaches with the allowed probability, over all candidates."""
-        return float(stats.chi2.isf(self.settings.false_alarm / max(len(self.system.candidates), 1), k))
-
-    def _cost(self, trial: Fit) -> float:
-        return trial.cost / self.noise
-
-    def _price(self, candidates: Iterable[Candidate]) -> float:
-        """Bayesian information criterion's price of the quantities."""
-        names = {n for c in candidates for n in c.names}
-        return len(names) * float(np.log(max(np.sum(self.system.weights), 2)))
 
     def _quantities(self, candidates: Sequence[Candidate]) -> tuple[Quantity, ...]:
         new = {q.name: q for c in candidates for q in c.quantities}
@@ -271,7 +410,7 @@ class _Search:
         cost = float(np.sum(self.system.linearise(values, ())[0] ** 2) + right @ right)
         return cost < known.cost - CLASS_GAIN * self.noise
 
-    def _best_fit(self, current: Trial, extra: Sequence[Candidate]) -> Fit:
+    def _best_fit(self, current: Explanation, extra: Sequence[Candidate]) -> Fit | None:
         """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
         together = [*current.candidates, *extra]
         starts: list[dict[str, float]] = [{}]
@@ -292,9 +431,9 @@ class _Search:
         if declared and fits and not any(f.converged for f in fits):
             # without the effect the others may have gone so far to make up for it that no step leads back
             fits.append(self._fit(together, current.fit.values | declared))
-        return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else current.fit
+        return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else None
 
-    def _promising(self, current: Trial, together: Sequence[Candidate], start: Values) -> bool:
+    def _promising(self, current: Explanation, together: Sequence[Candidate], start: Values) -> bool:
         """Have some steps from this start removed a good part of the residual?"""
         values = dict(current.fit.values) | dict(start)
         try:
@@ -303,7 +442,7 @@ class _Search:
             return False
         return few.cost < PROMISING * current.fit.cost
 
-    def _followed(self, current: Trial, together: Sequence[Candidate], start: Values) -> Fit | None:
+    def _followed(self, current: Explanation, together: Sequence[Candidate], start: Values) -> Fit | None:
         """Refit that comes from longer and longer beginnings; None where one of them does not fit to the noise.
 
         Each instant at which a threshold is passed is a valley of its own: from a motion that ignores it no step leads
@@ -322,90 +461,11 @@ class _Search:
             values = found.values
         return self._fit(together, values)
 
-    def _judged(self, current: Trial, trial: Trial) -> Trial:
-        """With the free run over held-out data."""
-        assert current.held_out is not None
-        held = self._held_out(trial.fit)
-        gain = 2 * (held.log_density - current.held_out.log_density) / self.noise
-        if np.isnan(gain):  # neither predicts anything
-            gain = -np.inf
-        return replace(trial, held_out=held, held_out_gain=float(gain))
-
-    def _next(self, current: Trial, linear: Linearisation, scores: list[Score] | None) -> Trial | None:
-        """The best admissible enlargement, or None."""
-        trials: list[tuple[tuple[Candidate, ...], Trial]] = []
-        # beyond thresholds the prediction has kinks and a refit is long: last, and only where no other will do
-        for extra in sorted(self._shortlist(current, linear, scores), key=lambda e: any(c.threshold for c in e)):
-            if any(c.threshold for c in extra) and any(self._nearly_all(current, t) for _, t in trials):
-                continue
-            refitted = self._best_fit(current, extra)
-            trial = Trial((*current.candidates, *extra), refitted, self._cost(current.fit) - self._cost(refitted))
-            trials.append((extra, trial))
-            if len(extra) == 1:
-                self.refits.setdefault(extra[0].name, trial)
-        trials.sort(key=lambda item: self._criterion(item[1]))
-        chosen: Trial | None = None
-        obvious: Trial | None = None
-        for rank, (extra, trial) in enumerate(trials):
-            # where fits have several minima the best of them may stand no free run, and the next ones do
-            if rank >= self.settings.judged and (chosen or obvious or not self.rough):
-                break
-            if not self._enough(trial, extra):
-                continue
-            judged = self._judged(current, trial)
-            if len(extra) == 1 and self.refits[extra[0].name] is trial:
-                self.refits[extra[0].name] = judged
-            held = judged.held_out_gain
-            if chosen is None and held is not None and held > 0:
-                chosen = judged
-            elif obvious is None and self._obvious(judged, extra):
-                obvious = judged
-        return chosen or obvious
-
-    def _obvious(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
-        """Does it gain far more than noise does, while samples that were not fitted do not speak against it?
-
-        The fitted part may know all that there is to know of it.
-        """
-        held = trial.held_out_gain
-        k = len({n for c in extra for n in c.names})
-        return held is not None and held > -CLASS_GAIN and trial.gain > OBVIOUS * self.threshold(k)
-
-    def _nearly_all(self, before: Trial, after: Trial) -> bool:
-        """Does the enlargement remove nine tenths of what exceeds the noise, and is little left?"""
+    def _nearly_all(self, before: Explanation, after: Explanation) -> bool:
+        """Does the other remove nine tenths of what exceeds the noise, and is little left?"""
         excess = [t.fit.chi_square / self.noise - t.fit.degrees_of_freedom for t in (before, after)]
         near = after.fit.reduced_chi_square < FAR * self.noise
         return after.fit.converged and near and excess[1] < 0.1 * excess[0]
-
-    def _shortlist(
-        self, current: Trial, linear: Linearisation, scores: list[Score] | None
-    ) -> list[tuple[Candidate, ...]]:
-        """Candidates, and pairs of them where one alone will not do, that are worth a refit."""
-        taken = {c.name for c in current.candidates}
-        scores = scores or score_all(linear, [c for c in self.candidates if c.name not in taken])
-        if not scores:
-            return []
-        ranked = sorted(scores, key=lambda s: self._price([s.candidate]) - s.gain / self.noise)
-        best = ranked[0].gain
-        # near noise the first order is exact; far from it, a nonlinear refit may do better than its score
-        worth = [
-            s
-            for i, s in enumerate(ranked[: self.settings.shortlist])
-            if s.gain / self.noise > 0.5 * self.threshold(len(s.candidate.names)) and (i < 4 or s.gain > 0.3 * best)
-        ]
-        shortlist: list[tuple[Candidate, ...]] = [(s.candidate,) for s in worth]
-        if self._at_noise(current.fit, best):
-            return shortlist
-        shortlist += [(c,) for c in self.system.candidates if c.threshold and c.name not in taken]
-        room = len(taken) + 2 <= self.settings.max_effects
-        if room and worth:
-            shortlist += self._pairs(linear, [s.candidate for s in ranked[:14] if s.visible])
-        return shortlist
-
-    def _pairs(self, linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
-        pairs = score_pairs(linear, candidates)
-        pairs.sort(key=lambda p: self._price(p[1:]) - p[0] / self.noise)
-        return [(a, b) for _, a, b in pairs[:3]]
 
     def _at_noise(self, fit_: Fit, gain: float = 0.0) -> bool:
         left = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1)
@@ -414,16 +474,7 @@ class _Search:
             limit = max(limit, 1.0 + 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))))
         return left <= limit * self.noise
 
-    def _criterion(self, trial: Trial) -> float:
-        return self._cost(trial.fit) + self._price(trial.candidates)
-
-    def _enough(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
-        k = len({n for c in extra for n in c.names})
-        enough = self.threshold(k) if len(extra) == 1 else self.threshold(k) + self.threshold(1)
-        rough = self.rough and trial.fit.promised < ROUGH * trial.gain
-        return (trial.fit.converged or rough) and trial.gain > enough and not self._incredible(trial, extra)
-
-    def _incredible(self, trial: Trial, extra: Sequence[Candidate]) -> bool:
+    def _incredible(self, trial: Explanation, extra: Sequence[Candidate]) -> bool:
         """Is an amount at the limit of what is ever met, or do forces or faults of the measurement undo each other?"""
         values = trial.fit.values
         limits = [(values[q.name], q) for c in extra if c.kind == "measurement" for q in c.quantities]
@@ -445,103 +496,64 @@ class _Search:
         pairs = combinations(range(len(faults)), 2)
         return any(np.sum((signals[a] + signals[b]) ** 2) < CANCELLING * min(powers[a], powers[b]) for a, b in pairs)
 
-    def _pruned(self, trial: Trial) -> Trial:
-        """Without effects that have become unnecessary."""
-        for candidate in trial.candidates[:-1]:
-            rest = tuple(c for c in trial.candidates if c is not candidate)
-            smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
-            loss = self._cost(smaller) - self._cost(trial.fit)
-            if loss < self.threshold(len(candidate.names)):  # converged or not: further on it would lose less
-                trial = replace(trial, candidates=rest, fit=smaller, held_out=self._held_out(smaller))
-        return trial
+    def _without_idle(self, e: Explanation) -> Explanation | None:
+        """Without the effect that gains least, if a residual with the memory of what is left may give it as much."""
+        if self.settings.noise is not None:
+            return None
+        left = max(1.0, e.fit.reduced_chi_square / self.noise)  # what is left counts as noise does
+        factors = dict(zip(e.fit.names, inflation(self.system, e.fit), strict=True))
+        losses = []
+        for c in e.candidates:
+            smaller = self._refit_without(e, c)
+            loss = (smaller.fit.cost - e.fit.cost) / self.noise
+            enough = left * self.threshold(len(c.names)) * max(factors[n] for n in c.names) ** 2
+            if smaller.fit.converged or loss < enough:  # a fit that has not converged loses even less further on
+                losses.append((loss / enough, c.name, smaller))
+        if not losses or min(losses)[0] >= 1.0:
+            return None
+        return min(losses)[2]
 
-    def _standing(self, trial: Trial) -> Trial:
-        """Without effects that gain no more than a residual with the memory of what is left may give them."""
-        while trial.candidates and self.settings.noise is None:
-            left = max(1.0, trial.fit.reduced_chi_square / self.noise)  # what is left counts as noise does
-            factors = dict(zip(trial.fit.names, inflation(self.system, trial.fit), strict=True))
-            losses = []
-            for candidate in trial.candidates:
-                rest = tuple(c for c in trial.candidates if c is not candidate)
-                smaller = self._fit(rest, _without(trial.fit.values, candidate, rest))
-                loss = self._cost(smaller) - self._cost(trial.fit)
-                enough = left * self.threshold(len(candidate.names)) * max(factors[n] for n in candidate.names) ** 2
-                if smaller.converged or loss < enough:  # a fit that has not converged loses even less further on
-                    losses.append((loss / enough, candidate.name, rest, smaller))
-            if not losses or min(losses, key=lambda item: item[0])[0] >= 1.0:
-                return trial
-            _, _, rest, smaller = min(losses, key=lambda item: item[0])
-            trial = replace(trial, candidates=rest, fit=smaller, held_out=self._held_out(smaller))
-        return trial
-
-    def _settled(self, trial: Trial) -> tuple[Trial, dict[str, list[Rival]]]:
-        """Every effect exchanged for each of its rivals; a better one stays. Returns the rivals per effect too."""
-        rivals: dict[str, list[Rival]] = {}
-        for position in range(len(trial.candidates)):
-            found = self._rivals(trial, position)
-            better = min(found, key=lambda r: self._swapped_criterion(trial, position, r), default=None)
-            if better and self._swapped_criterion(trial, position, better) < self._criterion(trial) - 1e-6:
-                swapped = list(trial.candidates)
-                swapped[position] = better.candidate
-                new = replace(trial, candidates=tuple(swapped), fit=better.fit, held_out=self._held_out(better.fit))
-                undone = self.system.undo_each_other(swapped, better.fit.values, self.fits[frozenset()].values)
-                if not undone and self._log_density(new) > self._log_density(trial) - CLASS_GAIN / 2 * self.noise:
-                    trial = new
-                    found = self._rivals(trial, position)
-            rivals[trial.candidates[position].name] = [r for r in found if r.loss < CLASS_GAIN]
-        return trial, rivals
-
-    @staticmethod
-    def _log_density(trial: Trial) -> float:
-        return trial.held_out.log_density if trial.held_out is not None else -np.inf
-
-    def _swapped_criterion(self, trial: Trial, position: int, rival: Rival) -> float:
-        others = [c for i, c in enumerate(trial.candidates) if i != position]
-        fitted = self._cost(rival.fit) + self._price([*others, rival.candidate])
-        # only against the one that it would replace: how surprising is each value?
-        return fitted + _surprise(rival.candidate, rival.fit) - _surprise(trial.candidates[position], trial.fit)
-
-    def _rivals(self, trial: Trial, position: int) -> list[Rival]:
-        """Effects that predict nearly the same residual, refitted in place of the effect."""
-        effect = trial.candidates[position]
-        rest = tuple(c for c in trial.candidates if c is not effect)
-        reduced = _restricted(trial.fit, self._quantities(rest))
+    def _rivals(self, e: Explanation, effect: Candidate) -> list[Rival]:
+        """Effects that predict nearly the same residual, refitted in place of one; they join the explanations."""
+        rest = tuple(c for c in e.candidates if c is not effect)
+        reduced = _restricted(e.fit, self._quantities(rest))
         linear = Linearisation(self.system, reduced, self.candidates)
-        amount = np.array([trial.fit.values[q.name] - q.null for q in effect.quantities])
+        amount = np.array([e.fit.values[q.name] - q.null for q in effect.quantities])
         signal = linear.columns(effect.names) @ amount
         strength = float(np.sum(linear.cleared(signal[:, None]) ** 2)) / self.noise
-        others = [c for c in self.candidates if c.name not in {d.name for d in trial.candidates}]
+        others = [c for c in self.candidates if c.name not in e.names]
         angles = {c.name: angle(linear, signal, c.names) for c in others}
         near = sorted(others, key=lambda c: angles[c.name])
         near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]
         near = near[: MOST_RIVALS if strength < FAINT else MOST_RIVALS // 2]
         found = []
         for candidate in near:
-            refitted = self._fit((*rest, candidate), _without(trial.fit.values, effect, rest))
-            loss = self._cost(refitted) - self._cost(trial.fit)
-            if refitted.converged:
-                found.append(Rival(candidate, angles[candidate.name], loss, refitted))
+            together = (*rest, candidate)
+            names = frozenset(c.name for c in together)
+            if names not in self.pool:
+                fitted = self._fit(together, _without(e.fit.values, effect, rest))
+                new = Explanation(together, fitted)
+                self.pool[names] = replace(new, credible=fitted.converged and not self._incredible(new, (candidate,)))
+            other = self.pool[names]
+            loss = (other.fit.cost - e.fit.cost) / self.noise
+            if other.fit.converged and loss < CLASS_GAIN:
+                found.append(Rival(candidate, angles[candidate.name], loss, other.fit))
         return found
 
-    def _found(self, trial: Trial, candidate: Candidate, rivals: list[Rival]) -> Found:
-        rest = tuple(c for c in trial.candidates if c is not candidate)
-        without = self._fit(rest, _without(trial.fit.values, candidate, rest), patient=True)
-        held = self._held_out(without)
-        held_gain = 2 * (self._log_density(trial) - held.log_density) / self.noise
-        gain = self._cost(without) - self._cost(trial.fit)
+    def _found(self, e: Explanation, candidate: Candidate, rivals: list[Rival]) -> Found:
+        rest = tuple(c for c in e.candidates if c is not candidate)
+        without = self._fit(rest, _without(e.fit.values, candidate, rest), patient=True)
+        held_gain = 2 * (self._held_out(e.fit).log_density - self._held_out(without).log_density) / self.noise
+        gain = (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(rivals))
 
     def _answer(
-        self,
-        before: Trial,
-        after: Trial,
-        found: tuple[Found, ...],
-        scores: list[Score],
-        partial: Trial | None = None,
-    ) -> Diagnosis:
+        self, before: Explanation, after: Explanation, found: tuple[Found, ...], scores: list[Score],
+        partial: tuple[Candidate, ...] = (),
+    ) -> Diagnosis:  # fmt: skip
         explained = self._at_noise(after.fit)
-        assert after.held_out is not None
-        ratio = after.held_out.ratio_to_floor / np.sqrt(self.noise)
+        held = self._held_out(before.fit), self._held_out(after.fit)
+        ratio = held[1].ratio_to_floor / np.sqrt(self.noise)
         left = f"{after.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {self.noise:.3g}"
         if explained and found:
             verdict, reason = "found", f"chi-square falls to {left}; the free run errs by {ratio:.2f} of its floor"
@@ -552,28 +564,25 @@ class _Search:
                 "unexplained",
                 f"chi-square stays at {left}: no effect of the catalogue brings it to noise",
             )
-        tried = tuple(self._tried(s, after, found) for s in scores)
+        tried = tuple(self._tried(s, found) for s in scores)
+        shortest = self.length(after)
+        listed = tuple((tuple(sorted(e.names)), self.length(e) - shortest) for e in self._ranked())
         return Diagnosis(
-            verdict,
-            reason,
-            found,
-            before.fit,
-            after.fit,
-            before.held_out,
-            after.held_out,
-            self.noise,
-            tried,
-            self.settings,
-            partial.candidates if partial is not None else (),
-        )
+            verdict, reason, found, before.fit, after.fit, *held, self.noise, tried, self.settings, partial,
+            explanations=tuple(item for item in listed if item[1] < CLASS_GAIN),
+        )  # fmt: skip
 
-    def _tried(self, score: Score, after: Trial, found: tuple[Found, ...]) -> Tried:
+    def _tried(self, score: Score, found: tuple[Found, ...]) -> Tried:
         c = score.candidate
-        trial = self.refits.get(c.name)
-        gain, held = (trial.gain, trial.held_out_gain) if trial else (None, None)
-        return Tried(c, score.gain / self.noise, gain, held, self._why(score, trial, found))
+        gain, refitted = self.first.get(c.name, (None, None))
+        held = None
+        if refitted is not None and any(of is refitted.fit for of, _ in self.free_runs):
+            held = self._held_out_gain(self.pool[frozenset()], refitted)
+        return Tried(c, score.gain / self.noise, gain, held, self._why(score, gain, held, refitted, found))
 
-    def _why(self, score: Score, trial: Trial | None, found: tuple[Found, ...]) -> str:
+    def _why(
+        self, score: Score, gain: float | None, held: float | None, trial: Explanation | None, found: tuple[Found, ...]
+    ) -> str:
         c = score.candidate
         if any(c.name == f.candidate.name for f in found):
             return "chosen"
@@ -585,14 +594,14 @@ class _Search:
         if not score.visible and trial is None:
             return "leaves no trace in this recording that other fitted quantities do not absorb"
         threshold = self.threshold(len(c.names))
-        gain = trial.gain if trial else score.gain / self.noise
+        gain = score.gain / self.noise if gain is None else gain
         if gain <= threshold:
             # beside an effect that was found, the first score says nothing of what may be there
             bound = "" if found else _bounds(score)
             return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}{bound}"
         if trial and not trial.fit.converged:
             return NOT_CONVERGED
-        if trial and trial.held_out_gain is not None and trial.held_out_gain <= 0:
+        if held is not None and held <= 0:
             return "the free run over held-out data does not improve"
         than_chosen = "less than what was chosen" if found else "too little of what is missing"
         return f"gains {gain:.4g}, {than_chosen}"
@@ -620,7 +629,9 @@ def _bounds(score: Score) -> str:
     """What the data leave room for, where they show no more than noise does."""
     sizes = zip(score.candidate.quantities, np.abs(score.values), score.sigma, strict=True)
     open_ = [(q, size + TWO_SIDED * sigma) for q, size, sigma in sizes if np.isfinite(size + sigma)]
-    most = ", ".join(f"{q.part} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_)
+    most = ", ".join(
+        f"{q.name.partition('.')[2]} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_
+    )
     return f"; only bounded: {most} (95 %)" if most else ""
 
 

@@ -10,13 +10,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score
-from disctrack.discrepancy.search import CLASS_GAIN, FAINT, Diagnosis, Found, Tried
+from disctrack.discrepancy.search import CLASS_GAIN, FAINT, Diagnosis, Found, Tried, length, threshold
 from disctrack.discrepancy.system import Candidate, Quantity, System, TrialGivenUp
 
 MAX_TRIALS = 24  # values of a shape at which the rest is refitted
@@ -190,10 +189,7 @@ def _with_one_looked_for(system: System, diagnosis: Diagnosis, best: Diagnosis) 
 
 
 def _length(system: System, answer: Diagnosis) -> float:
-    """Chi-square, price of the fitted numbers, and of having picked each effect out of so many."""
-    free = sum(not np.isfinite(q.prior_sigma) for q in answer.after.quantities)
-    numbers = free * float(np.log(max(np.sum(system.weights), 2)))
-    return answer.after.cost / answer.noise + numbers + 2 * len(answer.found) * float(np.log(len(system.candidates)))
+    return length(system, answer.settings, answer.noise, answer.after, [f.candidate for f in answer.found])
 
 
 def _grid(candidate: Candidate) -> list[dict[str, float]]:
@@ -248,12 +244,12 @@ def _with_free_shape(
         return None
     quantities = (*candidate.quantities, *free)
     gain = (base.cost - fitted.cost) / noise
-    threshold = float(stats.chi2.isf(settings.false_alarm / max(len(system.candidates), 1), len(quantities)))
+    enough = threshold(system, settings, len(quantities))
     held = _held_out(system, diagnosis, fitted)
     held_gain = 2 * (held.log_density - before.log_density) / noise
-    if not (gain > threshold and held_gain > 0):
+    if not (gain > enough and held_gain > 0):
         return None
-    found = Found(replace(candidate, quantities=quantities), float(gain), float(held_gain), threshold, ())
+    found = Found(replace(candidate, quantities=quantities), float(gain), float(held_gain), enough, ())
     reason = f"chi-square falls to {fitted.reduced_chi_square:.3g} per degree of freedom at a noise of {noise:.3g}"
     tried = tuple(
         Tried(t.candidate, t.score, float(gain), float(held_gain), "chosen, with its shape free")

@@ -11,7 +11,13 @@ from disctrack.diagnosis.errors import Ahead, Errors
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.words import UNFOLLOWED
 from disctrack.diagnosis.plan import Separation
-from disctrack.discrepancy.document import declared_json, effect_json, parameters_json, tried_json
+from disctrack.discrepancy.document import (
+    declared_json,
+    effect_json,
+    explanations_json,
+    parameters_json,
+    tried_json,
+)
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
@@ -137,6 +143,7 @@ def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> d
         else {},
         "energy_J": result.energy,
         "energy_before_J": beside.energy_before if beside else {},
+        "explanations": explanations_json(diagnosis),
         "tried": [tried_json(t) for t in diagnosis.tried],
         "plan": planned.as_json(result.plan),
         "settings": vars(diagnosis.settings),

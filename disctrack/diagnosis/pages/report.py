@@ -12,7 +12,7 @@ from disctrack.diagnosis.model_file import NONE, PAPER
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.figures import all_figures
 from disctrack.diagnosis.pages.words import UNFOLLOWED, law_text
-from disctrack.discrepancy.search import Found, Tried
+from disctrack.discrepancy.search import Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.words import effect_text, quantity_text
 from disctrack.files.whole import write_whole
@@ -41,6 +41,7 @@ def _page(result: DiscDiagnosis, beside: ModelFreeEvidence | None, recording: st
         *(paragraph(_said(note)) for note in result.notes),
         section("Missing effects", [_effects(result)]),
         section("What would settle it", planned.html(result.plan)),
+        section("Explanations that compete", [explanations_table(result.diagnosis)]),
         section("Before and after", _before_after(result, beside)),
         section("In pictures", [figures]),
         section("What was tried", [tried_table(result.diagnosis.tried)]),
@@ -175,6 +176,18 @@ def _energy(result: DiscDiagnosis, beside: ModelFreeEvidence) -> list[tuple[str,
         text = quantity_text(loss, sigma, "1")
         rows.append(("energy lost, from the poses of the disc as declared [mJ]", text, text))
     return rows
+
+
+def explanations_table(d: Diagnosis) -> str:
+    """Sets of effects whose lengths the data do not tell apart; empty where there is only one."""
+    rows = [
+        (", ".join(names) or "nothing is missing", f"{longer:.1f}", f"{np.exp(-0.5 * longer):.2g}")
+        for names, longer in d.explanations
+    ]
+    words = (
+        "-2 log evidence over that of the answer: chi-square, the price of the numbers, the surprise of their values"
+    )
+    return table(words, ("effects", "longer by", "odds"), rows) if len(rows) > 1 else ""
 
 
 def tried_table(tried: Sequence[Tried]) -> str:

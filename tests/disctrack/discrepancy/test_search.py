@@ -392,4 +392,15 @@ def test_what_rests_while_it_is_kept_back_does_not_speak_against_a_name(ahead, w
         )
         for c, h in zip((11_000.0, 1_400.0), ahead, strict=True)
     ]
+    search.free_runs = [(trial.fit, trial.held_out) for trial in trials]
     assert search._worth_naming(*trials) is worth
+
+
+def test_explanations_that_fit_alike_are_listed_with_their_odds(rng):
+    answer = diagnose(oscillator(rng, {"drift": 0.01}), START)
+    listed = dict(answer.explanations)
+    assert {("drift",), ("twin",)} <= set(listed)  # one and the same but for the sign
+    assert abs(listed["drift",] - listed["twin",]) < 0.1
+    assert () not in listed  # the control: that nothing is missing is no alternative
+    nothing = diagnose(oscillator(rng), START)
+    assert nothing.explanations[0] == ((), 0.0)
