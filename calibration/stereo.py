@@ -24,7 +24,7 @@ from calibration.judge.assessment import (
     half_set_differences,
     stereo_covariance,
 )
-from calibration.judge.camera_moved import camera_moved
+from calibration.judge.camera_moved import camera_moved, zoomed
 from calibration.judge.motion_size import likely_motion
 from calibration.judge.pairs import PairsJudged, pairs_that_agree
 from calibration.judge.table_frame import rig_with_covariance
@@ -238,6 +238,11 @@ def calibrate_from_corners(
     pairs = PairsJudged(start.model, start.right_poses, {}, {}, start.left_poses)
     # seen best by cameras that no pair has pulled yet
     moved = camera_moved(observations, pairs, start.model, table_view)
+    if moved and (lenses := zoomed(observations, moved, board.points, start.model.cameras)):
+        for camera, why in lenses.items():
+            for v in moved.others:
+                views[camera][v] = BoardNotFound(why)
+        return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names, progress)
     if moved is None:
         pairs = pairs_that_agree(observations, start.model, board.points, start.agrees, start.right_poses)
     else:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.cameras.camera import StereoRig, triangulate
 from calibration.fit.board_motion import BoardMotion, split
 from calibration.fit.normal_equations import Problem, inverse_covariance, minimise
 from calibration.fit.refinement import Refinement, refine_stereo
@@ -27,6 +28,7 @@ from calibration.kit.arrays import Array, Mask
 
 HOPELESS = 1.5  # times the noise of the best model, left in the views it was fitted to: not worth views left out
 FOLDS = 5
+LEAST_TRIANGULATED = 8  # corners of a view: a board of fewer fits whatever they are
 NEGLIGIBLE = 1e-5  # of chi-square, still to be gained: of 10^4 points, a third of a sigma of one parameter
 TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
 SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler model may be worse
@@ -40,6 +42,7 @@ class TermsTried:
     n_parameters: int  # shared by all views
     rms_px: float  # on the views that were fitted
     held_out_rms_px: float  # on views left out, each with its own pose fitted
+    held_out_error: float  # [m] the same of corners in space, rms over those views; NaN where both cameras saw none
     held_out_chi_square: float  # per observation, truncated, in units of the noise of this comparison
     noise_px: float  # sigma per axis of this comparison beyond the corners' own noise: the least of its models
     per_view: Array  # (n_views,) the same, NaN where a view was not used
@@ -47,19 +50,19 @@ class TermsTried:
 
 def held_out(
     refinement: Refinement, sigma: float, good: Mask, motion: BoardMotion | None = None
-) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp], Array]:
     """Per view, each view left out in turn: chi-square (truncated) of all points, squared distance [px^2] of good ones.
 
     sigma : unexplained noise [px] for the comparison, the same for every candidate
     good : (m,) the observations that count in the distance
     motion : of the boards between the exposures, for the comparison
-    returns : chi-square, squared distance, number of all and of good points, each (n_views,)
+    returns : chi-square, squared distance, number of all and of good points, rms error in space [m], each (n_views,)
     """
     used = refinement.observations[refinement.kept]
     everything = refinement.observations
     n_views = refinement.problem.n_views
     chi2, square = np.full(n_views, np.nan), np.full(n_views, np.nan)
-    count, good_count = np.zeros(n_views, int), np.zeros(n_views, int)
+    count, good_count, error = np.zeros(n_views, int), np.zeros(n_views, int), np.full(n_views, np.nan)
     views = np.unique(used.view)
     weights = inverse_covariance(used.covariance, sigma**2)
     whole = replace(refinement.problem, observations=used, weights=weights, motion=motion)
@@ -85,7 +88,24 @@ def held_out(
             chi2[v] = np.minimum(distance[of_view], TRUNCATE).sum()
             square[v] = np.sum(residuals[of_view & good[tested]] ** 2)
             count[v], good_count[v] = of_view.sum(), (of_view & good[tested]).sum()
-    return chi2, square, count, good_count
+            error[v] = error_in_space(model, test[of_view & good[tested]])
+    return chi2, square, count, good_count, error
+
+
+def error_in_space(model: StereoModel, seen: Observations) -> float:
+    """Rms distance [m] of a view's corners, triangulated, from the board where they put it best; NaN by one camera."""
+    left, right = (seen[seen.camera == camera] for camera in (0, 1))
+    common, a, b = np.intersect1d(left.point, right.point, return_indices=True)
+    rig = StereoRig(*model.cameras, model.R_right_left, model.t_right_left, np.eye(3), np.zeros(3))
+    found = triangulate(np.stack([left.pixels[a], right.pixels[b]]), rig)
+    met = np.isfinite(found).all(axis=1)
+    if met.sum() < LEAST_TRIANGULATED:
+        return float("nan")
+    board, found = model.points[common][met], found[met]
+    d, e = board - board.mean(0), found - found.mean(0)
+    U, _, Vt = np.linalg.svd(d.T @ e)
+    turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return float(np.sqrt(np.mean(np.sum((e - d @ turn) ** 2, axis=1))))
 
 
 def fit_poses(
@@ -108,7 +128,7 @@ def fit_poses(
 def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
     """The row of one fitted model, by the noise, the good points and the boards' motion of another; see `held_out`."""
     sigma = quietest.unexplained_sigma
-    chi2, square, count, good_count = held_out(refinement, sigma, quietest.kept, quietest.problem.motion)
+    chi2, square, count, good_count, error = held_out(refinement, sigma, quietest.kept, quietest.problem.motion)
     with np.errstate(invalid="ignore"):
         per_view = chi2 / np.where(count > 0, count, np.nan)
     return TermsTried(
@@ -116,6 +136,7 @@ def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
         n_parameters=refinement.problem.stereo_basis.shape[1] + refinement.problem.shape_basis.shape[-1],
         rms_px=refinement.rms(),
         held_out_rms_px=float(np.sqrt(np.nansum(square) / max(good_count.sum(), 1))),
+        held_out_error=float(np.sqrt(np.mean(error[np.isfinite(error)] ** 2))) if np.isfinite(error).any() else np.nan,
         held_out_chi_square=float(np.nansum(chi2) / max(count.sum(), 1)),
         noise_px=sigma,
         per_view=per_view,

@@ -17,8 +17,10 @@ from calibration.kit.least_squares import scaled_solve
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
 MIN_GOOD_VIEWS = 8
-GOOD_RMS_PX = 0.3  # real, printed boards: 0.1 to 0.3 px is usual; rendered or etched ones reach 0.01 px
-POOR_RMS_PX = 0.8
+# Of a point's distance, excellent, good and usable: 0.05, 0.5 and 5 mm at half a metre. Images of half the size, or of
+# half the noise, say as much about cameras that are as wrong.
+GRADES = (1e-4, 1e-3, 1e-2)
+BEYOND_USE = 0.05  # of a point's distance: no rig to be kept unasked
 BIG_INFLATION = 2.0  # of the variance, view against view: beyond, something is not in the model
 
 
@@ -50,8 +52,18 @@ class Assessment:
     place_sigma: tuple[tuple[float, str], ...]  # of x, y, z of points [m], with the board's sizes; most of it from what
     pairs: int  # views that both cameras saw and the fit uses
     motion: PairMotion | None  # of the board between the exposures of a pair
+    direction_sigma: float  # [rad] of a line across the table's board, or of the turn of a body as large
+    stereo_misfit_px: float  # of views left out of the fit, one place of the board for both images; NaN where none was
+    held_out_error: float  # [m] of corners of such views, triangulated, against the board where they put it best
+    distance: float  # [m] from the left camera
     verdict: str
     warnings: tuple[str, ...]
+
+    @property
+    def beyond_use(self) -> bool:
+        """True where lengths mean next to nothing: such a rig is kept only by consent."""
+        worst = max(self.triangulation_sigma[0], np.nan_to_num(self.held_out_error)) / self.distance
+        return not worst < BEYOND_USE
 
 
 def consistency_factor(refinement: Refinement) -> float:
@@ -218,7 +230,7 @@ def assess(
     tilt, spread = tilts(refinement)
     volume = measurement_volume(refinement, rig, table_view)
     pixel_sigma, point_sigma = point_uncertainty(rig, volume)
-    lengths = (length_uncertainty(rig, volume), length_uncertainty(rig_with_board, volume))
+    along, across = length_uncertainty(rig, volume)
     sigma, most = place_causes(rig_with_board, volume)
     place = tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
     pairs = len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1]))
@@ -237,8 +249,7 @@ def assess(
     warnings = (*wide, *warnings)
     point_length = np.linalg.norm(point_sigma, axis=-1)
     pixel_length = np.linalg.norm(pixel_sigma, axis=-1)
-    triangulation = (float(np.sqrt(np.mean(point_length**2))), float(point_length.max()))
-    return Assessment(
+    found = Assessment(
         chi_square=refinement.chi_square,
         unexplained_px=refinement.unexplained_sigma,
         corner_sigma_px=float(np.sqrt(np.mean(np.trace(kept.covariance, axis1=1, axis2=2)) / 2)),
@@ -248,14 +259,19 @@ def assess(
         tilt_spread_deg=spread,
         half_sets=halves,
         projection_sigma_px=(float(np.sqrt(np.mean(pixel_length**2))), float(pixel_length.max())),
-        triangulation_sigma=triangulation,
-        length_sigma=lengths,
+        triangulation_sigma=(float(np.sqrt(np.mean(point_length**2))), float(point_length.max())),
+        length_sigma=(along, length_uncertainty(rig_with_board, volume)[0]),
         place_sigma=place,
         pairs=pairs,
         motion=motion,
-        verdict=_verdict(refinement, triangulation, _range(rig, volume), lengths, pairs, halves, named, chosen, wide),
+        direction_sigma=across,
+        stereo_misfit_px=chosen.held_out_rms_px if chosen else np.nan,
+        held_out_error=chosen.held_out_error if chosen else np.nan,
+        distance=float(np.linalg.norm(rig.R_left_world @ volume.mean(0) + rig.t_left_world)),
+        verdict="",
         warnings=warnings,
     )
+    return replace(found, verdict=_verdict(found, refinement.rms(), named, wide))
 
 
 def _warnings(
@@ -301,58 +317,44 @@ def _warnings(
     return tuple(found)
 
 
-def length_uncertainty(rig: StereoRig, points_world: Array) -> float:
-    """Relative standard deviation of a length across the points (n, 3) [m], from the calibration alone.
+def length_uncertainty(rig: StereoRig, points_world: Array) -> tuple[float, float]:
+    """Standard deviations of a line across the points (n, 3) [m]: relative of its length, and its direction [rad].
 
-    The mean over the three axes of space, of a length as long as the points' scatter; displacements have the same.
+    From the calibration alone; means over the three axes of space, of a line as long as the points' scatter.
+    Displacements have the same.
     """
     middle, size = points_world.mean(0), float(np.sqrt(np.mean(np.var(points_world, axis=0)) * 3))
-    ends = middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)])
-    shift = _shifts_of_points(rig, ends)
-    along = np.stack([shift[axis, axis] - shift[axis + 3, axis] for axis in range(3)]) / size
-    return float(np.sqrt(np.mean(np.einsum("ap,pq,aq->a", along, rig.covariance, along))))
+    shift = _shifts_of_points(rig, middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)]))
+    change = (shift[:3] - shift[3:]) / size  # (3 lines, 3 axes, 30)
+    variance = np.einsum("lap,pq,laq->la", change, rig.covariance, change)
+    own = float(np.trace(variance)) / 3
+    return float(np.sqrt(max(own, 0.0))), float(np.sqrt(max(float(variance.sum()) - 3 * own, 0.0) / 6))
 
 
-def _range(rig: StereoRig, points_world: Array) -> float:
-    """Distance [m] from the left camera to the middle of the points."""
-    return float(np.linalg.norm(rig.R_left_world @ points_world.mean(0) + rig.t_left_world))
-
-
-_GRADES = ("excellent", "good", "usable", "poor")
-
-
-def _verdict(
-    refinement: Refinement,
-    triangulation: tuple[float, float],
-    distance: float,
-    lengths: tuple[float, float],
-    pairs: int,
-    halves: HalfSets | None,
-    moved: bool,
-    chosen: TermsTried | None,
-    wide: tuple[str, ...],
-) -> str:
-    """The worst of what the figures say, with the reason, then the figures."""
-    rms = refinement.rms()
-    held_out = chosen.held_out_rms_px if chosen is not None and np.isfinite(chosen.held_out_rms_px) else rms
-    limits = (0.05, GOOD_RMS_PX, POOR_RMS_PX)
+def _verdict(found: Assessment, rms: float, moved: bool, wide: tuple[str, ...]) -> str:
+    """The worst of what the figures say, with the reason, then the figures: what a user gets on the table."""
+    (sigma, most), error = found.triangulation_sigma, found.held_out_error
+    words = ("excellent", "good", "usable", "poor")
     judged = [(3, wide[0].partition(":")[0])] if wide else []  # of equal grades the first is told: the cause
-    judged.append((int(np.searchsorted(limits, held_out)), f"views left out of the fit give {held_out:.4f} px"))
-    if pairs < MIN_GOOD_VIEWS:
-        judged.append((2 if pairs > 3 else 3, f"only {pairs} views were seen by both cameras"))
-    if held_out > 2 * rms:
-        judged.append((2, f"views left out give {held_out:.3f} px where those fitted give {rms:.3f} px"))
-    if halves is not None and halves.sigmas > 2:
-        judged.append((2, f"odd and even views differ by {halves.sigmas:.1f} of their sigmas"))
+    for value, what in ((sigma, "a point is uncertain by"), (error, "corners of views left out of the fit are off by")):
+        if np.isfinite(value):
+            part = f"{1e3 * value:.3g} mm, {100 * value / found.distance:.2g} % of the distance"
+            judged.append((int(np.searchsorted(GRADES, value / found.distance)), f"{what} {part}"))
+    if found.pairs < MIN_GOOD_VIEWS:
+        judged.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
+    if found.stereo_misfit_px > 2 * rms:
+        judged.append((2, f"views left out give {found.stereo_misfit_px:.3f} px where those fitted give {rms:.3f} px"))
+    if found.half_sets is not None and found.half_sets.sigmas > 2:
+        judged.append((2, f"odd and even views differ by {found.half_sets.sigmas:.1f} of their sigmas"))
     if moved:
         judged.append((2, "the two images of a pair do not show the board in one place"))
-    if triangulation[0] > 1e-3 * distance:
-        share = 100 * triangulation[0] / distance
-        judged.append((2 if share < 1 else 3, f"a point is uncertain by {share:.2g} % of its distance"))
-    grade, why = max(judged, key=lambda item: item[0])
+    grade, why = max(judged, key=lambda item: item[0], default=(3, "nothing tells how good it is"))
+    off = f", their corners {1e3 * error:.4f} mm in space" if np.isfinite(error) else ""
+    turn = 1e3 * np.degrees(found.direction_sigma)
     return (
-        f"{_GRADES[grade].capitalize()}: {why}. RMS {rms:.4f} px, views left out {held_out:.4f} px. Through this "
-        f"calibration a point comes out within {1e3 * triangulation[0]:.4f} mm (1 sigma, 3-D; at most "
-        f"{1e3 * triangulation[1]:.4f} mm), a length or displacement within {100 * lengths[0]:.2g} %, or "
-        f"{100 * lengths[1]:.2g} % with the declared size of the board."
+        f"{words[grade].capitalize()}: {why}. Through this calibration a point comes out within {1e3 * sigma:.4f} mm "
+        f"(1 sigma, 3-D; at most {1e3 * most:.4f} mm), a direction within {turn:.2g} mdeg, "
+        f" a length or displacement within {100 * found.length_sigma[0]:.2g} %, or "
+        f"{100 * found.length_sigma[1]:.2g} % with the declared size of the board. Views left out of the fit: stereo "
+        f"misfit {found.stereo_misfit_px:.4f} px{off}; RMS of those fitted {rms:.4f} px."
     )

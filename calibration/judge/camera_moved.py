@@ -13,7 +13,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from calibration.cameras.camera import PAIR_SHIFT, PAIR_TURN
+from calibration.cameras.camera import PAIR_SHIFT, PAIR_TURN, Camera, project
+from calibration.fit.start import start_camera
 from calibration.fit.stereo_model import Observations, StereoModel, predict
 from calibration.judge.pairs import PairsJudged
 from calibration.kit.arrays import Array
@@ -24,6 +25,8 @@ LEAST = 6  # pairs: of fewer a step cannot be told from motions of the boards
 STEP = 4.0
 LEAST_SIDE = 3  # pairs on either side of a step: fewer are not a place of the cameras, but boards that moved
 ASTRAY = 0.1  # share of the pairs that may lie nearer to the other side's place
+ZOOM = 0.01  # of the focal length: below, a part of the views may tell as much otherwise
+BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
 LEAST_TOLD = 1e-5  # of singular values: below, the points lie on a line as seen from the camera
 
 
@@ -76,6 +79,35 @@ class CameraMoved:
             "of the others serve each its own camera. If the motion was recorded with the cameras as they stood at "
             "other views, calibrate from these alone, or take new ones"
         )
+
+
+def zoomed(
+    observations: Observations, moved: CameraMoved, nominal: Array, cameras: tuple[Camera, Camera]
+) -> dict[int, str]:
+    """Cameras whose focal length is another one in the other stretches, and what is to be said of their images there.
+
+    A camera with other focal lengths in both parts, alone and roughly, must fit clearly better than one for all views.
+    """
+    found = {}
+    other = np.isin(observations.view, moved.others)
+    paired = np.isin(observations.view, [v for stretch in moved.stretches for v in stretch])
+    for index, camera in enumerate(cameras):
+        focal, square = [], []
+        for part in (paired, paired & ~other, paired & other):
+            rough, poses = start_camera(observations[part], index, nominal, camera.image_size)
+            mine = observations[part & (observations.camera == index) & np.isin(observations.view, list(poses))]
+            R, t = (np.stack([poses[v][i] for v in mine.view]) for i in (0, 1))
+            off = mine.pixels - project(np.einsum("nij,nj->ni", R, nominal[mine.point]) + t, rough)
+            focal.append(rough.fx)
+            square.append(float(np.sum(off**2)))
+        change = focal[2] / focal[1] - 1.0
+        if abs(change) > ZOOM and square[0] > BY_ZOOM * (square[1] + square[2]):
+            found[index] = (
+                f"the {('left', 'right')[index]} camera was zoomed or focused anew while the views were taken: its "
+                f"focal length is {focal[1]:.0f} px in the {len(moved.stretches[moved.kept])} views that are used, "
+                f"{focal[2]:.0f} px here. If the motion was recorded so, calibrate from these views alone"
+            )
+    return found
 
 
 def camera_moved(

@@ -16,7 +16,7 @@ from calibration.board.target import Board, Target
 from calibration.fit import normal_equations
 from calibration.rig_file import read_rig, write_rig
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
-from disctrack.errors import OutputError, RecordingError, RigFileError
+from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import whole_file
 from disctrack.progress import compiling, progress_bar
@@ -105,9 +105,12 @@ def given_rig(file: Path) -> CalibrationResult:
     return CalibrationResult(rig, [f"{'calibration':<13} {file}: baseline {rig.baseline * 1e3:.3f} mm"], [])
 
 
-def calibrate_into(path: Path, source: CalibrationSource, overwrite: bool, figures: bool) -> CalibrationResult:
+def calibrate_into(
+    path: Path, source: CalibrationSource, overwrite: bool, figures: bool, force: bool = False
+) -> CalibrationResult:
     """Calibrate, or reuse the rig that is there; write rig and pictures.
 
+    force : write a rig that is beyond use, too; CalibrationError without
     Raises OutputError if `path` holds something else and may not be replaced.
     """
     refuse_input(path)
@@ -122,6 +125,12 @@ def calibrate_into(path: Path, source: CalibrationSource, overwrite: bool, figur
         reused = f"{'reused':<13} {path}: complete result of the same views, settings and version"
         return CalibrationResult(read_rig(path), [reused, *lines], [path])
     found, problems = _calibrate(source)
+    if found.assessment.beyond_use and not force:
+        said = "; ".join([found.assessment.verdict, *found.warnings])
+        raise CalibrationError(
+            f"{source.views.place}: the rig is beyond use and was not written. {said}. Take better views; `disctrack "
+            "calibrate --force` writes it as it is."
+        )
     lines = summary.calibration_lines(found, problems)
     with whole_file(path, suffix=".h5") as part:
         write_rig(part, found)

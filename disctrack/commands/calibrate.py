@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
         source = source_of(read_recording(arguments.recording), outputs.calibration_settings(arguments))
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
-    result = calibrate_into(path, source, arguments.overwrite, figures=not arguments.no_figures)
+    result = calibrate_into(path, source, arguments.overwrite, figures=not arguments.no_figures, force=arguments.force)
     print("\n".join([*result.lines, *summary.file_lines([outputs.relative(file) for file in result.files])]))
     return DONE
 

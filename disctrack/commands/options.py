@@ -76,6 +76,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     without.add_argument("--table-view", type=int, metavar="I", help="view whose board lies flat on the table, from 0")
     without.add_argument("--board-thickness-mm", type=_length_or_zero, metavar="MM", help="(default: 0)")
     parser.add_argument("--overwrite", action="store_true", help="replace a rig made from other views or settings")
+    parser.add_argument("--force", action="store_true", help="write a rig that is beyond use, too")
     parser.add_argument("--no-figures", action="store_true", help="no pictures")
     _calibration_options(parser)
 

@@ -124,3 +124,54 @@ def test_rotation_vectors_are_those_of_their_rotations(rng):
 def test_pairs_agree_as_far_as_the_best_of_them_do():
     pairs = Pairing(np.eye(3), np.zeros(3), np.zeros(5, int), np.array([0.1, 1.0, 1.2, 4.9, 60.0]), 0.0, 0.5)
     assert pairs.agrees.tolist() == [True, True, True, True, False]
+
+
+@pytest.mark.parametrize("zoom", [1.05, 0.95])
+def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_images(scene_maker, zoom):
+    scene = scene_maker(n_views=20)
+    m, board = scene.model, scene.board
+    right = m.cameras[1]
+    zoomed = replace(m, cameras=(m.cameras[0], replace(right, fx=zoom * right.fx, fy=zoom * right.fy)))
+    left, before = corner_views(scene, np.random.default_rng(0), board=board)
+    after = corner_views(replace(scene, model=zoomed), np.random.default_rng(1), board=board)[1]
+    sides = ([replace(view, image_size=(512, 512)) for view in side] for side in (left, [*before[:12], *after[12:]]))
+    found = calibrate_from_corners(*sides, board, CalibrationSettings(board="flat"))
+    (text,) = [text for text in found.warnings if "zoomed" in text]
+    assert text.startswith("right 12, right 13")
+    assert "the right camera was zoomed or focused anew" in text
+    assert not any("camera was moved" in text for text in found.warnings)
+    assert found.assessment.pairs == 12
+    sigma = np.sqrt(np.diag(found.rig.covariance))
+    assert abs(found.rig.right.fx - right.fx) < 4 * sigma[9]
+    assert np.abs((found.rig.t_right_left - m.t_right_left) / sigma[21:24]).max() < 4
+
+
+def test_images_of_half_the_size_are_no_better_a_calibration(scene_maker):
+    """The same cameras with half the pixels, corners as uncertain in space: the same verdict, half the misfit in px."""
+    scene = small_scene(scene_maker, n_views=12)
+    m = scene.model
+    half = tuple(
+        replace(c, fx=c.fx / 2, fy=c.fy / 2, cx=c.cx / 2 - 0.25, cy=c.cy / 2 - 0.25, image_size=(120, 96))
+        for c in m.cameras
+    )
+    found = []
+    for model, size, sigma in ((m, (240, 192), 0.1), (replace(m, cameras=half), (120, 96), 0.05)):
+        sides = corner_views(replace(scene, model=model), np.random.default_rng(2), sigma)
+        sides = [[replace(view, image_size=size) for view in side] for side in sides]
+        found.append(calibrate_from_corners(*sides, BOARD, FLAT).assessment)
+    whole, less = found
+    assert less.verdict.split(":")[0] == whole.verdict.split(":")[0]
+    assert_allclose(less.stereo_misfit_px, 0.5 * whole.stereo_misfit_px, rtol=0.05)
+    assert_allclose(less.held_out_error, whole.held_out_error, rtol=0.05)
+    # 0.1 px of 0.55 mm at each of two cameras 45 deg apart, less what the board's place takes up
+    assert 0.03e-3 < whole.held_out_error < 0.3e-3
+    assert f"stereo misfit {whole.stereo_misfit_px:.4f} px" in whole.verdict
+    assert "mdeg" in whole.verdict
+
+
+def test_a_rig_is_beyond_use_where_points_are_off_by_a_twentieth_of_their_distance(views):
+    good = calibrate_from_corners(*views, BOARD, FLAT).assessment
+    assert not good.beyond_use
+    assert replace(good, triangulation_sigma=(0.06 * good.distance, 1.0)).beyond_use
+    assert replace(good, held_out_error=0.06 * good.distance).beyond_use
+    assert replace(good, triangulation_sigma=(float("nan"), 1.0)).beyond_use
