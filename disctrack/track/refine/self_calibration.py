@@ -254,7 +254,7 @@ def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]
 
     Dots that lie off their places against each other by s, rms per axis, lie off them as a whole by s / sqrt(m). The
     dot that is off most is left out of s: one that was declared wrongly says nothing of the others. A sum of lengths is
-    less efficient than one of squares, and s has few degrees of freedom (both by simulation, test_as_printed.py).
+    less efficient than one of squares, and s has few degrees of freedom (both by simulation, test_self_calibration.py).
     """
     m = disc.n_markers
     squares = np.sort(np.sum(shift[:, :2] ** 2, axis=1))
