@@ -111,7 +111,7 @@ def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: A
 def apart(left: BoardPlaces, right: BoardPlaces, R_pair: Array, t_pair: Array) -> Array:
     """(m, n) [px] by which n pairs are off m places of the right camera against the left: (m, 3, 3) and (m, 3) [m]."""
     back = np.swapaxes(R_pair, 1, 2)[:, None]
-    turn = _vectors(back @ right.R @ np.swapaxes(left.R, 1, 2))
+    turn = rotation_vectors(back @ right.R @ np.swapaxes(left.R, 1, 2))
     shift = (back @ (right.middle - t_pair[:, None])[..., None])[..., 0] - left.middle
     B = np.zeros((len(R_pair), 1, 6, 6))
     B[..., :3, :3] = B[..., 3:, 3:] = back
@@ -292,7 +292,7 @@ def _both(turn: Array, shift: Array) -> Array:
     return B
 
 
-def _vectors(R: Array) -> Array:
+def rotation_vectors(R: Array) -> Array:
     """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); of half turns, some vector as long as pi."""
     v = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
     sine = np.linalg.norm(v, axis=-1)

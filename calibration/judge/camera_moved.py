@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import cv2
 import numpy as np
 
-from calibration.cameras.camera import PAIR_SHIFT, PAIR_TURN, Camera, project
+from calibration.cameras.camera import Camera, project
+from calibration.fit.pairing import apart, places_of, rotation_vectors, told_by
 from calibration.fit.start import start_camera
-from calibration.fit.stereo_model import Observations, StereoModel, predict
+from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.judge.pairs import PairsJudged
 from calibration.kit.arrays import Array
 
@@ -27,7 +27,6 @@ LEAST_SIDE = 3  # pairs on either side of a step: fewer are not a place of the c
 ASTRAY = 0.1  # share of the pairs that may lie nearer to the other side's place
 ZOOM = 0.01  # of the focal length: below, a part of the views may tell as much otherwise
 BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
-LEAST_TOLD = 1e-5  # of singular values: below, the points lie on a line as seen from the camera
 
 
 @dataclass(frozen=True)
@@ -118,11 +117,11 @@ def camera_moved(
     observations : with the views' numbers; pairs : as judged by cameras that were refined, `model` has those
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
-    views, places, spread = _places(observations, pairs, model)
+    views, places, between = _places(observations, pairs, model)
     if len(views) < LEAST:
         return None
     steps: list[Step] = []
-    ends = [0, *_steps(_between(places, spread), places, views, (0, len(views)), steps), len(views)]
+    ends = [0, *_steps(between, places, views, (0, len(views)), steps), len(views)]
     if not steps:
         return None
     stretches = tuple(tuple(views[a:b]) for a, b in pairwise(ends))
@@ -134,54 +133,26 @@ def camera_moved(
 
 
 def _places(observations: Observations, pairs: PairsJudged, model: StereoModel) -> tuple[list[int], Array, Array]:
-    """Views of pairs, how the cameras stand by each alone, turn and shift (n, 6) from `model`, and how well it sees it.
+    """Views of pairs, how the cameras stand by each alone, turn and shift (n, 6) from `model`, and how far apart.
 
-    The latter (n, 6, 6) is the covariance of what displaces the right image's points by one pixel, root mean square,
-    once the board's place in the left image has taken up what it can. Pairs whose points lie on a line do not tell.
+    The latter (n, n) [px] by the covariance of the places that each image alone gives the board; see `fit.pairing`.
     """
-    views, places, spreads = [], [], []
-    R_right_left = model.R_right_left
-    R, t = pairs.model.R_left_board.copy(), pairs.model.t_left_board.copy()
-    for v, (R_left, t_left) in pairs.left_poses.items():
-        R[v], t[v] = R_left, t_left
-    at_left = replace(model, R_left_board=R, t_left_board=t, boards_right=None)
-    for v in sorted(pairs.left_poses):
-        seen = observations[observations.view == v]
-        _, by_stereo, by_pose, _ = predict(at_left, seen)
-        right = seen.camera == 1
-        by_turn, by_shift = by_stereo[right][..., PAIR_TURN], by_stereo[right][..., PAIR_SHIFT]
-        by_pair = np.concatenate([by_turn, by_shift], axis=-1).reshape(-1, 6)
-        by_right, by_left = by_pose[right].reshape(-1, 6), by_pose[~right].reshape(-1, 6)
-        if not min(_determined(by_pair), _determined(by_left)) > LEAST_TOLD:
-            continue
-        carried = np.linalg.lstsq(by_pair, by_right, rcond=None)[0]  # a board's step, as one of the cameras
-        spread = carried @ np.linalg.solve(by_left.T @ by_left, carried.T) + np.linalg.inv(by_pair.T @ by_pair)
-        spreads.append(spread * right.sum())
-        (R_left, t_left), (R_right, t_right) = pairs.left_poses[v], pairs.right_poses[v]
-        turn = cv2.Rodrigues(R_right_left @ R_right @ R_left.T @ R_right_left.T)[0].ravel()
-        places.append(np.concatenate([turn, R_right_left @ (t_right - R_right @ R_left.T @ t_left)]))
-        views.append(v)
-    return views, np.reshape(places, (-1, 6)), np.reshape(spreads, (-1, 6, 6))
-
-
-def _determined(derivative: Array) -> float:
-    """Least over greatest singular value of a derivative (m, 6), each column by its own length; NaN out of sight."""
-    if not np.isfinite(derivative).all():
-        return float("nan")
-    values = np.linalg.svd(derivative / np.linalg.norm(derivative, axis=0), compute_uv=False)
-    return float(values[-1] / values[0])
-
-
-def _between(places: Array, spread: Array) -> Array:
-    """(n, n) [px] how far the places that two pairs tell of are apart in the right image, where both of them see it.
-
-    spread : (n, 6, 6) by which a deviation is one pixel, root mean square
-    """
-    apart = (places[:, None] - places[None])[..., None]
-    both = 0.5 * (spread[:, None] + spread[None])
-    scale = np.sqrt(np.einsum("ijkk->ijk", both))[..., None]
-    seen = np.linalg.solve(both / scale / np.swapaxes(scale, -1, -2), apart / scale) * apart / scale
-    return np.asarray(np.sqrt(np.maximum(seen.sum((-2, -1)), 0.0)), np.float64)
+    R_pair, t_pair = model.R_right_left, model.t_right_left
+    in_right = {
+        v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items() if v in pairs.left_poses
+    }
+    in_left = {v: pairs.left_poses[v] for v in in_right}
+    sides = []
+    for index, poses in enumerate((in_left, in_right)):
+        mine = observations[observations.camera == index]
+        points = {v: model.points[mine.point[mine.view == v]] for v in poses}
+        sides.append(places_of(poses, points, model.points, model.cameras[index]))
+    tells = np.flatnonzero(np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0))
+    left, right = (side[tells] for side in sides)
+    R, t = told_by(left, right)
+    between = apart(left, right, R, t)
+    places = np.concatenate([rotation_vectors(R @ R_pair.T), t - t_pair], axis=1)
+    return np.array(list(in_left), int)[tells].tolist(), places, 0.5 * (between + between.T)
 
 
 def _steps(between: Array, places: Array, views: Sequence[int], part: tuple[int, int], steps: list[Step]) -> list[int]:

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from calibration import Board, BoardNotFound, CalibrationError, CalibrationSettings, calibrate_from_corners
 from calibration.cameras.camera import rotation_from_vector
-from calibration.fit.pairing import Pairing, _vectors
+from calibration.fit.pairing import Pairing, rotation_vectors
 from tests.calibration.test_stereo import BOARD, FLAT, corner_views, small_scene
 
 
@@ -116,9 +116,9 @@ def test_an_image_that_is_missing_makes_no_two_views_one(views):
 def test_rotation_vectors_are_those_of_their_rotations(rng):
     vectors = rng.normal(size=(200, 3))
     vectors *= (rng.uniform(0, np.pi - 1e-3, 200) / np.linalg.norm(vectors, axis=1))[:, None]
-    assert_allclose(_vectors(rotation_from_vector(vectors)), vectors, atol=1e-8)
-    assert np.linalg.norm(_vectors(np.diag([-1.0, -1.0, 1.0]))) == pytest.approx(np.pi)
-    assert_allclose(_vectors(np.eye(3)), 0.0)
+    assert_allclose(rotation_vectors(rotation_from_vector(vectors)), vectors, atol=1e-8)
+    assert np.linalg.norm(rotation_vectors(np.diag([-1.0, -1.0, 1.0]))) == pytest.approx(np.pi)
+    assert_allclose(rotation_vectors(np.eye(3)), 0.0)
 
 
 def test_pairs_agree_as_far_as_the_best_of_them_do():
