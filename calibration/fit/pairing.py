@@ -24,6 +24,7 @@ from calibration.kit.errors import CalibrationError
 FLOOR = 1e-3  # of the image's longer side: rough cameras put boards no better
 SAME_PLACE = 1e-3  # of the image's longer side: lenses and boards err alike where corners differ by less
 NEARER = 3.0  # times that the pairs of another hypothesis lie together better than those stored, to be believed
+BY_CHANCE = 2.0  # times that pairs lie together better than images of other pairs do: less is no agreement
 TOO_FAR = 5.0  # times the usual distance: of another place
 MOST_LATE = 8  # views by which the two cameras may differ
 LEAST_PAIRS = 4  # of a hypothesis
@@ -228,30 +229,39 @@ def paired(
         )
     shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) <= n - LEAST_PAIRS]
     others = {(step, k): by(step, k, turns) for step in (1, -1) for k in shifts if (step, k) != (1, 0)}
-    tried = {which: one for which, one in others.items() if one is not None}
-    if tried:
-        (step, late), (whose, best) = max(tried.items(), key=lambda item: item[1][1].evidence)
-        if _is_likelier(best, found):
-            v = whose[int(np.argmin(best.distance))]
-            partner = (v if step > 0 else last - v) + late
-            which = "in reversed order" if step < 0 else f"{abs(late)} {'late' if late > 0 else 'early'}"
-            raise CalibrationError(
-                f"the left and the right views are no pairs as they are stored: the right ones come {which}. So "
-                f"paired, they tell of one place of the cameras to {best.median:.2g} px, as stored to "
-                f"{found.median:.2g} px: {names[v][0]} shows the board where {names[partner][1]} does. A frame "
-                "was lost, or one camera began earlier: name or move the files so that pairs have one number"
-            )
-        chance = float(np.median([one.evidence for _, one in tried.values()]))
-        if n >= 2 * LEAST_PAIRS and found.evidence < chance + np.log(4.0) and found.usual > TOO_FAR * floor:
-            raise CalibrationError(
-                f"the {n} pairs tell of no common place of the cameras: they differ by {found.usual:.2g} px and more, "
-                f"as images do that are no pairs. Other orders, up to {MOST_LATE} views late or early, and mirrored "
-                "images do not fit either: left and right image of each number must show the board in one place"
-            )
+    _refuse_other_order(found, {which: one for which, one in others.items() if one is not None}, names)
     notes = _late(left, turns, place, both, found, names)
     if notes and 2 * found.agrees.sum() <= n:
         raise CalibrationError(f"{'; '.join(notes)}. As stored {found.agrees.sum()} of {n} pairs are right")
     return found, notes
+
+
+def _refuse_other_order(
+    stored: Pairing, others: Mapping[tuple[int, int], tuple[list[int], Pairing]], names: Names
+) -> None:
+    """Raise CalibrationError where pairs in another order (step, late) agree and those stored do not, or none do."""
+    if not others:
+        return
+    n, last = len(stored.distance), len(names) - 1
+    (step, late), (whose, best) = max(others.items(), key=lambda item: item[1][1].evidence)
+    if _is_likelier(best, stored):
+        v = whose[int(np.argmin(best.distance))]
+        partner = (v if step > 0 else last - v) + late
+        which = "in reversed order" if step < 0 else f"{abs(late)} {'late' if late > 0 else 'early'}"
+        raise CalibrationError(
+            f"the left and the right views are no pairs as they are stored: the right ones come {which}. So paired, "
+            f"they tell of one place of the cameras to {best.median:.2g} px, as stored to {stored.median:.2g} px: "
+            f"{names[v][0]} shows the board where {names[partner][1]} does. A frame was lost, or one camera began "
+            "earlier: name or move the files so that pairs have one number"
+        )
+    chance = float(np.median([one.evidence for _, one in others.values()]))
+    agree = stored.evidence > chance + 2.0 * np.log(BY_CHANCE) or stored.usual < TOO_FAR * stored.floor
+    if n >= 2 * LEAST_PAIRS and not agree:
+        raise CalibrationError(
+            f"the {n} pairs tell of no common place of the cameras: they differ by {stored.usual:.2g} px and more, as "
+            f"images do that are no pairs. Other orders, up to {MOST_LATE} views late or early, and mirrored images "
+            "do not fit either: left and right image of each number must show the board in one place"
+        )
 
 
 def _is_likelier(one: Pairing, stored: Pairing) -> bool:
