@@ -29,7 +29,6 @@ SPIN_SIGMA = 2.0  # [rad/s]: the centre then runs on a circle of 1 mm
 K_M = {"steel": 0.381e-7, "glass": 0.28e-7}  # [m s^2] section 5c
 LONGEST = {"steel": 0.5, "glass": 0.3}  # [s] section 4a: time left where the fits of tables 2 and 3 begin
 LAST_STAGE = 1.5  # [s] simulated in section 5c
-BRAKING = 0.02  # [s] in which the disc comes to rest on its paper, figure 10
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
 _SHARED = ("air", "body")  # modules of effects that do not depend on the surface
 
@@ -81,7 +80,7 @@ def published_series() -> tuple[Series, ...]:
 
 # What the reading may do wrong: quantity, title and source of READING's errors, in its order.
 _ERRORS_OF_READING = (
-    (Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=BRAKING / 2),
+    (Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=0.01),
      "the instant called t_f is not that of collapse", "section 4a"),
     (Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02),
      "the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),

@@ -9,7 +9,7 @@ contradiction, and which of them these tables cannot tell apart.
 """
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,17 +17,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from disctrack.analyse.published import PREDICTED
 from disctrack.discrepancy.document import document, table
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
-from disctrack.discrepancy.system import Values
 from disctrack.discrepancy.words import quantity_text
 from disctrack.examples._command import Outcome, command
-from disctrack.examples.exponent_model import LastStage, Setup
-from disctrack.examples.exponent_system import BRAKING, ExponentSystem, at, published_series
+from disctrack.examples.exponent_system import ExponentSystem, published_series
 from disctrack.pages.figures import panels
 from disctrack.pages.palette import INK, MUTED
 
@@ -68,52 +66,31 @@ def misfit(surface: str, exponents: Array, predicted: Array) -> Misfit:
 
 @dataclass(frozen=True)
 class Explanation:
-    """An effect fitted to all, or one whose size is known beforehand."""
+    """An effect fitted to all trials."""
 
     name: str
     fit: Fit
     sizes: tuple[str, ...]  # its fitted quantities
     gain: float  # decrease of chi-square against the base model
     misfits: tuple[Misfit, ...]
-    held_out_gain: dict[str, float] = field(default_factory=dict)  # in 2 log density of the data left out, by split
+    held_out_gain: float  # in 2 log density of the later trials, which were left out
 
 
-def explanation(
-    system: ExponentSystem, base: Fit, name: str, known: Values | None = None, said: str = ""
-) -> Explanation:
-    """Refit one candidate together with all that the base fit moves, and judge it on data left out.
-
-    known : sizes that are held; the candidate is then fitted beside them, or nothing where its name is empty
-    """
+def explanation(system: ExponentSystem, base: Fit, name: str) -> Explanation:
+    """Refit one candidate together with all that the base fit moves, and judge it on the later trials."""
     extra = tuple(q for c in system.candidates if c.name == name for q in c.quantities)
-    found = fit(system, (*system.base, *extra), base.values | dict(known or {}))
+    found = fit(system, (*system.base, *extra), base.values)
     misfits = tuple(
         misfit(s.setup.surface, s.exponents, system.outcomes(i, found.values)[:3]) for i, s in enumerate(system.series)
     )
-    gains = {}
-    for split, rows in splits(system).items() if known is None else ():
-        without = held_out(system, system.base, base.values, rows)
-        with_it = held_out(system, found.quantities, found.values, rows)
-        sure = without.train.converged and with_it.train.converged
-        gains[split] = 2 * (with_it.log_density - without.log_density) if sure else float("nan")
+    rows = training_rows(system)
+    held = [
+        held_out(system, quantities, f.values, rows)
+        for quantities, f in ((system.base, base), (found.quantities, found))
+    ]
+    ahead = 2 * (held[1].log_density - held[0].log_density) if all(h.train.converged for h in held) else float("nan")
     gain = base.cost - found.cost if found.converged else float("nan")
-    return Explanation(said or name, found, tuple(q.name for q in extra), gain, misfits, gains)
-
-
-def splits(system: ExponentSystem) -> dict[str, Mask]:
-    """Rows to fit on, by what is then foretold."""
-    rows = {"later trials": training_rows(system)}
-    for i, surface in enumerate(system.surfaces):
-        rows[surface] = ~((system.number < 3) & (system.owner == i))
-    return rows | {"n_energy": system.number != 2}
-
-
-def early_stop(setup: Setup, theta: float = np.radians(0.5)) -> float:
-    """Time [s] before collapse at which the nutation falls to theta, where the disc comes to lie on its paper."""
-    stage = LastStage(setup, {"km.k_m": setup.k_m})
-    assert stage.curve is not None
-    time = np.linspace(stage.duration - setup.longest, stage.duration - 1e-3, 4000)
-    return float(stage.duration - time[np.argmax(np.exp(stage.curve(time)[:, 0]) < theta)])
+    return Explanation(name, found, tuple(q.name for q in extra), gain, misfits, ahead)
 
 
 @dataclass(frozen=True)
@@ -123,7 +100,6 @@ class Answer:
     diagnosis: Diagnosis
     thin: tuple[Misfit, ...]  # against 2/3, -1/3, 2/3
     explanations: tuple[Explanation, ...]
-    known: tuple[Explanation, ...]  # sizes that theory or the paper's own words give
 
     @property
     def undecided(self) -> tuple[Explanation, ...]:
@@ -140,24 +116,10 @@ def _named(diagnosis: Diagnosis) -> list[str]:
 def examine(system: ExponentSystem) -> Answer:
     """Diagnosis of the trials, and everything that is said beside it; ASKED must be among the system's candidates."""
     diagnosis = diagnose(system, system.start, SETTINGS)
-    base = diagnosis.before
-    touch = {at("t_f.bias", s.setup.surface): -early_stop(s.setup) for s in system.series}
-    rest, nominal = {name: BRAKING + value for name, value in touch.items()}, {"air_bildsten.beta": 1.0}
-    known = (
-        ("t_f where the disc reaches its paper, 0.5 deg", "", touch),
-        (f"t_f where it has come to rest on it, {1e3 * BRAKING:.0f} ms later", "", rest),
-        ("Moffatt's layer as calculated", "", {"air_moffatt.f": 1.0}),
-        ("Bildsten's boundary layers with a factor of one", "", nominal),
-        ("the same with t_f fitted", "t_f_each", nominal),
-        # the paper does not say where its fits end; the curves of its figures do so 0.05 s before t_f
-        ("fits that end 0.02 s later, with t_f fitted", "t_f", {"cut.shift": -0.02}),
-        ("fits that end 0.05 s earlier, with t_f fitted", "t_f", {"cut.shift": 0.05}),
-    )
     return Answer(
         diagnosis,
         tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series),
-        tuple(explanation(system, base, name) for name in dict.fromkeys([*_named(diagnosis), *ASKED])),
-        tuple(explanation(system, base, free, sizes, said) for said, free, sizes in known),
+        tuple(explanation(system, diagnosis.before, name) for name in dict.fromkeys([*_named(diagnosis), *ASKED])),
     )
 
 
@@ -184,13 +146,12 @@ def report(answer: Answer) -> str:
         for name, mean, sigma, predicted, s in zip(NAMES, m.mean, m.sigma, m.predicted, m.sigmas, strict=True):
             lines.append(f"  {m.surface:6}{name:9}{mean:8.4f} +- {sigma:.4f}   {predicted:8.4f}{s:6.1f} sigma")
         lines.append(f"  {m.surface:6}together {m.joint_sigmas:.1f} sigma (p = {m.p_value:.2g})")
-    lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size; gain in 2 ln p of data left out"]
-    for e in (*answer.explanations, *answer.known):
+    lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size; gain in 2 ln p of the later trials"]
+    for e in answer.explanations:
         units = {q.name: q.unit for q in e.fit.quantities}
         sizes = ", ".join(f"{n} = {quantity_text(e.fit.values[n], e.fit.sigma(n), units[n])}" for n in e.sizes)
         left = ", ".join(f"{m.surface} {m.joint_sigmas:.1f}" for m in e.misfits)
-        gains = ", ".join(f"{split} {gain:.1f}" for split, gain in e.held_out_gain.items())
-        lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes, gains) if x))
+        lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes, f"{e.held_out_gain:.1f}") if x))
     return "\n".join([*lines, "", *table(answer.diagnosis)])
 
 
@@ -227,7 +188,6 @@ def as_document(answer: Answer) -> dict[str, Any]:
         "cannot_be_told_apart": [e.name for e in answer.undecided],
         "against_thin_disc": [of(m) for m in answer.thin],
         "explanations": [explained(e) for e in answer.explanations],
-        "known_sizes": [explained(e) for e in answer.known],
     }
 
 
