@@ -636,9 +636,9 @@ def _bounds(score: Score) -> str:
 
 
 def _surprise(candidate: Candidate, fit_: Fit) -> float:
-    """Minus twice the logarithm of a heavy-tailed (Cauchy) prior as wide as the quantities' typical sizes."""
-    sizes = [abs(fit_.values[q.name] - q.null) / q.typical for q in candidate.quantities]
-    return 2.0 * float(np.log1p(max(sizes) ** 2))
+    """Minus twice the logarithm of a heavy-tailed (Cauchy) prior, against that at the size which surprises nobody."""
+    size = max(abs(fit_.values[q.name] - q.null) / q.typical for q in candidate.quantities)
+    return max(0.0, 2.0 * float(np.log((1.0 + size**2) / 2.0)))
 
 
 def _without(values: Values, candidate: Candidate, rest: Sequence[Candidate]) -> dict[str, float]:

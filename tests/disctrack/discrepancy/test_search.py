@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
+from scipy.stats import chi2
 
 from calibration.kit.least_squares import solve_bounded, triangle
 from disctrack.discrepancy.fit import compress, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
-from disctrack.discrepancy.search import Settings, _Search, diagnose
+from disctrack.discrepancy.search import Settings, _Search, diagnose, length
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp
 from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 
@@ -404,3 +405,20 @@ def test_explanations_that_fit_alike_are_listed_with_their_odds(rng):
     assert () not in listed  # the control: that nothing is missing is no alternative
     nothing = diagnose(oscillator(rng), START)
     assert nothing.explanations[0] == ((), 0.0)
+
+
+def test_the_length_of_an_explanation_is_chi_square_with_its_prices(rng):
+    system = oscillator(rng)
+    base = fit(system, system.base, START)
+    drift = next(c for c in system.candidates if c.name == "drift")
+    drift = replace(drift, quantities=tuple(replace(q, typical=0.1) for q in drift.quantities))
+    with_it = replace(base, quantities=(*base.quantities, *drift.quantities))
+
+    def longer(size):
+        fitted = replace(with_it, values=base.values | {"drift": size})
+        return length(system, Settings(), 1.0, fitted, [drift]) - length(system, Settings(), 1.0, base, [])
+
+    tests = len(system.candidates)
+    assert longer(0.1) == pytest.approx(chi2.isf(0.005 / tests, 1))  # what the best of so many gains by noise
+    assert longer(0.02) == longer(0.1)  # a size that surprises nobody costs nothing
+    assert longer(1.0) - longer(0.1) == pytest.approx(2 * np.log(101 / 2))
