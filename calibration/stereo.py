@@ -26,7 +26,7 @@ from calibration.judge.assessment import (
 )
 from calibration.judge.camera_moved import camera_moved, zoomed
 from calibration.judge.motion_size import likely_motion
-from calibration.judge.pairs import PairsJudged, pairs_that_agree
+from calibration.judge.pairs import LEAST_PAIRS, PairsJudged
 from calibration.judge.table_frame import rig_with_covariance
 from calibration.judge.tolerances import (
     BoardShape,
@@ -243,10 +243,11 @@ def calibrate_from_corners(
             for v in moved.others:
                 views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names, progress)
-    if moved is None:
-        pairs = pairs_that_agree(observations, start.model, board.points, start.agrees, start.right_poses)
-    else:
+    if moved:
         pairs = moved.set_apart(pairs)
+    elif len(start.right_poses) >= LEAST_PAIRS:
+        # a pose by one camera alone, from rough intrinsics, may be degrees off: refined cameras judge these pairs anew
+        pairs = replace(pairs, apart={v: "" for v in start.right_poses if not start.agrees[v]})
     report("refining")
     seen = np.bincount(observations.point, minlength=len(board.points))
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")

@@ -354,7 +354,7 @@ def _verdict(found: Assessment, rms: float, moved: bool, wide: tuple[str, ...]) 
     return (
         f"{words[grade].capitalize()}: {why}. Through this calibration a point comes out within {1e3 * sigma:.4f} mm "
         f"(1 sigma, 3-D; at most {1e3 * most:.4f} mm), a direction within {turn:.2g} mdeg, "
-        f" a length or displacement within {100 * found.length_sigma[0]:.2g} %, or "
+        f"a length or displacement within {100 * found.length_sigma[0]:.2g} %, or "
         f"{100 * found.length_sigma[1]:.2g} % with the declared size of the board. Views left out of the fit: stereo "
         f"misfit {found.stereo_misfit_px:.4f} px{off}; RMS of those fitted {rms:.4f} px."
     )

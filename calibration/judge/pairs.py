@@ -8,19 +8,17 @@ import numpy as np
 from calibration.fit.board_motion import BoardMotion
 from calibration.fit.model_choice import fit_poses
 from calibration.fit.normal_equations import inverse_covariance
-from calibration.fit.refinement import Refinement, refine_stereo
-from calibration.fit.stereo_model import Observations, StereoModel, Terms, predict, predict_pixels
+from calibration.fit.refinement import Refinement
+from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
 from calibration.judge.motion_size import likely_motion
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
-ROUGH = Terms("k1 k2", "flat")
 MIN_POINTS = 8  # of an image, to tell the board's pose by itself
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
 # Times the usual misfit. Of Gaussian motions (F of 6 and 24 degrees of freedom) one in 10^9 is as far; the motions of
 # hand-held boards have longer tails.
 TOO_FAR = 5.0
-ROUNDS = 4
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in the left camera's axes
 
 
@@ -172,28 +170,6 @@ def _misfit(observations: Observations, model: StereoModel, n: int) -> tuple[Arr
     square = np.nan_to_num(np.sum(residuals**2, axis=-1), nan=1e12)
     squares, counts = (np.bincount(observations.view, what, minlength=n) for what in (square, np.ones_like(square)))
     return np.asarray(squares, np.float64), np.asarray(counts, np.float64)
-
-
-def pairs_that_agree(
-    observations: Observations, start: StereoModel, nominal: Array, agrees: Mask, right_poses: Mapping[int, Pose]
-) -> PairsJudged:
-    """Which pairs belong together after all, where rough cameras put the board of some (agrees: n_views) elsewhere.
-
-    The pose of a board in one camera alone, from rough intrinsics, may be degrees off; all images together, each where
-    its own camera has it, make the cameras better, and then the pairs are judged anew.
-    """
-    apart = sorted(v for v in right_poses if not agrees[v])
-    if len(right_poses) < LEAST_PAIRS or not apart:
-        return PairsJudged(start, dict(right_poses), {}, {})
-    judged = PairsJudged(start, dict(right_poses), dict.fromkeys(apart, ""), {})
-    for _ in range(ROUNDS):
-        before = sorted(judged.apart)
-        places = own_places(observations, judged.model, before, judged.right_poses)
-        fit = refine_stereo(*places, nominal, ROUGH)
-        judged = judge_pairs(observations, fit, before)
-        if sorted(judged.apart) == before:
-            break
-    return judged
 
 
 @dataclass(frozen=True)
