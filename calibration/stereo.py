@@ -42,6 +42,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError
 from calibration.kit.stuck_pixels import repaired_views
+from calibration.kit.threads import one_blas_thread
 from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
 
 CAMERA_NAMES = ("left", "right")
@@ -138,6 +139,7 @@ class StereoCalibration(Brief):
         return rejected
 
 
+@one_blas_thread
 def calibrate_stereo(
     left_images: Sequence[NDArray],
     right_images: Sequence[NDArray],
@@ -200,6 +202,7 @@ def _determined() -> Iterator[None]:
 
 
 @_determined()
+@one_blas_thread
 def calibrate_from_corners(
     left_views: Sequence[CornerView | BoardNotFound],
     right_views: Sequence[CornerView | BoardNotFound],

@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from disctrack.calibrate.stage import calibrate_recording as calibrate_recording
     from disctrack.calibrate.views import calibrate_views as calibrate_views
     from disctrack.calibrate.views import find_views as find_views
-    from disctrack.diagnosis.stage import diagnose_trajectory
+    from disctrack.diagnosis.stage import diagnose_trajectory as diagnose  # noqa: F401
     from disctrack.diagnosis.stage import run_diagnose as run_diagnose
     from disctrack.disc import Disc as Disc
     from disctrack.errors import DiscTrackError as DiscTrackError
@@ -108,8 +108,6 @@ if TYPE_CHECKING:
     from disctrack.trajectory.file import write_csv as write_csv
     from disctrack.trajectory.file import write_group as write_group
     from disctrack.trajectory.file import write_trajectory as write_trajectory
-
-    diagnose = diagnose_trajectory
 
 
 def __getattr__(name: str) -> Any:

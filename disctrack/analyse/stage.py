@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.kit.brief import Brief
+from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
 from disctrack.analyse.derivatives import GROUP_NAMES, STATE
 from disctrack.analyse.power_laws import (
@@ -58,6 +59,7 @@ class AnalyseOutcome(Brief):
         return [*found, f"files         {self.file}", f"              {self.report}"]
 
 
+@one_blas_thread
 def run_analyse(
     path: str | Path,
     output: str | Path | None = None,

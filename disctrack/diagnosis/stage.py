@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.kit.brief import Brief
+from calibration.kit.threads import one_blas_thread
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc_system import DiscSystem
@@ -62,6 +63,7 @@ class DiagnoseOutcome(Brief):
         return {**self.result.facts(), "files": ", ".join(file.name for file in self.files)}
 
 
+@one_blas_thread
 def diagnose_trajectory(
     trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None, *, separate: bool = True
 ) -> DiscDiagnosis:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.cameras.camera import StereoRig
+from calibration.kit.threads import one_blas_thread
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.recording.readers.blocks import PairBlock
@@ -20,6 +21,7 @@ Images = NDArray[Any]  # uint8 or uint16
 BLOCK, COPIED_BLOCK = 256, 16  # pairs
 
 
+@one_blas_thread
 def measure_pairs(
     images: Images | tuple[Images, Images],
     rig: StereoRig,

@@ -13,6 +13,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
+from calibration.kit.threads import one_blas_thread
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
@@ -122,6 +123,7 @@ def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
             )
 
 
+@one_blas_thread
 def measure(
     recording: Recording,
     rig: StereoRig,

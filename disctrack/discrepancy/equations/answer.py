@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
+from calibration.kit.threads import one_blas_thread
 from disctrack.discrepancy.document import document, table
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.law import LearnedForce
@@ -42,6 +43,7 @@ class ChannelErrors:
     noise: float  # as found in what the model leaves
 
 
+@one_blas_thread
 def diagnose(
     equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
     settings: Settings | None = None, stretch: float | None = None,
