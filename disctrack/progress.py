@@ -121,7 +121,7 @@ def compiling(what: str, seconds: int) -> Iterator[None]:
             print(told, file=sys.stderr, flush=True)
         said.append(told)
 
-    with one_at_a_time(tell):
+    with one_at_a_time(tell, what):
         yield
     if said:
         _tell(began, f"inner loops of {what} compiled")

@@ -61,12 +61,12 @@ class _BeforeCompiling(event.Listener):
 
 
 @contextmanager
-def one_at_a_time(tell: Callable[[], None] = lambda: None) -> Iterator[None]:
+def one_at_a_time(tell: Callable[[], None] = lambda: None, what: str = "") -> Iterator[None]:
     """Hold a lock while functions are compiled or loaded: of many processes one compiles, the others load its code.
 
-    `tell` is called before whatever is compiled, and not where all is loaded.
+    `tell` is called before whatever is compiled, and not where all is loaded; `what` has a lock of its own.
     """
-    lock = FileLock(FOLDER / "lock", is_singleton=True)
+    lock = FileLock(FOLDER / f"{what}.lock", is_singleton=True)
     with suppress(OSError, NotImplementedError):  # a file system without locks: each compiles for itself
         FOLDER.mkdir(parents=True, exist_ok=True)
         lock.acquire()

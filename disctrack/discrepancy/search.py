@@ -569,7 +569,7 @@ class _Search:
         listed = tuple((tuple(sorted(e.names)), self.length(e) - shortest) for e in self._ranked())
         return Diagnosis(
             verdict, reason, found, before.fit, after.fit, *held, self.noise, tried, self.settings, partial,
-            explanations=tuple(item for item in listed if item[1] < CLASS_GAIN),
+            explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN),
         )  # fmt: skip
 
     def _tried(self, score: Score, found: tuple[Found, ...]) -> Tried:

@@ -123,6 +123,7 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
     assert_allclose([np.mean([m.shift for m in sizes]), np.mean([m.turn for m in sizes])], 0.5e-3, rtol=0.25)
 
 
+@pytest.mark.statistical
 def test_boards_that_were_held_still_count_for_more_than_those_that_moved():
     rig = moved_boards.make_rig(2)
     still, moving = (moved_boards.pairs(rig, 6, seed, shift=size, turn=size) for seed, size in ((1, 0.0), (2, 2e-3)))

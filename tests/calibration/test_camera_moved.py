@@ -38,6 +38,7 @@ def rig():
     return moved_boards.make_rig(3)
 
 
+@pytest.mark.statistical
 def test_a_camera_touched_between_the_views_is_named_and_sized(rig):
     later = moved_boards.turned(rig, TURN, SHIFT)
     found = calibrated([(rig, 12), (later, 7)])
@@ -52,6 +53,7 @@ def test_a_camera_touched_between_the_views_is_named_and_sized(rig):
     assert pair_error(found, later) > 5.0
 
 
+@pytest.mark.statistical
 def test_the_cameras_stand_as_they_did_at_the_view_on_the_table(rig):
     later = moved_boards.turned(rig, TURN, SHIFT)
     found = calibrated([(rig, 12), (later, 7)], table_view=14)
@@ -60,6 +62,7 @@ def test_the_cameras_stand_as_they_did_at_the_view_on_the_table(rig):
     assert pair_error(found, later) < 3.0
 
 
+@pytest.mark.statistical
 def test_a_camera_pushed_by_degrees_in_pairs_that_were_not_synchronised(rig):
     later = moved_boards.turned(rig, np.radians([4.0, -1.0, 0.0]), np.array([0.02, 0.0, 0.0]))
     found = calibrated([(rig, 14), (later, 9)], shift=2e-3, turn=2e-3)
@@ -69,6 +72,7 @@ def test_a_camera_pushed_by_degrees_in_pairs_that_were_not_synchronised(rig):
     assert pair_error(found, rig) < 3.0
 
 
+@pytest.mark.statistical
 def test_a_camera_that_was_moved_twice_leaves_three_stretches(rig):
     later = moved_boards.turned(rig, TURN, SHIFT)
     last = moved_boards.turned(later, 10 * TURN[::-1], SHIFT)

@@ -148,6 +148,7 @@ def spoiled(image, how):
     return image
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("how", ["sharpened", "jpeg", "small", "half-tone"])
 def test_spoiled_images_lose_no_corner_and_state_their_error(board_drawer, how):
     board = Board((9, 6), 8e-3)
@@ -204,6 +205,7 @@ def test_other_boards_are_found_in_their_own_order(board_drawer, counts):
     assert_allclose(view.points, truth(board, R, t), atol=0.1)  # squares down to 10 px, and blur of 0.6 px
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("counts", [(8, 6), (9, 5), (10, 6), (9, 7), (6, 4)])
 def test_wrong_counts_are_refused(board_drawer, counts):
     board = Board((9, 6), 8e-3)

@@ -78,6 +78,7 @@ def test_a_finer_grid_holds_splines_of_twice_its_spacing(rng):
     assert_allclose(values[0], values[1], atol=1e-12)
 
 
+@pytest.mark.statistical
 def test_what_varies_within_a_cell_is_found_too(scene_maker, monkeypatch):
     """Waves of a third of the image: a grid of five cells leaves of them what is seen in chi-square."""
     scene = scene_maker(n_views=16)

@@ -88,6 +88,7 @@ def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(sce
         assert min(found.rig.left.fy, found.rig.right.fy) > 0
 
 
+@pytest.mark.statistical
 def test_views_of_one_place_count_once(scene_maker, views):
     once = calibrate_from_corners(*views, BOARD, FLAT)
     thrice = calibrate_from_corners(*[3 * side for side in views], BOARD, FLAT, table_view=14)
@@ -126,6 +127,7 @@ def test_pairs_agree_as_far_as_the_best_of_them_do():
     assert pairs.agrees.tolist() == [True, True, True, True, False]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("zoom", [1.05, 0.95])
 def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_images(scene_maker, zoom):
     scene = scene_maker(n_views=20)

@@ -161,6 +161,7 @@ def test_views_without_a_board_are_left_out_with_the_reason(drawn):
     assert np.isfinite(found.rms_per_view_px[5, 0])
 
 
+@pytest.mark.statistical
 def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
     _, (left, right) = drawn
     blank = np.full_like(left[0], 90)
@@ -197,6 +198,7 @@ def test_exchanged_images_are_found_out(scene_maker, rng, tmp_path):
         calibrate_from_corners(left, right, BOARD, FLAT, table_view=2)
 
 
+@pytest.mark.statistical
 def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=10)
     left, right = corner_views(scene, rng)
@@ -223,6 +225,7 @@ def unsynchronised(scene, rng, step):
     return corner_views(scene, rng)[0], corner_views(replace(scene, model=moved), rng)[1]
 
 
+@pytest.mark.statistical
 def test_pairs_that_were_not_synchronised_are_named_and_others_are_not(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=14)
     found = calibrate_from_corners(*unsynchronised(scene, rng, 0.2e-3), BOARD, FLAT)
@@ -277,6 +280,7 @@ def test_so_few_pairs_that_none_can_judge_another_are_all_used(scene_maker, rng)
     assert not judge_pairs(moved, fit, []).apart
 
 
+@pytest.mark.statistical
 def test_parallel_views_are_warned_of(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=8)
     m = scene.model

@@ -258,6 +258,7 @@ def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_decl
     assert len(searched) == 12
 
 
+@pytest.mark.statistical
 def test_images_of_another_board_are_not_searched_to_the_end(board_drawer, monkeypatch):
     camera, R = Camera(700.0, 700.0, 160.0, 120.0, (0.0,) * 5, (320, 240)), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
     image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((7, 5), 8e-3), rng=np.random.default_rng(1))

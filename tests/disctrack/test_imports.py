@@ -28,6 +28,7 @@ def run(code: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.statistical
 def test_physics_imports_no_image_file_or_plot_library():
     block = "import sys\n" + "".join(f"sys.modules[{name!r}] = None\n" for name in FORBIDDEN)
     done = run(block + "".join(f"import disctrack.{module}\n" for module in PHYSICS))

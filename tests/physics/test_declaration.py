@@ -40,6 +40,7 @@ def honest(true_motion, as_tracked):
     return as_tracked(true_motion(8.0, 0.16, nutation=0.1), np.random.default_rng(4))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
 def test_honest_motions_are_not_contradicted(theta, seconds, k_m, nutation, spin, true_motion, as_tracked):
     motion = true_motion(theta, seconds, k_m, nutation, spin=spin)

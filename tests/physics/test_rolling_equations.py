@@ -94,6 +94,7 @@ def zero(expression):
     return sp.rem(sp.rem(polynomial, S**2 + C**2 - 1, S), S_psi**2 + C_psi**2 - 1, S_psi) == 0
 
 
+@pytest.mark.statistical
 def test_lagrange_gives_the_corrected_equations():
     theta_row, psi_row, phi_row = lagrange_rows()
     assert zero(theta_row - ROWS[0])
@@ -112,6 +113,7 @@ def test_printed_constraint_is_noticed():
     assert not zero(rows[0] - ROWS[0])
 
 
+@pytest.mark.statistical
 def test_printed_angular_momentum_balance_is_noticed():
     rows = newton_euler_rows(omega)  # literal (2.7): rate of the body in place of the frame's
     assert zero(rows[0] - ROWS[0] + J1 * s * phid * psid)

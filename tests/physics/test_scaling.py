@@ -84,6 +84,7 @@ def test_wrong_instant_of_collapse_bends_the_exponent_as_stated(rng):
     assert_allclose(slopes[1] - slopes[0], 4e-3 * fit.n_theta_per_t_f, rtol=0.25)
 
 
+@pytest.mark.statistical
 def test_nutation_does_not_move_the_exponents_of_a_rolling_disc(true_motion):
     """The same disc with and without nutation loses its energy by the same law: n_theta within 0.002."""
     calm = fit_power_laws(*of_motion(true_motion(theta_deg=9, duration=3.0, nutation=0.0)))

@@ -176,6 +176,7 @@ def test_a_file_of_unknown_origin_is_kept(one, recording):
     assert foreign.read_bytes() == b"years of work"
 
 
+@pytest.mark.statistical
 def test_a_full_disk_is_told_and_leaves_nothing_that_looks_whole(one, recording, monkeypatch):
     def full(path, *_, **__):
         raise output_error(path, OSError(28, "No space left on device"))
@@ -189,6 +190,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_that_looks_whole(one, recording,
     assert stage.do(one).status == "measured"
 
 
+@pytest.mark.statistical
 def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, recording, monkeypatch):
     real = stage.measure
 
@@ -214,6 +216,7 @@ def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, 
     assert "recording.toml" in stage.do(one).record.reason
 
 
+@pytest.mark.statistical
 def test_an_unexpected_fault_of_one_is_its_own(recording, tmp_path, monkeypatch):
     root = tmp_path / "day"
     for name in ("a", "b"):
@@ -249,6 +252,7 @@ def test_the_summary_is_that_of_all_shards(recording, tmp_path, in_this_process)
     assert statuses(summary)["c"] == "not measured"
 
 
+@pytest.mark.statistical
 def test_ctrl_c_in_the_diagnosis_of_all_keeps_the_summary_and_its_page_is_named(
     recording, tmp_path, capsys, monkeypatch, in_this_process
 ):
@@ -293,6 +297,7 @@ def test_nothing_to_measure_is_an_error(tmp_path, capsys):
     assert "no recording found" in capsys.readouterr().err
 
 
+@pytest.mark.statistical
 def test_results_may_go_elsewhere_and_the_recordings_stay_as_they_are(recording, tmp_path, in_this_process):
     root, output = tmp_path / "day", tmp_path / "out"
     copy_of(recording, root / "x" / "a")
@@ -330,6 +335,7 @@ def test_without_room_there_is_a_reason_and_nothing_half_written(room, one, reco
     assert [file.name for file in results.iterdir()] == (["batch.json"] if room > 1000 else [])
 
 
+@pytest.mark.statistical
 def test_without_room_for_the_summary_the_results_stay_and_the_line_says_so(recording, capsys, in_this_process):
     assert main(["batch", str(recording), *FAST]) == 0
     summary = recording / "batch_results" / "summary.json"
@@ -362,6 +368,7 @@ def subject_to_permissions():
         assert libc.capset(header, before) == 0
 
 
+@pytest.mark.statistical
 def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(recording, tmp_path, capsys, in_this_process):
     recording.chmod(0o555)
     try:

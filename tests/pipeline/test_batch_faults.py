@@ -295,6 +295,7 @@ def has_workers(address: str, n: int) -> bool:
     return False
 
 
+@pytest.mark.statistical
 @_OF_ANOTHER_PROJECT
 def test_a_dead_address_and_a_missing_extra_are_told_before_anything_is_done(day, monkeypatch, capsys):
     pytest.importorskip("distributed")

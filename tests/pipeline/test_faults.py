@@ -252,6 +252,7 @@ def as_toml(value):
     return f"[{', '.join(map(as_toml, value))}]" if isinstance(value, list | tuple) else repr(value)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n", [12, pytest.param(500, marks=pytest.mark.slow)])
 def test_random_scenes_end_in_a_recording_or_a_sentence(tmp_path, capsys, n):
     """One or two values of a small scene are replaced; what is rendered has its truth in numbers."""

@@ -37,6 +37,7 @@ def linked(folder: Path, to: Path) -> Path:
     return to
 
 
+@pytest.mark.statistical
 def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(sample_clip, tmp_path, capsys):
     folder = linked(sample_clip, tmp_path / "clip")
     declared = tomllib.loads((folder / "recording.toml").read_text())

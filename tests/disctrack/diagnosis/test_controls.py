@@ -20,6 +20,7 @@ def system_of(trajectory, names=None):
     return DiscSystem(trajectory, model, None if names is None else motion_candidates(model, names))
 
 
+@pytest.mark.statistical
 def test_a_wrong_effect_offered_alone_is_refused_by_the_free_run():
     """Drag takes a part of what an unbalanced disc does to the fitted frames, and errs the more in those to come."""
     trajectory = measured({"centre_of_mass.c_1": 3e-5}, seed=9, n=160, declared_rate=500.0)

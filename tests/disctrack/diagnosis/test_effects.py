@@ -139,6 +139,7 @@ def test_false_alarms_are_rare():
     assert alarms <= 2
 
 
+@pytest.mark.statistical
 def test_settings_are_kept_with_the_answer():
     settings = Settings(false_alarm=1e-3, max_effects=1)
     assert diagnose_trajectory(measured(seed=13, n=60), settings=settings).diagnosis.settings == settings

@@ -62,6 +62,7 @@ def test_a_camera_that_turned_does_not_make_the_motion_look_like_rest():
     assert not at_rest(with_noise_of_frames(trajectory)[0], measured_rows).any()
 
 
+@pytest.mark.statistical
 def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
     found = systematic_of(recording()[0])
     assert found.left == pytest.approx(1.0, abs=0.1)  # 200 frames of 18 numbers: 2 %, and what bumps miss

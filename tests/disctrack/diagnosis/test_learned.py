@@ -104,6 +104,7 @@ def test_missing_moment_is_the_hidden_one():
     assert np.sqrt(np.mean((error - error.mean()) ** 2)) < 0.1 * size
 
 
+@pytest.mark.statistical
 def test_in_noise_no_law_is_learned():
     trajectory = measured(seed=8, n=300)
     system = DiscSystem(trajectory, declared_model(trajectory).model)

@@ -11,6 +11,7 @@ from disctrack.validate.diagnoses import HiddenCase, plant
 from tests.oracles.measured_disc import measured
 
 
+@pytest.mark.statistical
 def test_an_exponent_is_measured_along_its_profile():
     trajectory = measured({"rolling_power.k": 4e-4, "rolling_power.p": 1.0}, k_m=0.0, seed=72, n=250, theta_deg=5.0)
     model = declared_model(trajectory, "none").model

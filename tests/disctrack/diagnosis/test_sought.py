@@ -21,6 +21,7 @@ def starts(name, effects, n=150):
     return system.starts(candidate, values)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("angle", [0.4, 3.9])
 def test_the_angle_of_a_flat_is_found_to_half_its_width(angle):
     found = starts("rim_flat", {"rim_flat.depth": 1e-4, "rim_flat.angle": angle})
@@ -29,6 +30,7 @@ def test_the_angle_of_a_flat_is_found_to_half_its_width(angle):
     assert found[0][1] == 0.15  # the width begins at what is usual
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("frequency", [63.7, 140.0])
 def test_the_frequency_of_a_shaken_table_is_found_to_half_a_turn_over_the_recording(frequency):
     """Of the two halves into which noise splits the peak at 63.7 Hz neither is near enough."""

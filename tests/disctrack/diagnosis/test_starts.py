@@ -185,6 +185,7 @@ def test_dots_off_centre_are_not_taken_for_slip():
     assert names
 
 
+@pytest.mark.statistical
 def test_a_disc_that_is_held_and_stopped_is_diagnosed_in_between():
     motion = held_until(0.0301, stopped_at(0.1803, rolling))
     result = diagnose_trajectory(measured(motion=motion, seed=46, n=260))

@@ -48,6 +48,7 @@ def test_what_is_judged_of_a_flight_is_white_and_blind_to_its_own_motion():
     assert_allclose(W @ K @ W.T, np.eye(10), atol=1e-10)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("hidden", "expected"),
     [
@@ -70,6 +71,7 @@ def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hi
         assert abs(found.after.values[key] - value) < 4 * found.after.sigma(key) + 0.02 * abs(value)
 
 
+@pytest.mark.statistical
 def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scale(rng, tmp_path):
     system = CubeTosses(simulated(rng, tmp_path, gravity=9.7))
     found = diagnose(system, {}, SETTINGS, system.training_rows())
@@ -78,6 +80,7 @@ def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scal
     assert {effect.candidate.name} | rivals == {"gravity", "frame_rate"}
 
 
+@pytest.mark.statistical
 def test_a_vertical_that_leans_with_every_toss_is_not_taken_for_one_that_leans_in_the_room(rng, tmp_path):
     system = CubeTosses(simulated(rng, tmp_path, lean=0.01))
     found = diagnose(system, {}, SETTINGS, system.training_rows())

@@ -229,6 +229,7 @@ def test_any_bytes_are_read_or_refused_with_a_message(tmp_path, content):
     _read_or_refuse(write(tmp_path, content))
 
 
+@pytest.mark.statistical
 @_fuzz
 @given(data=st.data())
 def test_any_value_at_any_key_is_read_or_refused_with_a_message(tmp_path, data):

@@ -110,6 +110,7 @@ def markers_world(truth):
     return truth.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + truth.q[:, None, :3]
 
 
+@pytest.mark.statistical
 def test_dots_are_where_the_truth_says_in_every_camera(scene, tmp_path):
     truth = synthetic.write_recording(tmp_path / "r", scene)
     for camera in (0, 1):
@@ -165,6 +166,7 @@ def shift_of_faulty_dots(scene, tmp_path, faults, camera):
     return truth.markers_px[0, camera] - clean.markers_px[0, camera]
 
 
+@pytest.mark.statistical
 def test_delayed_camera_sees_the_disc_later(scene, tmp_path):
     shift = shift_of_faulty_dots(scene, tmp_path, Faults(right_delay_s=1e-3), camera=1)
     truth = synthetic.read_truth(tmp_path / "faulty/truth.h5")
@@ -222,6 +224,7 @@ def test_misprinted_dots_and_pattern_off_centre_shift_together(scene, tmp_path):
     )
 
 
+@pytest.mark.statistical
 def test_hidden_dot_is_paper_and_occluder_is_dark(scene, tmp_path):
     rod = Occluder(camera="right", centre_px=(128.0, 100.0), width_px=10.0, grey=40.0, first_frame=2, last_frame=2)
     faulty = replace(scene, faults=Faults(hidden_markers=(3,), occluders=(rod,)))
@@ -247,6 +250,7 @@ def test_twelve_bits_are_written_as_such(scene, tmp_path):
     assert 190 / 255 * 4095 * 0.9 < np.percentile(image, 99) < 4095
 
 
+@pytest.mark.statistical
 def test_frame_shows_the_pose_of_its_mid_exposure(scene, tmp_path):
     quiet = replace(scene, sensor=SensorSettings(gain_e_per_dn=0.0, read_noise_dn=0.0))
     blurred = replace(quiet, cameras=replace(quiet.cameras, exposure_s=8e-4))

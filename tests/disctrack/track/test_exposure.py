@@ -117,6 +117,7 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     assert np.sqrt(np.mean((by_path - expected) ** 2)) > 0.4 * size  # the mean of the path alone is not what is found
 
 
+@pytest.mark.statistical
 def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs, monkeypatch):
     """At 55 deg of nutation, dots up to 75 deg off their normal; negative control: as circles of the same area."""
     rig, disc, noise = rendered_pairs.rig, rendered_pairs.disc, NoiseModel(4e5, 0.0)

@@ -79,6 +79,7 @@ def test_every_figure_is_drawn_and_not_blank(trajectory, tmp_path, name):
     assert [file.name for file in tmp_path.iterdir()] == [f"{name}.png"]
 
 
+@pytest.mark.statistical
 def test_a_png_file_shows_what_matplotlib_writes_at_the_same_size_on_paper(trajectory, tmp_path):
     figure = plots.coordinates_figure(trajectory)
     figure.savefig(tmp_path / "expected.png", dpi=DPI)

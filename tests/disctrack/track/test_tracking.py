@@ -124,6 +124,7 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     assert np.median(change.max(axis=1)) < 1e-3
 
 
+@pytest.mark.statistical
 def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 4)
     monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
@@ -167,6 +168,7 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     assert len(whole.trajectory) == len(torn.trajectory)
 
 
+@pytest.mark.statistical
 def test_an_empty_scene_is_seldom_searched_and_a_disc_put_there_is_found_at_once(rolling, rendered_pairs, monkeypatch):
     from disctrack.track.follow import following
 

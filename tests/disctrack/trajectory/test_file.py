@@ -227,6 +227,7 @@ def test_findings_are_json_for_every_reader(tmp_path, trajectory):
         }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
 def test_what_was_found_and_chosen_are_plain_attributes_that_a_later_stage_keeps(tmp_path, trajectory, engine):
     xarray = pytest.importorskip("xarray")

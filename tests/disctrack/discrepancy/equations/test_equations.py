@@ -153,6 +153,7 @@ def test_870_samples_and_five_terms_take_seconds():
     assert within(answer, "cubic_spring_x.k", 20.0)
 
 
+@pytest.mark.statistical
 def test_nothing_is_claimed_where_nothing_is():
     x = swinging(lambda x, v: 0.0)
     for seed in range(4):
@@ -425,6 +426,7 @@ def test_what_is_declared_wrongly_is_named(declare, message):
         declare()
 
 
+@pytest.mark.statistical
 def test_the_answer_is_written_as_json_and_as_a_page(with_friction, tmp_path):
     paths = with_friction.write(tmp_path)
     found = json.loads(paths[0].read_text())
@@ -652,6 +654,7 @@ def held_arm(friction, time):
     return solve_ivp(rates, (0, time[-1]), [0.02, 0.0], t_eval=time, rtol=1e-9, atol=1e-12, method="Radau").y[0]
 
 
+@pytest.mark.statistical
 def test_a_friction_that_holds_is_integrated_with_its_sensitivities():
     """The explicit method would take 400 000 steps for each second at rest; the implicit one takes over and back."""
     time = 0.01 * np.arange(1200)
@@ -715,6 +718,7 @@ def test_terms_that_do_not_stand_out_leave_the_fit_that_was_before_them(with_fri
     assert found.nearest.cost == asked.diagnosis.after.cost
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("friction", [True, False])
 def test_a_term_that_only_showed_the_way_is_not_named(rng, monkeypatch, friction):
     """Growing windows lose a motion that the equations follow by themselves, once a term has led to it."""
