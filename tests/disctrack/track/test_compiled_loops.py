@@ -64,6 +64,7 @@ print(bool(told))
 """
 
 
+@pytest.mark.statistical
 def test_of_processes_that_begin_at_once_one_compiles_and_the_others_load(tmp_path):
     file, home = tmp_path / "loop.py", os.path.dirname(os.path.dirname(cli.__file__))
     file.write_text(AT_ONCE)
