@@ -58,7 +58,8 @@ def start(root: Path, *words: str) -> subprocess.Popen:
 
 def heed_interrupts() -> None:
     """As a terminal's processes do: a shell's background jobs, and so tests that are one, ignore them."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for kind in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(kind, signal.SIG_DFL)
 
 
 def wait_until(condition, process=None) -> None:
