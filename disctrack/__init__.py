@@ -25,7 +25,7 @@ Conventions (frames, angles, units, pixels) have one home: the docstring of disc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-# In the order of the measurement: module -> the names it gives; "name=other" where the module calls it otherwise.
+# In the order of the measurement: module -> the names it gives.
 _HOME = {
     "disctrack.recording.declaration": ("read_recording", "Recording"),
     "disctrack.recording.readers": ("open_frames", "FrameReader"),
@@ -50,7 +50,7 @@ _HOME = {
     "disctrack.analyse.derivatives": ("differentiate",),
     "disctrack.analyse.stage": ("run_analyse",),
     "disctrack.analyse.analysis": ("Analysis",),
-    "disctrack.diagnosis.stage": ("run_diagnose", "diagnose=diagnose_trajectory"),
+    "disctrack.diagnosis.stage": ("run_diagnose", "diagnose"),
     "disctrack.batch": ("run_batch",),
     "disctrack.rolling": ("Model", "State", "steady_precession", "simulate"),
     "disctrack.synthetic.simulation": ("run_simulate",),
@@ -58,11 +58,7 @@ _HOME = {
     "disctrack.errors": ("DiscTrackError",),
     "disctrack.files.software": ("__version__",),
 }
-_MODULE_OF = {
-    name.partition("=")[0]: (module, name.partition("=")[2] or name)
-    for module, names in _HOME.items()
-    for name in names
-}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [name for name in _MODULE_OF if name != "__version__"]
 
 if TYPE_CHECKING:
@@ -75,7 +71,7 @@ if TYPE_CHECKING:
     from disctrack.calibrate.stage import calibrate_recording as calibrate_recording
     from disctrack.calibrate.views import calibrate_views as calibrate_views
     from disctrack.calibrate.views import find_views as find_views
-    from disctrack.diagnosis.stage import diagnose_trajectory as diagnose  # noqa: F401
+    from disctrack.diagnosis.stage import diagnose as diagnose
     from disctrack.diagnosis.stage import run_diagnose as run_diagnose
     from disctrack.disc import Disc as Disc
     from disctrack.errors import DiscTrackError as DiscTrackError
@@ -113,8 +109,7 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'disctrack' has no attribute {name!r}")
-    module, attribute = _MODULE_OF[name]
-    return getattr(import_module(module), attribute)
+    return getattr(import_module(_MODULE_OF[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -6,8 +6,8 @@
 
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.stage import DiagnoseOutcome, diagnose_trajectory, run_diagnose
-from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
+from disctrack.diagnosis.stage import DiagnoseOutcome, diagnose, run_diagnose
+from disctrack.discrepancy.search import Diagnosis, Settings
 from disctrack.discrepancy.system import Candidate, Quantity, System
 
 __all__ = [
@@ -20,6 +20,5 @@ __all__ = [
     "Settings",
     "System",
     "diagnose",
-    "diagnose_trajectory",
     "run_diagnose",
 ]

@@ -21,7 +21,7 @@ from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
-from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, diagnose, noise_variance, threshold
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, explain, noise_variance, threshold
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
@@ -94,7 +94,7 @@ def diagnose_motion(
         # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
         rolling = rolling.again(_without_slip(rolling))
         notes = (*stretch.notes, CREEPS)
-        return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=notes)
+        return SlipDiagnosis(rolling, explain(rolling, base.values, settings), notes=notes)
 
 
 def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> SlipDiagnosis:
@@ -108,7 +108,7 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
         if _contact_lies_elsewhere(rolling, base):
             others = rolling.again(_without_slip(rolling))
-            diagnosis, remarks = refine_shapes(others, diagnose(others, base.values, settings))
+            diagnosis, remarks = refine_shapes(others, explain(others, base.values, settings))
             if diagnosis.verdict == "found":
                 return SlipDiagnosis(others, diagnosis, notes=(*stretch.notes, *remarks))
         return _slipping(settings, rolling, base, onset)
@@ -118,7 +118,7 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
         alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
             return _slipping(settings, rolling, base, onset)
-    return SlipDiagnosis(rolling, diagnose(rolling, base.values, settings), notes=stretch.notes)
+    return SlipDiagnosis(rolling, explain(rolling, base.values, settings), notes=stretch.notes)
 
 
 def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
@@ -164,7 +164,7 @@ def _without_slip(system: DiscSystem) -> tuple[Candidate, ...]:
 
 
 def _with_large(assumed: Assumed, settings: Settings) -> SlipDiagnosis:
-    diagnosis = with_large(diagnose(assumed.system, assumed.base.values, settings), assumed)
+    diagnosis = with_large(explain(assumed.system, assumed.base.values, settings), assumed)
     return SlipDiagnosis(assumed.system, diagnosis, notes=(*assumed.system.stretch.notes, in_words(assumed)))
 
 
@@ -186,10 +186,10 @@ def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: Rolling
     system.patience = rolling.patience
     crept: tuple[str, ...] = ()
     try:
-        diagnosis = diagnose(system, system.start(), settings)
+        diagnosis = explain(system, system.start(), settings)
     except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
         system = rolling.again((), starts_in_slip=True)
-        diagnosis, crept = diagnose(system, system.start(), settings), (CREEPS_BESIDE,)
+        diagnosis, crept = explain(system, system.start(), settings), (CREEPS_BESIDE,)
     if not crept and diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
         later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
@@ -219,7 +219,7 @@ def _after_slip(
     except AnalysisError:
         return None
     system.patience = rolling.patience
-    diagnosis = diagnose(system, system.start(), settings)
+    diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained":
         return None
     left = f"chi-square {slipping.after.reduced_chi_square:.3g}" if slipping.after.converged else "no fit"

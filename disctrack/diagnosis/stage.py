@@ -64,7 +64,7 @@ class DiagnoseOutcome(Brief):
 
 
 @one_blas_thread
-def diagnose_trajectory(
+def diagnose(
     trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None, *, separate: bool = True
 ) -> DiscDiagnosis:
     """What does the model lack? Fit, trace, refit, judge.
@@ -465,7 +465,7 @@ def run_diagnose(
     provenance = read_provenance(path)
     trajectory = with_declared_dots(read_trajectory(path), read_findings(path))
     try:
-        result = diagnose_trajectory(trajectory, model)
+        result = diagnose(trajectory, model)
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
     result = with_plan(result) if settle else result

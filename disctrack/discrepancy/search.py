@@ -128,7 +128,7 @@ class Diagnosis(Outline):
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
 
-def diagnose(
+def explain(
     system: System, start: Values, settings: Settings | None = None, rows: Mask | None = None,
     former: Diagnosis | None = None,
 ) -> Diagnosis:  # fmt: skip

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from disctrack.discrepancy.document import document, table
-from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
+from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Values
 from disctrack.discrepancy.words import effect_text
 from disctrack.examples._command import Outcome, command
@@ -53,7 +53,7 @@ class CubeAnswer:
 def analyse_tosses(tosses: Sequence[Toss]) -> CubeAnswer:
     """Diagnose, and measure errors on held-out tosses. Raises AnalysisError."""
     system = CubeTosses(tosses)
-    diagnosis = diagnose(system, {}, SETTINGS, system.training_rows())
+    diagnosis = explain(system, {}, SETTINGS, system.training_rows())
     held = diagnosis.held_out_after
     return CubeAnswer(system, diagnosis, errors_of(system, {}), errors_of(system, held.train.values if held else {}))
 

@@ -22,7 +22,7 @@ from disctrack.analyse.published import PREDICTED
 from disctrack.discrepancy.document import document, table
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
-from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
+from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.words import quantity_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_system import ExponentSystem, published_series
@@ -115,7 +115,7 @@ def _named(diagnosis: Diagnosis) -> list[str]:
 
 def examine(system: ExponentSystem) -> Answer:
     """Diagnosis of the trials, and everything that is said beside it; ASKED must be among the system's candidates."""
-    diagnosis = diagnose(system, system.start, SETTINGS)
+    diagnosis = explain(system, system.start, SETTINGS)
     return Answer(
         diagnosis,
         tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series),

@@ -11,7 +11,7 @@ from time import perf_counter
 import numpy as np
 from scipy import stats
 
-from disctrack.diagnosis import DiscDiagnosis, diagnose_trajectory
+from disctrack.diagnosis import DiscDiagnosis, diagnose
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.significance import wald
 from disctrack.errors import DiscTrackError
@@ -110,7 +110,7 @@ def hide(case: HiddenCase) -> Verdict:
     """Plant, diagnose, compare."""
     parts, trajectory = plant(case)
     began = perf_counter()
-    result = diagnose_trajectory(trajectory, separate=False)
+    result = diagnose(trajectory, separate=False)
     seconds = perf_counter() - began
     pulls = [_pull_of(result, p) for p in parts]
     d, nan = result.diagnosis, float("nan")

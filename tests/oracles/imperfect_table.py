@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from disctrack.cli import main as disctrack_cli
-from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.trajectory.file import read_findings, read_trajectory
 from tests.oracles import imperfect_laboratory as laboratory
@@ -98,7 +98,7 @@ def row_of(name, effect, trajectory, findings, R, t):
     """Errors of a trajectory, and its diagnosis."""
     error, variance = point_laboratory.errors_and_variances(trajectory, R, t)
     began = time.process_time()
-    result = diagnose_trajectory(with_declared_dots(trajectory, findings), separate=False)
+    result = diagnose(with_declared_dots(trajectory, findings), separate=False)
     seconds = time.process_time() - began
     claims, faults, fit = {}, [], result.after_fit
     if result.learned is not None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.left_over import left_over
 from disctrack.rolling import Model
@@ -35,7 +35,7 @@ def trial(name: str, seed: int) -> dict:
     """Diagnose, and compare with the truth."""
     made = recording(name, seed)
     began = time.process_time()
-    result = diagnose_trajectory(made.trajectory, separate=False)
+    result = diagnose(made.trajectory, separate=False)
     seconds = time.process_time() - began
     left = left_over(result.system, result.after_fit, result.diagnosis.noise) if result.after else None
     said = result.sentence

@@ -218,7 +218,7 @@ def test_other_corners_than_declared_are_named_once_for_all_views(short_recordin
     shutil.copy(short_recording / "recording.toml", tmp_path)
     edit(tmp_path, "[9, 6]", "[10, 7]")
     message = failure(capsys, "calibrate", tmp_path)
-    assert message.count("no board of 10 x 7") == 1
+    assert message.count("a board of 10 x 7 inner corners is not in it") == 1
     assert "inner_corners = [9, 6]" in message
 
 

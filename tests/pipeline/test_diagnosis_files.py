@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disctrack.cli import main
-from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.free_runs import evidence, force_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import simulate_scene
@@ -68,7 +68,7 @@ def test_group_holds_the_moment_and_force_that_were_missing(diagnosed):
 @pytest.mark.statistical
 def test_what_was_found_supplies_the_missing_force(diagnosed):
     """Two routes: accelerations of the poses without a model, and the force of the enlarged model."""
-    result = diagnose_trajectory(read_trajectory(diagnosed[0]), separate=False)
+    result = diagnose(read_trajectory(diagnosed[0]), separate=False)
     beside = evidence(result)
     added = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
     missing = beside.measured.force - force_of(result.system, result.diagnosis.before)

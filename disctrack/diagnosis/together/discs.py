@@ -34,7 +34,7 @@ def diagnose_together(
 ) -> DiscsTogether:
     """What does the model lack, of all recordings together?
 
-    model : as `diagnose_trajectory`
+    model : as `diagnose`
     unread : further recordings that are reported as left out, and why
     processes : among which the recordings are dealt out; the answer does not depend on their number
     settle : also compute which further recording would settle what is left open

@@ -38,7 +38,7 @@ from disctrack.discrepancy.search import (
     Rival,
     Settings,
     Tried,
-    diagnose,
+    explain,
 )
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.significance import wald
@@ -224,13 +224,13 @@ def _searched(
     if scans:  # each value that was looked at is a chance more
         share = len(system.candidates) / (len(system.candidates) + scans)
         settings = replace(settings, false_alarm=settings.false_alarm * share)
-    diagnosis = diagnose(system, values, settings, system.training)
+    diagnosis = explain(system, values, settings, system.training)
     if (anew := _led_with_terms(system, diagnosis)) is not None:
-        diagnosis = diagnose(system, diagnosis.before.values, settings, system.training, anew)
+        diagnosis = explain(system, diagnosis.before.values, settings, system.training, anew)
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
-    return sharper, diagnose(sharper, diagnosis.before.values, settings, sharper.training, diagnosis)
+    return sharper, explain(sharper, diagnosis.before.values, settings, sharper.training, diagnosis)
 
 
 def _led_with_terms(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis | None:
@@ -546,7 +546,7 @@ def _with_memory(
     noise = float(share * size**2)
     scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
     known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
-    again = diagnose(remembering, base.values, known, system.training, diagnosis)
+    again = explain(remembering, base.values, known, system.training, diagnosis)
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or remembering), coefficients, text

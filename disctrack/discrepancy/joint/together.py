@@ -22,7 +22,7 @@ from disctrack.discrepancy.joint.fitting_in import Blocks, FitsIn, apart
 from disctrack.discrepancy.joint.joint_system import JointSystem
 from disctrack.discrepancy.joint.sharing import EACH, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, cleared, score_all, span
-from disctrack.discrepancy.search import Diagnosis, Settings, diagnose
+from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
@@ -168,7 +168,7 @@ def _search(
     progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
     n = len(members)
     training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0
-    return system, _without_variants(diagnose(system, sharing.start(), settings, training))
+    return system, _without_variants(explain(system, sharing.start(), settings, training))
 
 
 def _without_variants(diagnosis: Diagnosis) -> Diagnosis:

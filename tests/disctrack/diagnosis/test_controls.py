@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose
+from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.row_noise import common_modes
 from disctrack.discrepancy.score import Linearisation, score_all
+from disctrack.discrepancy.search import explain
 from tests.disctrack.discrepancy.test_search import START, Oscillator, oscillator
 from tests.oracles.measured_disc import measured
 
@@ -24,7 +25,7 @@ def system_of(trajectory, names=None):
 def test_a_wrong_effect_offered_alone_is_refused_by_the_free_run():
     """Drag takes a part of what an unbalanced disc does to the fitted frames, and errs the more in those to come."""
     trajectory = measured({"centre_of_mass.c_1": 3e-5}, seed=9, n=160, declared_rate=500.0)
-    answer = diagnose(system := system_of(trajectory, ["drag_rotation"]), system.start())
+    answer = explain(system := system_of(trajectory, ["drag_rotation"]), system.start())
     assert answer.found == ()
     assert answer.verdict == "unexplained"
     (drag,) = answer.tried
@@ -32,7 +33,7 @@ def test_a_wrong_effect_offered_alone_is_refused_by_the_free_run():
     assert drag.gain > 16
     assert drag.held_out_gain < -30
     assert drag.reason == "the free run over held-out data does not improve"
-    right = diagnose(system := system_of(trajectory, ["drag_rotation", "centre_of_mass"]), system.start())
+    right = explain(system := system_of(trajectory, ["drag_rotation", "centre_of_mass"]), system.start())
     assert [f.candidate.name for f in right.found] == ["centre_of_mass"]
 
 
@@ -47,7 +48,7 @@ def test_a_shuffled_residual_of_the_disc_gives_no_finding():
     residual = system.observed - system.pixels(base.values, with_nuisances=True)
     order = np.random.default_rng(3).permutation(len(residual))
     shuffled = replace(trajectory, markers_px=system.pixels(base.values) + residual[order])
-    answer = diagnose(system_of(shuffled), base.values)
+    answer = explain(system_of(shuffled), base.values)
     assert answer.found == ()
 
 
@@ -65,7 +66,7 @@ def test_a_camera_that_shakes_is_no_effect_of_the_motion():
     assert variances == pytest.approx([68, 68], rel=0.35)
     right = np.repeat([False, True], 12)
     assert np.abs(vectors[~right]).max() < 0.1
-    assert diagnose(system, base.values).found == ()
+    assert explain(system, base.values).found == ()
 
 
 def test_independent_noise_has_no_common_modes():
@@ -78,13 +79,13 @@ def test_before_the_base_fit_has_converged_nothing_is_attributed():
     """From a start whose motion ends before the recording there is no fit; from the measured poses there is."""
     system = system_of(measured({"table_tilt.tilt_x": 5e-4}, seed=11, n=100, declared_rate=500.0))
     good = system.start()
-    answer = diagnose(system, good | {"state.theta": np.radians(0.3), "state.omega2": 0.0})
+    answer = explain(system, good | {"state.theta": np.radians(0.3), "state.omega2": 0.0})
     assert not answer.before.converged
     assert answer.verdict == "unexplained"
     assert answer.found == answer.tried == ()
     assert answer.held_out_before is None
     assert "has not converged" in answer.reason
-    assert [f.candidate.name for f in diagnose(system, good).found] == ["table_tilt"]
+    assert [f.candidate.name for f in explain(system, good).found] == ["table_tilt"]
 
 
 class Misled(Oscillator):
@@ -99,7 +100,7 @@ class Misled(Oscillator):
 def test_a_fit_that_stopped_on_its_way_attributes_nothing_although_candidates_would_gain(rng):
     right = oscillator(rng)
     system = Misled(right.observed, right.time)
-    answer = diagnose(system, START)
+    answer = explain(system, START)
     assert answer.verdict == "unexplained"
     assert answer.found == ()
     # the temptation is there: where the fit has stopped, the first order promises a gain far above what noise reaches

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, Settings, diagnose, diagnose_trajectory
+from disctrack.diagnosis import DiscSystem, Settings, diagnose
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.search import explain
 from disctrack.rolling import CATALOGUE
 from disctrack.synthetic.description import CameraFault, Faults
 from tests.oracles.measured_disc import measured
@@ -43,7 +44,7 @@ ALWAYS = {"table tilt 0.35 deg", "centre of mass 0.1 mm off", "right camera 0.25
 def test_a_hidden_effect_is_found_named_and_sized(name):
     planted, faults, names = HIDDEN[name]
     effects = {k: v for k, v in planted.items() if k.partition(".")[0] in CATALOGUE}
-    result = diagnose_trajectory(measured(effects, faults=faults, seed=len(name), n=300))
+    result = diagnose(measured(effects, faults=faults, seed=len(name), n=300))
     found = result.diagnosis.found
     assert result.diagnosis.verdict == "found", result.sentence
     assert found[0].candidate.name in names
@@ -61,7 +62,7 @@ def test_a_hidden_effect_is_found_named_and_sized(name):
 
 @pytest.mark.statistical
 def test_nothing_is_found_where_nothing_is_hidden():
-    result = diagnose_trajectory(measured(seed=4))
+    result = diagnose(measured(seed=4))
     assert result.diagnosis.verdict == "nothing missing"
     assert not result.diagnosis.found
     # 12 000 numbers: reduced chi-square 1 +- 0.013
@@ -74,9 +75,9 @@ def test_nothing_is_found_where_nothing_is_hidden():
 def test_a_thickness_within_its_tolerance_is_no_effect():
     """0.03 mm off in height, 2 sigma of what a caliper may err by and 20 of a micrometer's."""
     trajectory = measured({"contact_height.h_error": 3e-5}, seed=8, n=200, declared_rate=500.0)
-    assert diagnose_trajectory(trajectory, separate=False).diagnosis.verdict == "found"
+    assert diagnose(trajectory, separate=False).diagnosis.verdict == "found"
     disc = replace(trajectory.disc, thickness_tolerance=3e-5)
-    result = diagnose_trajectory(replace(trajectory, disc=disc), separate=False)
+    result = diagnose(replace(trajectory, disc=disc), separate=False)
     assert result.diagnosis.verdict == "nothing missing"
     after = result.diagnosis.after
     assert abs(after.values["contact_height.h_error"] - 3e-5) < 4 * after.sigma("contact_height.h_error") < 3e-5
@@ -85,7 +86,7 @@ def test_a_thickness_within_its_tolerance_is_no_effect():
 @pytest.mark.statistical
 def test_two_effects_are_found_together():
     hidden = {"table_tilt.tilt_x": 0.002, "kz.k_z": 2e-5}
-    result = diagnose_trajectory(measured(hidden, seed=6, n=250, declared_rate=500.0))
+    result = diagnose(measured(hidden, seed=6, n=250, declared_rate=500.0))
     assert {f.candidate.name for f in result.diagnosis.found} == {"table_tilt", "kz"}
     assert result.learned is None  # two named effects beat a law without a name
     for key, value in hidden.items():
@@ -95,7 +96,7 @@ def test_two_effects_are_found_together():
 @pytest.mark.statistical
 def test_a_camera_that_turned_is_told_from_an_effect_of_the_motion():
     turned = Faults(right=CameraFault(rotation_deg=(0.02, 0.0, 0.0)))
-    result = diagnose_trajectory(measured(faults=turned, seed=8, n=250, declared_rate=500.0))
+    result = diagnose(measured(faults=turned, seed=8, n=250, declared_rate=500.0))
     (found,) = result.diagnosis.found
     assert found.candidate.kind == "measurement"
     names = {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
@@ -106,7 +107,7 @@ def test_a_wrong_effect_offered_alone_is_refused():
     trajectory = measured({"table_tilt.tilt_x": 0.002}, seed=9)
     model = declared_model(trajectory).model
     system = system_of(trajectory, candidates=motion_candidates(model, ["air_quadratic"]))
-    answer = diagnose(system, system.start())
+    answer = explain(system, system.start())
     assert answer.verdict == "unexplained"
     assert not answer.found
     assert [c.name for c in answer.partial] in ([], ["air_quadratic"])
@@ -135,35 +136,35 @@ def test_derivatives_agree_with_differences_of_the_prediction():
 @pytest.mark.slow
 def test_false_alarms_are_rare():
     """Of 40 recordings with nothing hidden at most 2 may be found to lack something (one in 20)."""
-    alarms = sum(bool(diagnose_trajectory(measured(seed=1000 + i, n=400)).diagnosis.found) for i in range(40))
+    alarms = sum(bool(diagnose(measured(seed=1000 + i, n=400)).diagnosis.found) for i in range(40))
     assert alarms <= 2
 
 
 @pytest.mark.statistical
 def test_settings_are_kept_with_the_answer():
     settings = Settings(false_alarm=1e-3, max_effects=1)
-    assert diagnose_trajectory(measured(seed=13, n=60), settings=settings).diagnosis.settings == settings
+    assert diagnose(measured(seed=13, n=60), settings=settings).diagnosis.settings == settings
 
 
 @pytest.mark.slow
 def test_the_recording_proposed_to_separate_two_effects_separates_them():
     """Viscous contour friction at 14 deg looks like the air; the proposed recording, once made, tells them apart."""
     hidden = {"contour_viscous.c": 1e-5}
-    first = diagnose_trajectory(measured(hidden, seed=100, n=600))
+    first = diagnose(measured(hidden, seed=100, n=600))
     (found,) = first.diagnosis.found
     name = found.candidate.name
     assert name == "contour_viscous" or first.separated_by[name]["contour_viscous"] is not None
     plans = [p for p in first.separated_by[name].values() if p is not None and p.sigmas > 5]
     plan = max(plans, key=lambda p: p.sigmas)
     second = measured(hidden, seed=101, n=900, theta_deg=plan.theta_deg, omega3=plan.omega3, nutation_deg=0.4)
-    again = diagnose_trajectory(second)
+    again = diagnose(second)
     assert [f.candidate.name for f in again.diagnosis.found] == ["contour_viscous"]
     assert not again.diagnosis.found[0].cannot_be_told_from
 
 
 @pytest.mark.statistical
 def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
-    result = diagnose_trajectory(measured(faults=Faults(frame_rate_hz=1004.0), seed=14, n=300))
+    result = diagnose(measured(faults=Faults(frame_rate_hz=1004.0), seed=14, n=300))
     (found,) = result.diagnosis.found
     (plan,) = result.separated_by[found.candidate.name].values()
     assert plan.sigmas < 0.01  # all laws at hand are quadratic in the rates: time can be stretched
@@ -172,7 +173,7 @@ def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
 @pytest.mark.slow
 def test_slip_is_found_by_the_friction_at_which_it_sets_in():
     """Slip has no derivative where the disc does not slip yet: it is fitted from where it would begin."""
-    result = diagnose_trajectory(measured({"slip.mu": 0.1}, seed=100, n=300, theta_deg=20.0))
+    result = diagnose(measured({"slip.mu": 0.1}, seed=100, n=300, theta_deg=20.0))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip"]
     mu = as_json(result)["effects"][0]["parameters"][0]
     assert mu["name"] == "mu"

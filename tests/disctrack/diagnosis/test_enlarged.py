@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import rotation_from_vector
-from disctrack.diagnosis import DiscSystem, diagnose_trajectory
+from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.faults import measurement_candidates, predict
 from disctrack.diagnosis.model_file import declared_model, model_toml
 from disctrack.diagnosis.motion_start import first_state
@@ -86,7 +86,7 @@ def test_a_saved_model_looks_at_the_disc_as_the_cameras_did(short, tmp_path):
 )
 def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_path):
     """Found, saved, simulated anew with other noise, diagnosed against the saved model."""
-    first = diagnose_trajectory(measured(faults=faults, seed=62, n=150))
+    first = diagnose(measured(faults=faults, seed=62, n=150))
     (found,) = first.diagnosis.found
     assert name in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
     path = saved(first.system, first.after_fit.values, tmp_path)
@@ -95,8 +95,8 @@ def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_pat
     again = measured(
         faults=scene.faults, seed=63, n=150, motion=lambda t: simulate(model, start, times=np.r_[0.0, t]).q[1:]
     )
-    assert diagnose_trajectory(again).diagnosis.verdict == "found"  # it is there ...
-    second = diagnose_trajectory(again, str(path))
+    assert diagnose(again).diagnosis.verdict == "found"  # it is there ...
+    second = diagnose(again, str(path))
     assert second.diagnosis.verdict == "nothing missing", second.sentence  # ... and known
 
 
@@ -105,13 +105,13 @@ def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
     from tests.disctrack.diagnosis.test_starts import sliding
 
     trajectory = measured(motion=sliding(0.2, (0.08, 0.04)), seed=64, n=120)
-    first = diagnose_trajectory(trajectory)
+    first = diagnose(trajectory)
     path = saved(first.system, first.after_fit.values, tmp_path)
     scene = load_scene(path)
     motion = simulate(rolling_model(scene), rolling_start(scene), 0.1)
     # noise 0.5 um a frame, some um from the rig
     assert np.abs(motion.q[:100, :3] - trajectory.q[:100, :3]).max() < 2e-5
-    second = diagnose_trajectory(trajectory, str(path))
+    second = diagnose(trajectory, str(path))
     assert second.diagnosis.verdict == "nothing missing", second.sentence
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import DiscSystem, diagnose_trajectory
+from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.left_over import LeftOver
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stage import _doubtful
@@ -79,7 +79,7 @@ def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
 @pytest.mark.statistical
 def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
     trajectory, _ = recording(seed=5)
-    result = diagnose_trajectory(trajectory, separate=False)
+    result = diagnose(trajectory, separate=False)
     assert result.diagnosis.verdict != "unexplained"
     assert all(f.candidate.kind == "measurement" for f in result.diagnosis.found)
     assert result.sentence.startswith("Nothing")
@@ -89,7 +89,7 @@ def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
 @pytest.mark.slow
 def test_what_is_planted_in_an_imperfect_laboratory_is_named_and_sized():
     trajectory, _ = recording({"kz.k_z": 3e-5}, seed=6)
-    result = diagnose_trajectory(trajectory, separate=False)
+    result = diagnose(trajectory, separate=False)
     assert [f.candidate.name for f in result.diagnosis.found if f.candidate.kind == "motion"] == ["kz"]
     after = result.diagnosis.after
     assert abs(after.values["kz.k_z"] - 3e-5) < 3 * after.sigma("kz.k_z")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import diagnose_trajectory
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.faults import setup_of
 from disctrack.diagnosis.large_faults import in_step, poses_with, rig_as_it_is
 from disctrack.synthetic import rig_of
@@ -45,7 +45,7 @@ def test_poses_with_the_fault_agree_again():
 
 @pytest.mark.statistical
 def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
-    result = diagnose_trajectory(measured(faults=Faults(frame_rate_hz=2000.0), seed=1, n=200), separate=False)
+    result = diagnose(measured(faults=Faults(frame_rate_hz=2000.0), seed=1, n=200), separate=False)
     (found,) = result.diagnosis.found
     assert found.candidate.name == "frame_rate"
     after = result.diagnosis.after
@@ -64,7 +64,7 @@ def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
 )
 def test_large_faults_are_named_and_sized_in_an_imperfect_laboratory(faults, truth):
     """1 deg, 2 mm, three frames; the fields of the lenses reach 0.02 px rms, and sigmas contain them."""
-    result = diagnose_trajectory(recording(faults=faults, seed=1)[0], separate=False)
+    result = diagnose(recording(faults=faults, seed=1)[0], separate=False)
     found = [f.candidate for f in result.diagnosis.found]
     assert all(c.kind == "measurement" for c in found)
     assert any(set(truth) <= set(c.names) for c in found)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose_trajectory, stage
+from disctrack.diagnosis import DiscSystem, diagnose, stage
 from disctrack.diagnosis.law_library import Family, families
 from disctrack.diagnosis.learned_law import (
     GainOfFamily,
@@ -47,7 +47,7 @@ def hiding(name: str, component: str, formula: str, size: float, **options):
 )
 def test_an_effect_in_no_catalogue_is_described_by_a_learned_law(name, component, formula, size, locked):
     trajectory = hiding(name, component, formula, size, seed=5, n=450, omega3=2.0)
-    result = diagnose_trajectory(trajectory, separate=False)
+    result = diagnose(trajectory, separate=False)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
     assert set(result.learned.law.formulas) == {component}
@@ -230,7 +230,7 @@ def test_a_law_that_a_found_effect_describes_alone_is_that_effect(monkeypatch, a
     )
     if not asked:
         monkeypatch.setattr(stage, "_one_alone_does", lambda *_: False)
-    result = diagnose_trajectory(made, separate=False)
+    result = diagnose(made, separate=False)
     assert (result.learned is None) == asked
     assert [found.candidate.name for found in result.diagnosis.found] == ["table_tilt", "frame_rate"][1 - asked :]
     assert result.after.reduced_chi_square < 1.05
@@ -248,7 +248,7 @@ def test_a_law_that_describes_no_more_than_a_known_effect_is_told_beside_it(monk
     """
     monkeypatch.setattr(stage, "ALIKE", credit)
     options = {"nutation_deg": 0.5, "n": 150, "theta_deg": 10.0, "omega3": 1.0, "declared_rate": 500.0}
-    result = diagnose_trajectory(measured({"spring.k": 0.05}, seed=11, rig_seed=5, **options), separate=False)
+    result = diagnose(measured({"spring.k": 0.05}, seed=11, rig_seed=5, **options), separate=False)
     assert (result.learned is None) == bool(credit)
     if credit:
         (found,) = result.diagnosis.found

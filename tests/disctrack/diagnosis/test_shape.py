@@ -2,10 +2,11 @@
 
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose, diagnose_trajectory
+from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.search import explain
 from disctrack.discrepancy.shape import profiled, refine_shapes
 from disctrack.validate.diagnoses import HiddenCase, plant
 from tests.oracles.measured_disc import measured
@@ -30,7 +31,7 @@ def test_an_exponent_that_cannot_be_seen_is_said_to_be_assumed():
     trajectory = measured({"rolling_power.k": 2e-4}, seed=74, n=200)
     model = declared_model(trajectory).model
     system = DiscSystem(trajectory, model, motion_candidates(model, ["rolling_power"]))
-    answer, notes = refine_shapes(system, diagnose(system, system.start()))
+    answer, notes = refine_shapes(system, explain(system, system.start()))
     assert [f.candidate.name for f in answer.found] == ["rolling_power"]
     assert "rolling_power.p" not in answer.after.names
     (note,) = notes
@@ -41,7 +42,7 @@ def test_an_exponent_that_cannot_be_seen_is_said_to_be_assumed():
 def test_a_law_beyond_the_declared_one_is_found_by_its_exponent():
     """With p = 2.8 beside the k_m of p = 2 the law at its nominal p = 1.5 would have to be negative."""
     hidden = {"rolling_power.k": 1.5e-4, "rolling_power.p": 2.8}
-    result = diagnose_trajectory(measured(hidden, seed=71, n=400, theta_deg=8.0))
+    result = diagnose(measured(hidden, seed=71, n=400, theta_deg=8.0))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "rolling_power"
     fit_ = result.after_fit
@@ -53,7 +54,7 @@ def test_a_law_beyond_the_declared_one_is_found_by_its_exponent():
 @pytest.mark.slow
 def test_the_pivoting_rate_at_which_creep_begins_is_measured():
     hidden = {"pivoting_contensou.k": 6e-5, "pivoting_contensou.omega_s": 4.0}
-    result = diagnose_trajectory(measured(hidden, seed=74, n=400))
+    result = diagnose(measured(hidden, seed=74, n=400))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "pivoting_contensou"
     fit_ = result.after_fit
@@ -70,7 +71,7 @@ def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
 
     def found(*names):
         system = DiscSystem(trajectory, model, tuple(every[name] for name in names))
-        diagnosis = diagnose(system, system.start())
+        diagnosis = explain(system, system.start())
         assert {f.candidate.name for f in diagnosis.found} == {"right_distortion", "inertia_product"}
         return refine_shapes(system, diagnosis)[0]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import diagnose_trajectory, slip_start
+from disctrack.diagnosis import diagnose, slip_start
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.diagnosis.stretch import free_stretch
@@ -85,7 +85,7 @@ def assert_nothing_is_claimed(result):
 @pytest.mark.statistical
 def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
     motion, n = sliding(0.2, (0.08, 0.04)), 220
-    result = diagnose_trajectory(measured(motion=motion, seed=41, n=n))
+    result = diagnose(measured(motion=motion, seed=41, n=n))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     (effect,) = as_json(result)["effects"]
     mu = effect["parameters"][0]
@@ -105,7 +105,7 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
     """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within 1e6 steps."""
     trajectory = measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0)
     began = time.process_time()
-    result = diagnose_trajectory(trajectory, separate=False)
+    result = diagnose(trajectory, separate=False)
     assert time.process_time() - began < 60.0  # 3 and 13 s were measured
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     assert result.after.reduced_chi_square < 1.03 < 1000 < result.before.reduced_chi_square
@@ -125,7 +125,7 @@ def test_what_rolls_at_first_does_not_begin_in_slip(effects):
 
 @pytest.mark.statistical
 def test_slip_to_the_end_of_the_recording_is_found_too():
-    result = diagnose_trajectory(measured(motion=sliding(0.2, (0.2, 0.1)), seed=42, n=70))
+    result = diagnose(measured(motion=sliding(0.2, (0.2, 0.1)), seed=42, n=70))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     assert any("to the end of the recording" in text for text in result.notes)
 
@@ -133,7 +133,7 @@ def test_slip_to_the_end_of_the_recording_is_found_too():
 @pytest.mark.slow
 def test_an_effect_is_found_behind_slip_at_the_start():
     motion = sliding(0.2, (0.1, 0.1), {"kz.k_z": 6e-5})
-    result = diagnose_trajectory(measured(motion=motion, seed=43, n=400))
+    result = diagnose(measured(motion=motion, seed=43, n=400))
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start", "kz"]
     fit = result.after_fit
     assert abs(fit.values["kz.k_z"] - 6e-5) < 4 * fit.sigma("kz.k_z")
@@ -143,7 +143,7 @@ def test_an_effect_is_found_behind_slip_at_the_start():
 @pytest.mark.slow
 def test_slip_alone_is_an_answer_where_effects_beside_it_take_too_long(monkeypatch):
     monkeypatch.setattr(slip_start, "MOST_SLIP_STEPS", 5)  # a frame
-    result = diagnose_trajectory(measured(motion=sliding(0.2, (0.08, 0.04)), seed=41, n=220))
+    result = diagnose(measured(motion=sliding(0.2, (0.08, 0.04)), seed=41, n=220))
     assert [found.candidate.name for found in result.diagnosis.found] == ["slip_start"]
     assert result.after.reduced_chi_square < 0.1 * result.before.reduced_chi_square
     assert slip_start.CREEPS_BESIDE in result.notes
@@ -170,7 +170,7 @@ def test_slip_that_no_coefficient_describes_is_left_out_and_said_so():
             q[late] = simulate(stronger, State(*slow.tolist()), times=np.r_[half, times[late]]).q[1:]
         return q
 
-    result = diagnose_trajectory(measured(motion=falling, seed=44, n=400))
+    result = diagnose(measured(motion=falling, seed=44, n=400))
     assert_nothing_is_claimed(result)
     assert any("no coefficient of friction describes that" in text for text in result.notes)
     assert result.system.rows.start > 50
@@ -179,7 +179,7 @@ def test_slip_that_no_coefficient_describes_is_left_out_and_said_so():
 @pytest.mark.statistical
 def test_dots_off_centre_are_not_taken_for_slip():
     """They give the contact a velocity all the time: pattern_offset or its class, not slip."""
-    result = diagnose_trajectory(measured(faults=Faults(pattern_offset_mm=(1.0, 0.0)), seed=45, n=150))
+    result = diagnose(measured(faults=Faults(pattern_offset_mm=(1.0, 0.0)), seed=45, n=150))
     names = {f.candidate.name for f in result.diagnosis.found}
     assert "slip_start" not in names
     assert names
@@ -188,7 +188,7 @@ def test_dots_off_centre_are_not_taken_for_slip():
 @pytest.mark.statistical
 def test_a_disc_that_is_held_and_stopped_is_diagnosed_in_between():
     motion = held_until(0.0301, stopped_at(0.1803, rolling))
-    result = diagnose_trajectory(measured(motion=motion, seed=46, n=260))
+    result = diagnose(measured(motion=motion, seed=46, n=260))
     assert_nothing_is_claimed(result)
     rows = result.system.rows
     # frames are taken 2 ms late; nothing within 5 ms of the hand
@@ -205,7 +205,7 @@ def test_a_disc_that_lies_flat_at_the_end_is_diagnosed_before_that():
         q[: len(down)] = down
         return q
 
-    result = diagnose_trajectory(measured(motion=lying, seed=47, n=200))
+    result = diagnose(measured(motion=lying, seed=47, n=200))
     assert_nothing_is_claimed(result)
     assert any("lies flat" in text for text in result.notes)
 
@@ -215,20 +215,20 @@ def test_a_disc_that_lies_flat_at_the_end_is_diagnosed_before_that():
     "frames", [np.arange(60, 120), np.arange(3, 40), np.flatnonzero(np.arange(200) % 3)], ids=["gap", "early", "many"]
 )
 def test_lost_frames_claim_nothing(frames):
-    result = diagnose_trajectory(lost(measured(seed=48, n=200), frames))
+    result = diagnose(lost(measured(seed=48, n=200), frames))
     assert_nothing_is_claimed(result)
     assert any("no pose" in text or "cut off" in text for text in result.notes)
 
 
 @pytest.mark.statistical
 def test_one_camera_for_a_while_claims_nothing():
-    assert_nothing_is_claimed(diagnose_trajectory(lost(measured(seed=49, n=150), np.arange(40, 110), camera=0)))
+    assert_nothing_is_claimed(diagnose(lost(measured(seed=49, n=150), np.arange(40, 110), camera=0)))
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("n", [45, 70, 100])
 def test_short_recordings_claim_nothing(n):
-    assert_nothing_is_claimed(diagnose_trajectory(measured(seed=50 + n, n=n)))
+    assert_nothing_is_claimed(diagnose(measured(seed=50 + n, n=n)))
 
 
 def test_a_disc_without_a_motion_is_an_error_that_says_what_it_does():

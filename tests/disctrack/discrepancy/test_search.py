@@ -15,7 +15,7 @@ from calibration.kit.least_squares import solve_bounded, triangle
 from disctrack.discrepancy.fit import compress, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
-from disctrack.discrepancy.search import Settings, _Search, diagnose, length
+from disctrack.discrepancy.search import Settings, _Search, explain, length
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp
 from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 
@@ -125,7 +125,7 @@ def test_score_of_an_effect_beyond_its_tolerance_equals_its_refit(rng):
 
 @pytest.mark.parametrize(("tolerance", "verdict"), [(0.01, "nothing missing"), (1e-4, "found")])
 def test_an_effect_within_its_tolerance_is_not_claimed(rng, tolerance, verdict):
-    answer = diagnose(with_tolerance(oscillator(rng, {"drift": 0.01}), tolerance), START)
+    answer = explain(with_tolerance(oscillator(rng, {"drift": 0.01}), tolerance), START)
     assert answer.verdict == verdict
     if answer.found:  # freed, it is as well known as if nothing had been declared
         assert answer.after.sigma("drift") < 1e-3
@@ -145,7 +145,7 @@ def test_twins_enclose_no_angle_and_strangers_a_right_one(rng):
     [({"d": 0.02}, {"damping"}), ({"drift": 0.01}, {"drift", "twin"}), ({"hum_c": 0.005, "hum_s": -0.004}, {"hum"})],
 )
 def test_a_hidden_effect_is_named_with_all_that_cannot_be_told_from_it(rng, hidden, names):
-    answer = diagnose(oscillator(rng, hidden), START)
+    answer = explain(oscillator(rng, hidden), START)
     assert answer.verdict == "found"
     (found,) = answer.found
     assert {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)} == names
@@ -154,13 +154,13 @@ def test_a_hidden_effect_is_named_with_all_that_cannot_be_told_from_it(rng, hidd
 
 
 def test_two_hidden_effects_are_both_named(rng):
-    answer = diagnose(oscillator(rng, {"d": 0.02, "hum_c": 0.01}), START)
+    answer = explain(oscillator(rng, {"d": 0.02, "hum_c": 0.01}), START)
     assert {f.candidate.name for f in answer.found} == {"damping", "hum"}
 
 
 @pytest.mark.statistical
 def test_noise_alone_raises_an_alarm_at_most_once_in_twenty(rng):
-    alarms = sum(bool(diagnose(oscillator(rng), START).found) for _ in range(60))
+    alarms = sum(bool(explain(oscillator(rng), START).found) for _ in range(60))
     assert alarms <= 3  # the threshold promises one in a hundred
 
 
@@ -169,12 +169,12 @@ def test_a_shuffled_residual_gives_no_finding(rng):
     base = fit(system, system.base, START)
     residual = system.observed - system.predicted(base.values)
     shuffled = Oscillator(system.predicted(base.values) + rng.permutation(residual), system.time)
-    answer = diagnose(shuffled, START)
+    answer = explain(shuffled, START)
     assert not answer.found
 
 
 def test_a_negative_damping_is_not_allowed_to_explain_growth(rng):
-    answer = diagnose(oscillator(rng, {"d": -0.02}), START)
+    answer = explain(oscillator(rng, {"d": -0.02}), START)
     assert all(f.candidate.name != "damping" for f in answer.found)
     assert answer.verdict == "unexplained"
 
@@ -182,7 +182,7 @@ def test_a_negative_damping_is_not_allowed_to_explain_growth(rng):
 def test_an_effect_outside_the_catalogue_is_left_unexplained(rng):
     system = oscillator(rng)
     system.observed = system.observed + 0.05 * np.sign(np.sin(11.0 * system.time))
-    answer = diagnose(system, START)
+    answer = explain(system, START)
     assert answer.verdict == "unexplained"
     assert not answer.found
 
@@ -231,12 +231,12 @@ def test_a_model_without_quantities_is_diagnosed_and_rows_are_judged_as_asked(rn
     time = np.linspace(0, 1, 90)
     system = Line(0.05 * time + SIGMA * rng.standard_normal(90), time)
     rows = np.arange(90) % 3 != 0
-    answer = diagnose(system, {}, Settings(noise=1.0), rows)
+    answer = explain(system, {}, Settings(noise=1.0), rows)
     assert [f.candidate.name for f in answer.found] == ["slope"]
     assert answer.noise == 1.0
     assert (answer.held_out_after.test_rows == ~rows).all()
     assert abs(answer.after.values["k"] - 0.05) < 4 * answer.after.sigma("k")
-    assert not diagnose(Line(SIGMA * rng.standard_normal(90), time), {}, Settings(noise=1.0), rows).found
+    assert not explain(Line(SIGMA * rng.standard_normal(90), time), {}, Settings(noise=1.0), rows).found
 
 
 class Struck(Line):
@@ -260,10 +260,10 @@ def test_what_acts_in_the_fitted_part_alone_is_claimed_if_it_is_obvious(rng):
     time = np.linspace(0, 1, 900)
     observed = 0.014 * np.exp(-(((time - 0.3) / 0.1) ** 2)) + SIGMA * rng.standard_normal(900)
     rows = time <= 0.65
-    answer = diagnose(Struck(observed, time, "blow"), {}, Settings(noise=1.0), rows)
+    answer = explain(Struck(observed, time, "blow"), {}, Settings(noise=1.0), rows)
     assert [f.candidate.name for f in answer.found] == ["blow"]
     assert abs(answer.after.values["blow"] - 0.014) < 4 * answer.after.sigma("blow")
-    wrong = diagnose(Struck(observed, time, "stays"), {}, Settings(noise=1.0), rows)
+    wrong = explain(Struck(observed, time, "stays"), {}, Settings(noise=1.0), rows)
     (tried,) = wrong.tried
     assert tried.gain > 20
     assert tried.held_out_gain < -20
@@ -332,14 +332,14 @@ class Impatient(Oscillator):
 
 def test_a_hypothesis_that_takes_too_long_is_left_and_the_others_are_tried(rng):
     system = oscillator(rng, {"drift": 0.02, "hum_c": 0.05})
-    assert sorted(f.candidate.name for f in diagnose(system, START).found) == ["drift", "hum"]
+    assert sorted(f.candidate.name for f in explain(system, START).found) == ["drift", "hum"]
     impatient = Impatient(system.observed, system.time)
-    answer = diagnose(impatient, START)  # the twin of the drift does what the drift did
+    answer = explain(impatient, START)  # the twin of the drift does what the drift did
     assert sorted(f.candidate.name for f in answer.found) == ["hum", "twin"]
     assert not any(r.candidate.name == "drift" for f in answer.found for r in f.cannot_be_told_from)
     impatient.gives_up = True  # all patience at an end is another matter
     with pytest.raises(GivenUp):
-        diagnose(impatient, START)
+        explain(impatient, START)
 
 
 def test_a_fit_that_leaves_much_is_found_to_a_share_of_its_own_scatter(rng):
@@ -398,12 +398,12 @@ def test_what_rests_while_it_is_kept_back_does_not_speak_against_a_name(ahead, w
 
 
 def test_explanations_that_fit_alike_are_listed_with_their_odds(rng):
-    answer = diagnose(oscillator(rng, {"drift": 0.01}), START)
+    answer = explain(oscillator(rng, {"drift": 0.01}), START)
     listed = dict(answer.explanations)
     assert {("drift",), ("twin",)} <= set(listed)  # one and the same but for the sign
     assert abs(listed["drift",] - listed["twin",]) < 0.1
     assert () not in listed  # the control: that nothing is missing is no alternative
-    nothing = diagnose(oscillator(rng), START)
+    nothing = explain(oscillator(rng), START)
     assert nothing.explanations[0] == ((), 0.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.discrepancy.search import diagnose
+from disctrack.discrepancy.search import explain
 from disctrack.examples.cube_data import CLEARANCE, HALF_WIDTH, flights, read_tosses, without_copies
 from disctrack.examples.cube_system import CubeTosses, whitening_blind_to
 from disctrack.examples.cube_tosses import SETTINGS, analyse_tosses, main
@@ -63,7 +63,7 @@ def test_what_is_judged_of_a_flight_is_white_and_blind_to_its_own_motion():
 )
 def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hidden, expected):
     system = CubeTosses(simulated(rng, tmp_path, **hidden))
-    found = diagnose(system, {}, SETTINGS, system.training_rows())
+    found = explain(system, {}, SETTINGS, system.training_rows())
     assert named(found) == {key.partition(".")[0] for key in expected}
     assert found.verdict == ("found" if expected else "nothing missing")
     for key, value in expected.items():
@@ -74,7 +74,7 @@ def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hi
 @pytest.mark.statistical
 def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scale(rng, tmp_path):
     system = CubeTosses(simulated(rng, tmp_path, gravity=9.7))
-    found = diagnose(system, {}, SETTINGS, system.training_rows())
+    found = explain(system, {}, SETTINGS, system.training_rows())
     (effect,) = found.found
     rivals = {r.candidate.name for r in effect.cannot_be_told_from}
     assert {effect.candidate.name} | rivals == {"gravity", "frame_rate"}
@@ -83,7 +83,7 @@ def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scal
 @pytest.mark.statistical
 def test_a_vertical_that_leans_with_every_toss_is_not_taken_for_one_that_leans_in_the_room(rng, tmp_path):
     system = CubeTosses(simulated(rng, tmp_path, lean=0.01))
-    found = diagnose(system, {}, SETTINGS, system.training_rows())
+    found = explain(system, {}, SETTINGS, system.training_rows())
     assert named(found) == {"toss_tilt"}
     assert abs(found.after.values["toss_tilt.across"] - 0.01) < 4 * found.after.sigma("toss_tilt.across") + 2e-4
 
@@ -134,7 +134,7 @@ def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
     all_candidates = system.candidates
     try:
         system.candidates = tuple(c for c in all_candidates if c.name in ("clock_offset", "rotational_drag", "tilt"))
-        refused = diagnose(system, {}, SETTINGS, system.training_rows())
+        refused = explain(system, {}, SETTINGS, system.training_rows())
     finally:
         system.candidates = all_candidates
     assert refused.verdict == "unexplained"
@@ -151,7 +151,7 @@ def test_shuffled_residuals_of_the_tosses_give_no_finding(answer, rng):
             shuffled[rows] = rng.permutation(residual[rows], axis=0)
         shuffled *= original != 0  # what was not measured stays so
         system._left = shuffled
-        assert not diagnose(system, {}, SETTINGS, system.training_rows()).found
+        assert not explain(system, {}, SETTINGS, system.training_rows()).found
     finally:
         system._left = original
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from disctrack.analyse.published import SURFACES
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.search import diagnose
+from disctrack.discrepancy.search import explain
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
 from disctrack.examples.exponent_model import LastStage, Setup, slope
@@ -150,7 +150,7 @@ def test_a_planted_bias_of_t_f_is_found_in_its_class_and_sized(published):
     """Sixteen trials per surface with the published scatter: something is missing for sure, and t_f may be it."""
     truth = ExponentSystem(published).start | {"t_f.bias": -0.012}
     system = ExponentSystem(tables(published, truth, np.random.default_rng(2), n=16), FEW)
-    found = diagnose(system, system.start, QUICK)
+    found = explain(system, system.start, QUICK)
     assert found.verdict == "found"
     fits = fits_of_the_class(found)
     assert "kz" not in fits
@@ -162,7 +162,7 @@ def test_a_planted_bias_of_t_f_is_found_in_its_class_and_sized(published):
 def test_a_planted_layer_of_air_is_found_in_its_class_and_sized(published):
     truth = ExponentSystem(published).start | {"air_bildsten.beta": 0.3}
     system = ExponentSystem(tables(published, truth, np.random.default_rng(2)), ("air_bildsten", "theta_zero"))
-    found = diagnose(system, system.start, QUICK)
+    found = explain(system, system.start, QUICK)
     assert found.verdict == "found"
     fit_ = fits_of_the_class(found)["air_bildsten"]
     assert abs(fit_.values["air_bildsten.beta"] - 0.3) < 3 * fit_.sigma("air_bildsten.beta")
@@ -171,7 +171,7 @@ def test_a_planted_layer_of_air_is_found_in_its_class_and_sized(published):
 def test_nothing_is_claimed_where_nothing_was_planted(published, rng):
     start = ExponentSystem(published).start
     system = ExponentSystem(tables(published, start, rng, n=9), FEW)
-    found = diagnose(system, system.start, QUICK)
+    found = explain(system, system.start, QUICK)
     assert found.verdict == "nothing missing"
     assert not found.found
 
@@ -197,7 +197,7 @@ def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(p
 def test_effects_that_cannot_bend_the_law_are_refused_on_the_published_trials(published):
     """Something is missing there, but none of these is: offered alone they gain less than noise may."""
     system = ExponentSystem(published, ("kz", "theta_zero", "rolling_classical", "edge_radius", "smoothing"))
-    found = diagnose(system, system.start, QUICK)
+    found = explain(system, system.start, QUICK)
     assert found.before.converged
     assert not found.found
 
@@ -210,11 +210,11 @@ def test_false_alarms_and_finds_over_many_tables(published):
     claims = names = 0
     for _ in range(20):
         system = ExponentSystem(tables(published, start, rng, n=9), FEW)
-        claims += bool(diagnose(system, system.start, QUICK).found)
+        claims += bool(explain(system, system.start, QUICK).found)
     assert claims <= 1
     for _ in range(10):
         system = ExponentSystem(tables(published, start | {"t_f.bias": -0.02}, rng, n=9), FEW)
-        names += "t_f" in fits_of_the_class(diagnose(system, system.start, QUICK))
+        names += "t_f" in fits_of_the_class(explain(system, system.start, QUICK))
     assert names >= 9
 
 

@@ -16,7 +16,7 @@ from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, apart
 from disctrack.discrepancy.joint.joint_system import JointSystem
 from disctrack.discrepancy.joint.sharing import Sharing
-from disctrack.discrepancy.search import Settings, diagnose
+from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
 from tests.oracles.decaying_runs import build, fitted_at_once, renamed, runs
 
@@ -31,7 +31,7 @@ def joint(items, processes=1):
 def answer(items):
     system, _ = joint(items)
     n = len(items)
-    return system, diagnose(system, system.sharing.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
+    return system, explain(system, system.sharing.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
 
 
 def test_elimination_gives_what_all_quantities_at_once_give(rng):
@@ -271,7 +271,7 @@ def test_the_number_of_processes_changes_no_bit(rng):
     for processes in (1, 2):
         system, crew = joint(items, processes)
         with crew:
-            found.append(diagnose(system, system.sharing.start(), Settings(noise=1.0)).after)
+            found.append(explain(system, system.sharing.start(), Settings(noise=1.0)).after)
     assert found[0].values == found[1].values
     assert (found[0].covariance == found[1].covariance).all()
 
