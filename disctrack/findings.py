@@ -1,0 +1,237 @@
+"""What the program noticed about a measurement, as data.
+
+A stage makes a `Finding` where it sees something, with its sentence from the room's own module of messages; later
+stages read kinds, severities and numbers, never text. `causes` folds what another finding explains under that one.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from enum import Enum, IntEnum
+from typing import Any
+
+
+class Severity(IntEnum):
+    """How grave it is; a stage that tells a doubt ends with exit code 3, a refusal with 1."""
+
+    NOTE = 0  # good to know
+    WARNING = 1  # makes the result worse than it could be, within the stated sigmas
+    DOUBT = 2  # the result may be wrong by more than the stated sigmas
+    REFUSAL = 3  # there is no result
+
+
+class Kind(Enum):
+    """What was noticed; the value stands in files."""
+
+    # what is declared
+    SQUARE = "square"  # the chessboard's squares and the dots are on different scales
+    LENGTHS = "lengths"  # all lengths of disc and dots, or the board's
+    DIAMETER = "diameter of the dots"
+    RADIUS = "radius"
+    THICKNESS = "thickness"
+    DENSITY = "density"
+    GRAVITY_OR_RATE = "gravity or frame rate"
+    REVERSED = "reversed order"  # the energy grows
+    CORNERS = "inner corners"
+    DOTS_MISPLACED = "dots misplaced"
+    DOT_UNSEEN = "dot unseen"
+    SYMMETRIC_DOTS = "symmetric dots"
+    # the table
+    TABLE_VIEW = "table view"  # the board of the declared view does not lie where the disc rolls
+    BOARD_THICKNESS = "board thickness"
+    OFF_THE_TABLE = "off the table"
+    TABLE_DISAGREES = "table disagrees"  # beyond the tolerances of board and disc
+    # the cameras
+    EXCHANGED = "exchanged cameras"
+    MIRRORED = "mirrored images"
+    HANDEDNESS = "handedness"
+    CAMERA_MOVED = "camera moved"
+    CAMERAS_CONTRADICT = "cameras contradict each other"
+    ONE_SIDED = "one camera only"  # the dots of the other make no sense
+    DOTS_MISFIT = "dots misfit"  # in all frames, by more than their own scatter
+    DOTS_SCATTER = "dots scatter"
+    POSES_SCATTER = "poses scatter"
+    EXPOSURE = "exposure"
+    CLIPPED = "clipped"
+    SENSOR = "sensor"  # colour filter, stuck pixels
+    LIGHT = "light"
+    SHARPNESS = "sharpness"
+    ACCURACY = "accuracy"
+    # the clock
+    DELAY = "delay"
+    DROPPED_FRAMES = "dropped frames"  # by one camera
+    CLOCK_JUMP = "clock jump"  # pairs lost by both cameras
+    REPEATED_IMAGES = "repeated images"
+    TIME_STAMPS = "time stamps"
+    # the files, and the rest
+    READING = "reading"  # how the frames are read
+    HEADERS = "camera headers"
+    UNREADABLE = "unreadable images"
+    FRAMES_LOST = "frames lost"
+    DISC_NOT_FOUND = "disc not found"
+    DECLARATION = "declaration"
+    CALIBRATION = "calibration"
+    CALIBRATION_VIEWS = "calibration views"
+    ANALYSIS = "analysis"
+    DIAGNOSIS = "diagnosis"
+    OTHER = "other"  # of a file that a later version wrote
+
+
+@dataclass(frozen=True)
+class Number:
+    """A value with its standard deviation, where that is known."""
+
+    value: float
+    unit: str = ""
+    sigma: float | None = None
+
+    def __str__(self) -> str:
+        return with_sigma(self.value, self.sigma, self.unit)
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """What would mend it: a declared number with the one that would fit, or what to do."""
+
+    key: str = ""  # as in recording.toml
+    fits: str = ""  # what the key would have to be, in its unit
+    declared: str = ""
+    action: str = ""
+
+    def __str__(self) -> str:
+        declared = f" (declared {self.declared})" if self.declared else ""
+        would = f": {self.fits} would fit{declared}" if self.fits else declared
+        return f"{self.key}{would}{', ' if self.key and self.action else ''}{self.action}"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What it is about, as far as it is about less than the whole recording."""
+
+    stage: str = ""  # name of a command: check, calibrate, track, analyse, diagnose
+    camera: str = ""  # left or right
+    frames: tuple[tuple[int, int], ...] = ()  # first and last of each stretch
+    view: int | None = None  # of the calibration, counted from 0
+    dot: int | None = None  # of [markers], counted from 0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something noticed."""
+
+    kind: Kind
+    severity: Severity
+    text: str  # what was seen, one sentence without its full stop; for people only
+    subject: Subject = Subject()
+    numbers: Mapping[str, Number] = field(default_factory=dict)
+    remedies: tuple[Remedy, ...] = ()  # likeliest first
+    explains: tuple[Kind, ...] = ()  # consequences: not told beside this one
+
+    @property
+    def sentence(self) -> str:
+        """What to change first, then what was seen."""
+        told = [str(remedy) for remedy in self.remedies]
+        if not told:
+            return self.text
+        if not self.remedies[0].key:
+            advice = "; or ".join(told)
+            return f"{self.text}. {advice[:1].upper()}{advice[1:]}"
+        return f"{'; or '.join(told)}: {self.text}"
+
+    @property
+    def doubtful(self) -> bool:
+        """True where the result may be wrong by more than its sigmas."""
+        return self.severity >= Severity.DOUBT
+
+    def as_json(self) -> dict[str, Any]:
+        """Of JSON's types, with the sentence."""
+        words = {"kind": self.kind.value, "severity": self.severity.name.lower(), "sentence": self.sentence}
+        return {**asdict(self), **words, "explains": [kind.value for kind in self.explains]}
+
+
+def finding_from_json(document: Mapping[str, Any]) -> Finding:
+    """The finding that `as_json` wrote; a kind that this version does not know is OTHER."""
+    subject = dict(document["subject"])
+    return Finding(
+        _kind(document["kind"]),
+        Severity[document["severity"].upper()],
+        document["text"],
+        Subject(**{**subject, "frames": tuple((first, last) for first, last in subject["frames"])}),
+        {name: Number(**number) for name, number in document["numbers"].items()},
+        tuple(Remedy(**remedy) for remedy in document["remedies"]),
+        tuple(_kind(value) for value in document["explains"]),
+    )
+
+
+def _kind(value: str) -> Kind:
+    return Kind(value) if value in {kind.value for kind in Kind} else Kind.OTHER
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A finding that no other explains, as grave as what it explains."""
+
+    finding: Finding
+    consequences: tuple[Finding, ...] = ()
+
+
+def causes(findings: Iterable[Finding]) -> tuple[Cause, ...]:
+    """The findings, gravest first, each with those that it explains (or they explain) folded under it."""
+    rest: list[Finding] = []
+    for finding in sorted(findings, key=lambda f: -f.severity):
+        rest += [finding] if finding not in rest else []
+    found = []
+    while rest:
+        causal = next((f for f in rest if not any(_explains(g, f) for g in rest)), rest[0])
+        folded, kinds = [causal], set(causal.explains)
+        while more := [f for f in rest if f.kind in kinds and f not in folded]:
+            folded += more
+            kinds |= {kind for f in more for kind in f.explains}
+        rest = [f for f in rest if f not in folded]
+        severity = max(f.severity for f in folded)
+        found.append(Cause(replace(causal, severity=severity), tuple(folded[1:])))
+    return tuple(sorted(found, key=lambda cause: -cause.finding.severity))
+
+
+def _explains(one: Finding, other: Finding) -> bool:
+    return one.kind != other.kind and other.kind in one.explains
+
+
+def in_doubt(findings: Iterable[Finding]) -> bool:
+    """True where a result with these findings may be wrong by more than its sigmas."""
+    return any(finding.doubtful for finding in findings)
+
+
+class DoubtWarning(UserWarning):
+    """A result that may be wrong by more than its sigmas."""
+
+
+def warn_of_doubts(findings: Iterable[Finding], stacklevel: int = 3) -> None:
+    """A Python warning for each cause that puts the result in doubt."""
+    for cause in causes(findings):
+        if cause.finding.doubtful:
+            warnings.warn(cause.finding.sentence, DoubtWarning, stacklevel=stacklevel)
+
+
+def with_sigma(value: float, sigma: float | None = None, unit: str = "") -> str:
+    """A value and its sigma in words, both to two digits of the sigma; four digits where that is not known."""
+    value, ending = float(value), f" {unit}" if unit else ""
+    if not math.isfinite(value):
+        return "not known"
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+        return f"{value + 0.0:.4g}{ending}"  # + 0.0: no minus before a zero
+    decimals = 1 - math.floor(math.log10(sigma))
+    decimals -= round(sigma, decimals) >= 10.0 ** (2 - decimals)  # 0.0996 is 0.10
+    shown = max(decimals, 0)
+    return f"{round(value, decimals) + 0.0:.{shown}f} +- {round(sigma, decimals):.{shown}f}{ending}"
+
+
+LEAST_PROBABILITY = 1e-300  # below, differences of numbers near 1 and what a float can hold are the same
+
+
+def probability(value: float) -> str:
+    """A p value in words; none is zero."""
+    return f"p < {LEAST_PROBABILITY:g}" if value < LEAST_PROBABILITY else f"p = {value:.2g}"

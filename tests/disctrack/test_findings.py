@@ -1,0 +1,106 @@
+"""Findings: the cause is told first, once, and with the number that would fit; two digits of a sigma."""
+
+import json
+
+import pytest
+
+from disctrack.findings import (
+    DoubtWarning,
+    Finding,
+    Kind,
+    Number,
+    Remedy,
+    Severity,
+    Subject,
+    causes,
+    finding_from_json,
+    in_doubt,
+    probability,
+    warn_of_doubts,
+    with_sigma,
+)
+
+NOISE = Finding(Kind.POSES_SCATTER, Severity.WARNING, "poses scatter")
+MISFIT = Finding(Kind.DOTS_MISFIT, Severity.DOUBT, "dots miss their places", explains=(Kind.POSES_SCATTER,))
+EXCHANGED = Finding(
+    Kind.EXCHANGED,
+    Severity.DOUBT,
+    "the left and right images are exchanged",
+    Subject("check", frames=((3, 7), (9, 9))),
+    remedies=(Remedy("left, right", action="exchange the two patterns"),),
+    explains=(Kind.DOTS_MISFIT, Kind.ONE_SIDED),
+)
+SQUARE = Finding(
+    Kind.SQUARE,
+    Severity.DOUBT,
+    "the dots are 0.9877 +- 0.0010 times as far apart as declared",
+    numbers={"scale": Number(0.98765, "", 0.001)},
+    remedies=(Remedy("square_mm", "8.00", "8.1"), Remedy("centres_mm", action="multiply by 0.988")),
+)
+
+
+def test_the_cause_comes_first_and_its_consequences_lie_under_it():
+    (first, second) = causes([NOISE, MISFIT, SQUARE, EXCHANGED, NOISE])
+    assert first.finding == SQUARE
+    assert first.consequences == ()
+    assert second.finding == EXCHANGED
+    assert second.consequences == (MISFIT, NOISE)
+    (alone,) = causes([NOISE])
+    assert alone.finding == NOISE
+
+
+def test_a_cause_is_as_grave_as_what_it_explains():
+    delay = Finding(Kind.DELAY, Severity.NOTE, "a camera lags", explains=(Kind.DOTS_MISFIT,))
+    (found,) = causes([delay, MISFIT])
+    assert (found.finding.kind, found.finding.severity) == (Kind.DELAY, Severity.DOUBT)
+    assert in_doubt([MISFIT])
+    assert not in_doubt([delay])
+
+
+def test_two_that_explain_each_other_lose_neither():
+    one = Finding(Kind.RADIUS, Severity.DOUBT, "a", explains=(Kind.THICKNESS,))
+    other = Finding(Kind.THICKNESS, Severity.DOUBT, "b", explains=(Kind.RADIUS,))
+    (found,) = causes([one, other])
+    assert {found.finding.kind, *(f.kind for f in found.consequences)} == {Kind.RADIUS, Kind.THICKNESS}
+
+
+def test_the_sentence_begins_with_what_to_type():
+    assert SQUARE.sentence.startswith("square_mm: 8.00 would fit (declared 8.1); or centres_mm, multiply by 0.988: the")
+    assert NOISE.sentence == "poses scatter"
+
+
+def test_a_finding_comes_back_from_json_as_it_was():
+    for finding in (NOISE, MISFIT, EXCHANGED, SQUARE):
+        assert finding_from_json(json.loads(json.dumps(finding.as_json()))) == finding
+    later = finding_from_json({**NOISE.as_json(), "kind": "of a later version"})
+    assert later.kind == Kind.OTHER
+
+
+def test_doubts_are_python_warnings_and_their_consequences_are_not():
+    with pytest.warns(DoubtWarning) as told:
+        warn_of_doubts([MISFIT, EXCHANGED, NOISE])
+    assert [str(w.message) for w in told] == [EXCHANGED.sentence]
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "expected"),
+    [
+        (3.8120, 0.0125, "3.812 +- 0.013"),  # 0.0125 is a little above one and a quarter hundredths
+        (0.67483, 0.00049, "0.67483 +- 0.00049"),
+        (-0.04, 0.2, "-0.04 +- 0.20"),
+        (-0.0, 0.2, "0.00 +- 0.20"),
+        (86227.6, 22.1, "86228 +- 22"),
+        (12345.0, 678.0, "12340 +- 680"),
+        (1.0, 0.0996, "1.00 +- 0.10"),
+        (1.0, 99.6, "0 +- 100"),
+        (-0.0, None, "0"),
+        (float("nan"), 1.0, "not known"),
+    ],
+)
+def test_value_and_sigma_have_two_digits_of_the_sigma(value, sigma, expected):
+    assert with_sigma(value, sigma) == expected
+
+
+def test_no_probability_is_zero():
+    assert probability(0.0) == "p < 1e-300"
+    assert probability(0.0312) == "p = 0.031"
