@@ -73,7 +73,7 @@ class Suspect:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Contradiction:
     """A contradiction between what was declared and what was seen."""
 
     check: str  # "gravity and rate", "energy", "scale", "radius", "dot", "board", "handedness", "density"
@@ -110,7 +110,7 @@ class Balance:
 
 def contradictions(
     trajectory: Trajectory, declared: Disc | None = None, square: float | None = None
-) -> tuple[Finding, ...]:
+) -> tuple[Contradiction, ...]:
     """Every check that this trajectory allows.
 
     declared : the disc as declared, before its dots were refined
@@ -125,7 +125,7 @@ def contradictions(
     return tuple(found)
 
 
-def contradictions_of(recording: Recording, trajectory: Trajectory) -> tuple[Finding, ...]:
+def contradictions_of(recording: Recording, trajectory: Trajectory) -> tuple[Contradiction, ...]:
     """Every check that a recording and its trajectory allow."""
     board = recording.chessboard
     if board is None:
@@ -133,7 +133,7 @@ def contradictions_of(recording: Recording, trajectory: Trajectory) -> tuple[Fin
     return (*contradictions(trajectory, recording.disc, board.square), *turned_board(board.inner_corners))
 
 
-def told(findings: Mapping[str, Any], found: Sequence[Finding]) -> dict[str, Any]:
+def told(findings: Mapping[str, Any], found: Sequence[Contradiction]) -> dict[str, Any]:
     """The findings of a run with these before its warnings; what spoils the result is in doubt, too (exit code 3)."""
     sentences = [finding.sentence for finding in found]
     doubts = [finding.sentence for finding in found if finding.spoils]
@@ -145,7 +145,7 @@ def told(findings: Mapping[str, Any], found: Sequence[Finding]) -> dict[str, Any
     }
 
 
-def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
+def motion_against_gravity(trajectory: Trajectory) -> tuple[Contradiction, ...]:
     """Gravity and frame rate, and an energy that grows, on some stretches of the recording."""
     seen = balance(trajectory)
     g = trajectory.gravity
@@ -154,7 +154,7 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     ratio = seen.gravity / g
     if abs(np.log(ratio)) > np.log1p(BALANCE) and abs(seen.gravity - g) > SIGMAS * seen.sigma:
         return (
-            Finding(
+            Contradiction(
                 "gravity and rate",
                 f"the motion satisfies the balance of moments with a gravity of {seen.gravity:.4g} +- {seen.sigma:.1g} "
                 f"m/s^2 ({seen.n_blocks} stretches of {BLOCK} frames)",
@@ -170,7 +170,7 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     steady = np.mean(np.diff(seen.energy) > 0) > STEADY
     if end - start > GROWTH * start and slope > SIGMAS * sigma and steady:
         return (
-            Finding(
+            Contradiction(
                 "energy",
                 f"the mechanical energy grows from {1e3 * start:.4g} to {1e3 * end:.4g} mJ though no force but the "
                 "table's acts",
@@ -208,7 +208,7 @@ def _radius_suspected(trajectory: Trajectory, ratio: float) -> Suspect:
     return Suspect("[disc] radius_mm", f"{1e3 * disc.radius:g}", f"{1e3 * would_be:.4g}", misfit)
 
 
-def density(disc: Disc) -> tuple[Finding, ...]:
+def density(disc: Disc) -> tuple[Contradiction, ...]:
     """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in another unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
     if DENSITIES[0] < found < DENSITIES[1]:
@@ -219,7 +219,7 @@ def density(disc: Disc) -> tuple[Finding, ...]:
         Suspect("[disc] thickness_mm", f"{2e3 * disc.half_thickness:g}", "", 0.0),
     )
     seen = f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm^3"
-    return (Finding("density", seen, "0.05 (foam) to 23 (osmium)", suspects, spoils=False),)
+    return (Contradiction("density", seen, "0.05 (foam) to 23 (osmium)", suspects, spoils=False),)
 
 
 def balance(trajectory: Trajectory) -> Balance:
@@ -290,7 +290,7 @@ def _robust(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def another_plane(trajectory: Trajectory) -> tuple[Finding, ...]:
+def another_plane(trajectory: Trajectory) -> tuple[Contradiction, ...]:
     """Whether the rim rolls on a plane far from z = 0: the board of the table view did not lie on the table."""
     rows, disc = trajectory.measured, trajectory.disc
     centre, e3 = trajectory.q[rows, :3], rotation_from_quaternion(trajectory.quaternion[rows])[:, :, 2]
@@ -314,10 +314,10 @@ def another_plane(trajectory: Trajectory) -> tuple[Finding, ...]:
         return ()
     suspect = Suspect("[table] view", "as declared", "that in which the board lies flat on the table", 0.0)
     seen = f"the rim rolls on a plane that is turned by {np.degrees(turned):.1f} deg from the table's"
-    return (Finding("table view", seen, "the plane under the board of the table view", (suspect,), spoils=True),)
+    return (Contradiction("table view", seen, "the plane under the board of the table view", (suspect,), spoils=True),)
 
 
-def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
+def rise_of_centre(trajectory: Trajectory) -> tuple[Contradiction, ...]:
     """The radius from height against sin(theta), where the nutation varies enough."""
     q = trajectory.q[trajectory.measured]
     theta, disc = q[:, 4], trajectory.disc
@@ -340,10 +340,10 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
         Suspect("[calibration] square_mm", "as declared", f"{1 / ratio:.4g} times that", 2 * abs(np.log(abs(ratio)))),
     )
     seen = f"the centre rises by {1e3 * slope:.2f} +- {1e3 * sigma:.2f} mm per unit of sin(theta)"
-    return (Finding("radius", seen, f"the radius, {1e3 * disc.radius:.2f} mm", suspects, spoils=True),)
+    return (Contradiction("radius", seen, f"the radius, {1e3 * disc.radius:.2f} mm", suspects, spoils=True),)
 
 
-def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+def handedness(rig: StereoRig, disc: Disc) -> tuple[Contradiction, ...]:
     """Whether the left camera stands on the left as both look at the table, where the dots do not tell left from right.
 
     In a mirrored world it stands on the right. No verdict where the cameras stand one behind the other, or face each
@@ -362,7 +362,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
         Suspect("[cameras] left, right (and [calibration])", "as stored", "mirrored: then psi and phi turn round", 0.0),
     )
     return (
-        Finding(
+        Contradiction(
             "handedness",
             f"the left camera stands {1e3 * rig.baseline:.0f} mm to the right of the right one, as they look at it",
             "the left camera on the left; the dots do not tell, as their layout looks the same in a mirror",
@@ -372,7 +372,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     )
 
 
-def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
+def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Contradiction, ...]:
     """Distances of the dots, by both cameras alone, over those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 50)).astype(int)] if len(rows) else rows
@@ -403,10 +403,10 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     dots_off = Suspect("[markers] centres_mm", "as declared", f"{scale:.4f} times those", off)
     suspects = tuple(sorted((board, dots_off), key=lambda s: s.misfit))
     seen_text = f"by both cameras the dots are {scale:.4f} +- {max(sigma, 1e-4):.1g} times as far apart as declared"
-    return (Finding("scale", seen_text, "1 (chessboard and dots on one scale)", suspects, spoils=True),)
+    return (Contradiction("scale", seen_text, "1 (chessboard and dots on one scale)", suspects, spoils=True),)
 
 
-def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
+def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Contradiction, ...]:
     """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
     status = trajectory.marker_status[trajectory.measured]
     if not len(status):
@@ -421,7 +421,7 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
         reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")
         x, y = 1e3 * declared.marker_centres_body[dot, :2]
         found.append(
-            Finding(
+            Contradiction(
                 "dot",
                 f"dot {dot} of [markers] centres_mm is measured in {100 * share[dot]:.0f} % of the images ({reason})",
                 "a dot there, as round and dark as the others (numbers count from 0)",
@@ -432,13 +432,13 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
     return tuple(found)
 
 
-def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
+def turned_board(inner_corners: Sequence[int]) -> tuple[Contradiction, ...]:
     """Corners counted along the short side first turn the axes of the table by 90 deg."""
     first, second = inner_corners
     if first >= second:
         return ()
     return (
-        Finding(
+        Contradiction(
             "board",
             f"inner_corners = [{first}, {second}] counts along the short side first: x runs along the short side",
             "the long side first, so that x runs along it",
