@@ -11,8 +11,8 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.disc import MA_2014
-from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels
-from disctrack.pages.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
+from disctrack.report.figures import NO_TITLE, Drawn, dress, panels
+from disctrack.report.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 BAND = 3.0  # sigmas shown as a band
 INSET_DURATION = 0.3  # [s] last stage, as in the paper's figures 4 and 10

@@ -1,7 +1,7 @@
 """The motion to play with: one HTML file that needs neither server nor network.
 
 Disc in 3-D with the path of its contact, camera pictures with the fit drawn on them, nutation, precession rate and
-energy with a common cursor, and the residuals of the frame under it. The drawing is in `pages/motion.js`.
+energy with a common cursor, and the residuals of the frame under it. The drawing is in `report/motion.js`.
 """
 
 import base64
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.whole import write_whole
-from disctrack.pages.html import Markup, page, paragraph
-from disctrack.pages.palette import RED
+from disctrack.report.palette import RED
+from disctrack.report.parts import Markup, page, paragraph
 from disctrack.trajectory import FrameStatus
 
 Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
@@ -40,7 +40,7 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
     """The whole page."""
     content = page_data(analysis, drawn)
     data = json.dumps(content, separators=(",", ":")).replace("</", "<\\/")
-    script = files("disctrack.pages").joinpath("motion.js").read_text(encoding="utf-8")
+    script = files("disctrack.report").joinpath("motion.js").read_text(encoding="utf-8")
     curves = "".join(
         f'<canvas id="curve-{k}" class="curve" role="img" aria-label="{series["name"]} over time"></canvas>'
         for k, series in enumerate(content["series"])

@@ -11,8 +11,8 @@ from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.analyse.published import SURFACES, agreement, published_table
 from disctrack.files.whole import write_whole
-from disctrack.pages.figures import Drawn, draw, gallery
-from disctrack.pages.html import details, page, paragraph, section, table, tiles, warning
+from disctrack.report.figures import Drawn, draw
+from disctrack.report.parts import details, gallery, page, paragraph, section, table, tiles, warning
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
 

@@ -6,7 +6,7 @@ from urllib.parse import quote
 from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING, Row, copies
 from disctrack.batch.records import SKIPPED
 from disctrack.files.text import printable
-from disctrack.pages.html import Markup, page, paragraph, section, table, text, warning
+from disctrack.report.parts import Markup, page, paragraph, section, table, text, warning
 
 SAID = {SKIPPED: "measured before"}  # on a page, which is read long after the batch that found it done
 _FITTED = {

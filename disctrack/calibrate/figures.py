@@ -10,8 +10,8 @@ from matplotlib.ticker import MaxNLocator
 
 from calibration import StereoCalibration
 from disctrack.frames import CAMERAS
-from disctrack.pages.figures import lay_out
-from disctrack.pages.palette import BLUE, COLOURS, INK
+from disctrack.report.figures import lay_out
+from disctrack.report.palette import BLUE, COLOURS, INK
 
 COVERAGE_CELLS = 8
 _SHADES = LinearSegmentedColormap.from_list("coverage", ["#dceefa", BLUE])

@@ -146,7 +146,7 @@ def calibrate_into(
     files = [path]
     if figures:
         from disctrack.calibrate.figures import FIGURES
-        from disctrack.pages.figures import save_figure
+        from disctrack.report.figures import save_figure
 
         prefix = "calibration" if path.stem == "rig" else f"{path.stem}_calibration"
         files += [save_figure(make(found), path.with_name(f"{prefix}_{name}.png")) for name, make in FIGURES.items()]

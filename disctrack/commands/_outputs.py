@@ -155,7 +155,7 @@ def _companions(
         storage.write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
         yield path.with_suffix(".csv")
     if options.figures:
-        from disctrack.pages.figures import save_figure
+        from disctrack.report.figures import save_figure
         from disctrack.track.pictures import FIGURES
 
         pictures = {path.with_name(f"{prefix}{name}.png"): make for name, make in FIGURES.items()}

@@ -16,7 +16,7 @@ def run(arguments: argparse.Namespace) -> int:
     print("\n".join(seen.lines()))
     if seen.recording is not None and not arguments.no_figures:
         from disctrack.first_look.picture import check_figure
-        from disctrack.pages.figures import save_figure
+        from disctrack.report.figures import save_figure
 
         path = arguments.output or seen.recording.folder / outputs.RESULTS / "check.png"
         figure = check_figure(seen)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
-from disctrack.pages.figures import save_figure
+from disctrack.report.figures import save_figure
 
 
 @dataclass(frozen=True)

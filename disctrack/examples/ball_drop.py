@@ -29,8 +29,8 @@ from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Subset
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
-from disctrack.pages.figures import panels
-from disctrack.pages.palette import BLUE, RED
+from disctrack.report.figures import panels
+from disctrack.report.palette import BLUE, RED
 
 GRAVITY = 9.81  # [m/s^2] as declared
 AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC

@@ -24,8 +24,8 @@ from disctrack.examples._command import Outcome, command
 from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Toss, read_tosses
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import GROUPS, HELD_OUT, CubeTosses
-from disctrack.pages.figures import panels
-from disctrack.pages.palette import BLUE, RED
+from disctrack.report.figures import panels
+from disctrack.report.palette import BLUE, RED
 
 # The covariance of the noise is that of the data already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)

@@ -18,8 +18,8 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations import Answer, Equations, Run, Term, diagnose, terms
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command
-from disctrack.pages.figures import panels
-from disctrack.pages.palette import BLUE, MUTED, RED
+from disctrack.report.figures import panels
+from disctrack.report.palette import BLUE, MUTED, RED
 
 FITTED_S = 36.668  # by the authors; the rest is their validation
 STEP = 0.157e-3  # [rad] of the encoder

@@ -26,8 +26,8 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.words import quantity_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_system import ExponentSystem, published_series
-from disctrack.pages.figures import panels
-from disctrack.pages.palette import INK, MUTED
+from disctrack.report.figures import panels
+from disctrack.report.palette import INK, MUTED
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 ASKED = ("t_f", "air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # looked at, found or not

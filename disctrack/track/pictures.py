@@ -9,8 +9,8 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from calibration.kit.arrays import Array
 from disctrack.frames import CAMERAS, COORDINATES
-from disctrack.pages.figures import lay_out
-from disctrack.pages.palette import COLOURS, INK, MUTED
+from disctrack.report.figures import lay_out
+from disctrack.report.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 BAND = 3.0  # sigmas shown as a band: one is thinner than the line in most recordings

@@ -73,7 +73,8 @@ def test_every_public_name_is_there():
 STAIRS = (
     ("frames", "errors", "findings", "progress"),  # words shared by all
     ("disc", "files"),
-    ("trajectory", "rolling", "recording", "pages"),
+    ("report",),
+    ("trajectory", "rolling", "recording"),
     ("track", "analyse"),
     ("synthetic", "discrepancy"),
     ("diagnosis", "calibrate"),

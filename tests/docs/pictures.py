@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import disctrack
-from disctrack.pages.figures import panels, save_figure
-from disctrack.pages.palette import BLUE, INK
+from disctrack.report.figures import panels, save_figure
+from disctrack.report.palette import BLUE, INK
 from disctrack.track.video_overlay import draw_pair
 
 FRAME = 60

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from disctrack.analyse.stage import run_analyse
-from disctrack.pages.palette import BLUE
+from disctrack.report.palette import BLUE
 from disctrack.trajectory.file import Provenance, write_trajectory
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")

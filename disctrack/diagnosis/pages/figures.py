@@ -17,8 +17,8 @@ from disctrack.diagnosis.free_runs import ModelFreeEvidence, ModelFreeForces, fo
 from disctrack.diagnosis.learned_law import MissingMoment, learned_moment
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
-from disctrack.pages.figures import NO_TITLE, Drawn, dress, panels, plain_powers
-from disctrack.pages.palette import AMBER, BLUE, GRID, INK, MUTED, RED
+from disctrack.report.figures import NO_TITLE, Drawn, dress, panels, plain_powers
+from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
 

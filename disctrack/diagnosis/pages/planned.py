@@ -7,7 +7,7 @@ import numpy as np
 from disctrack.diagnosis.plan import ENOUGH, Plan, Question
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.words import quantity_text
-from disctrack.pages.html import bullets, details, paragraph, table
+from disctrack.report.parts import bullets, details, paragraph, table
 
 SAID = (
     "Computed from the fitted model: each recording is simulated with the same cameras and noise, and put beside "

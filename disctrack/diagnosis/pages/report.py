@@ -16,8 +16,8 @@ from disctrack.discrepancy.search import Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.words import effect_text, quantity_text
 from disctrack.files.whole import write_whole
-from disctrack.pages.figures import draw, gallery
-from disctrack.pages.html import Markup, bullets, page, paragraph, section, table, text
+from disctrack.report.figures import draw
+from disctrack.report.parts import Markup, bullets, gallery, page, paragraph, section, table, text
 
 
 def write_report(

@@ -19,9 +19,9 @@ from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.system import Quantity
 from disctrack.discrepancy.words import effect_text, quantity_text
 from disctrack.files.json_text import plain
-from disctrack.pages.figures import Drawn, panels
-from disctrack.pages.html import bullets, details, page, paragraph, section, table, typeset, warning
-from disctrack.pages.palette import AMBER, BLUE, MUTED
+from disctrack.report.figures import Drawn, panels
+from disctrack.report.palette import AMBER, BLUE, MUTED
+from disctrack.report.parts import bullets, details, page, paragraph, section, table, typeset, warning
 
 SHOWN = 12  # effects whose standard deviations are tabled by number of recordings; all are in the JSON
 NAMED = 8  # recordings that are named on an axis; more are counted

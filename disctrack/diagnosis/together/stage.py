@@ -49,7 +49,8 @@ def run_together(
     Raises TrajectoryFileError where there is no such file, AnalysisError, SceneError, ModelError, OutputError.
     """
     from disctrack.diagnosis.together.output import as_json, figures, lines, whole_page
-    from disctrack.pages.figures import draw, gallery  # matplotlib is wanted here only
+    from disctrack.report.figures import draw  # matplotlib is wanted here only
+    from disctrack.report.parts import gallery
 
     paths = [Path(p) for p in paths]
     for p in paths:

@@ -10,9 +10,9 @@ import numpy as np
 from scipy import signal
 
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
-from disctrack.pages.figures import Drawn, draw, gallery, panels
-from disctrack.pages.html import Markup, as_typed, bullets, page, paragraph, section, table
-from disctrack.pages.palette import BLUE, MUTED, RED
+from disctrack.report.figures import Drawn, draw, panels
+from disctrack.report.palette import BLUE, MUTED, RED
+from disctrack.report.parts import Markup, as_typed, bullets, gallery, page, paragraph, section, table
 
 if TYPE_CHECKING:
     from disctrack.discrepancy.equations.answer import Answer

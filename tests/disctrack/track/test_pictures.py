@@ -11,7 +11,7 @@ from calibration.cameras.camera import Camera, StereoRig, rotation_from_vector
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, quaternion_from_rotation, rotation_from_euler
-from disctrack.pages.figures import DPI, save_figure
+from disctrack.report.figures import DPI, save_figure
 from disctrack.track import pictures as plots
 from disctrack.track import video_overlay as overlay
 from disctrack.trajectory import FrameStatus, Trajectory

@@ -6,7 +6,6 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from disctrack.files.whole import whole_file, write_whole
-from disctrack.pages.html import Markup, text
-from disctrack.pages.palette import GRID, INK, MUTED
+from disctrack.report.palette import GRID, INK, MUTED
 
 DPI = 150
 END_OF_HEADER = 33  # of a PNG file: its signature and the chunk IHDR
@@ -153,13 +151,3 @@ def _inline(figure: Figure) -> str:
     if len(content) > LARGE:
         kind, content = "png", png_of(figure)
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> Markup:
-    """Figures with their captions; `pictures` holds a data URI per figure's name."""
-    items = "".join(
-        f'<figure><img src="{pictures[drawn.name]}" alt="{escape(drawn.title)}">'
-        f"<figcaption><b>{escape(drawn.title)}.</b> {text(drawn.caption)}</figcaption></figure>"
-        for drawn in figures
-    )
-    return Markup(f"<div class=gallery>{items}</div>" if items else "")

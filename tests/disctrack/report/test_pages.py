@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from disctrack.diagnosis.pages.figures import candidates
 from disctrack.files.json_text import json_file, json_text, plain
-from disctrack.pages import palette
-from disctrack.pages.figures import Drawn, draw, gallery, plain_powers
-from disctrack.pages.html import Markup, as_typed, bullets, page, paragraph, section, table, typeset, warning
+from disctrack.report import palette
+from disctrack.report.figures import Drawn, draw, plain_powers
+from disctrack.report.parts import Markup, as_typed, bullets, gallery, page, paragraph, section, table, typeset, warning
 
 
 class Tree(HTMLParser):

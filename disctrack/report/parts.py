@@ -7,11 +7,9 @@ import re
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from disctrack.pages.palette import AMBER, BLUE, GRID, INK, RED
-
-
-class Markup(str):
-    """HTML that goes into a page as it is."""
+from disctrack.report.blocks import Markup
+from disctrack.report.figures import Drawn
+from disctrack.report.html import STYLE
 
 
 def text(item: str) -> Markup:
@@ -130,47 +128,11 @@ def details(title: str, parts: Iterable[str]) -> Markup:
     return Markup(f"<details><summary>{escape(title)}</summary>{''.join(parts)}</details>")
 
 
-STYLE = f"""
-:root{{color-scheme:light dark;--ink:{INK};--soft:#4d5a67;--back:#f5f7f9;--card:#fff;--line:{GRID};--mark:{BLUE};
---warn:#fff6e5;--edge:{AMBER};--bad:{RED};--shade:#0003}}
-@media (prefers-color-scheme:dark){{:root{{--ink:#e6ebf0;--soft:#aab5c0;--back:#14191f;--card:#1c232b;--line:#323c47;
---mark:#6db9e8;--warn:#33290f;--bad:#ff9a5c;--shade:#000a}}}}
-html{{color:var(--ink);background:var(--back);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}}
-body{{margin:0}}main{{max-width:1180px;margin:0 auto;padding:2rem 1.5rem 4rem}}
-h1{{font-size:1.7rem;line-height:1.25;margin:.2rem 0 1rem}}h2{{font-size:1.25rem;margin:0 0 .8rem}}
-a{{color:var(--mark)}}
-section{{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:1.3rem 1.5rem;margin:1.4rem 0}}
-.lead{{font-size:1.05rem;max-width:60rem}}
-.tiles{{display:grid;grid-template-columns:repeat(auto-fit,minmax(210px,1fr));gap:.9rem;margin:1.2rem 0}}
-.tile{{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:.8rem 1rem}}
-.tile b{{display:block;font-size:1.15rem}}.tile span{{color:var(--soft);font-size:.88rem}}
-.warn{{background:var(--warn);border:1px solid var(--edge);border-radius:10px;padding:.9rem 1.2rem;margin:1.2rem 0}}
-.warn ul{{margin:.4rem 0 0;padding-left:1.2rem;overflow-wrap:anywhere}}
-.gallery{{columns:2 420px;column-gap:1.6rem}}
-figure{{margin:0 0 1.3rem;break-inside:avoid}}
-figure img{{width:100%;height:auto;display:block;background:#fff;border-radius:4px}}
-figcaption{{color:var(--soft);font-size:.88rem;line-height:1.45;margin-top:.35rem}}
-.scroll{{overflow-x:auto;background:linear-gradient(90deg,var(--card) 30%,transparent) 0/2rem 100% no-repeat local,
-linear-gradient(270deg,var(--card) 30%,transparent) 100%/2rem 100% no-repeat local,
-linear-gradient(90deg,var(--shade),transparent) 0/.7rem 100% no-repeat scroll,
-linear-gradient(270deg,var(--shade),transparent) 100%/.7rem 100% no-repeat scroll}}
-table{{border-collapse:collapse;font-size:.85rem;margin:.6rem 0 1rem}}
-caption{{text-align:left;color:var(--soft);padding-bottom:.35rem}}
-caption span{{position:sticky;left:0;display:inline-block;max-width:min(100%,calc(100vw - 4rem))}}
-th,td{{text-align:left;padding:.28rem .9rem .28rem 0;border-bottom:1px solid var(--line);white-space:nowrap;
-font-variant-numeric:tabular-nums}}
-td:first-child{{white-space:normal;min-width:9em}}td.said{{white-space:normal;min-width:22em}}
-th{{color:var(--soft);font-weight:600;white-space:normal;vertical-align:bottom}}
-tr.failed td,tr.not td{{color:var(--bad)}}
-details{{margin:.6rem 0}}summary{{cursor:pointer;color:var(--mark)}}
-@media (max-width:40rem){{main{{padding:1rem .8rem 3rem}}section{{padding:1rem .9rem}}h1{{font-size:1.35rem}}
-.gallery{{columns:1}}td.said{{min-width:16em}}td:first-child{{min-width:8em}}}}
-@page{{margin:14mm 15mm}}
-@media print{{:root{{color-scheme:light;--ink:#000;--soft:#333;--back:#fff;--card:#fff;--line:#ccc;--warn:#fff;
---mark:#000;--bad:#000;--shade:transparent}}html{{font-size:11.5px}}main{{max-width:none;padding:0}}
-section{{border:0;padding:0}}.scroll{{overflow:visible;background:none}}.gallery{{columns:auto}}
-figure img{{width:auto;max-width:100%;max-height:98mm}}h1,h2,summary,caption{{break-after:avoid}}
-tr{{break-inside:avoid}}.tiles{{grid-template-columns:repeat(4,1fr)}}td,th{{white-space:normal}}td:first-child{{min-width:11em}}
-td.said{{min-width:16em}}details>*{{display:block}}
-details::details-content{{content-visibility:visible;block-size:auto}}}}
-"""
+def gallery(figures: Sequence[Drawn], pictures: dict[str, str]) -> Markup:
+    """Figures with their captions; `pictures` holds a data URI per figure's name."""
+    items = "".join(
+        f'<figure><img src="{pictures[drawn.name]}" alt="{escape(drawn.title)}">'
+        f"<figcaption><b>{escape(drawn.title)}.</b> {text(drawn.caption)}</figcaption></figure>"
+        for drawn in figures
+    )
+    return Markup(f"<div class=gallery>{items}</div>" if items else "")

@@ -1,0 +1,178 @@
+"""What a report is made of: each stage fills these blocks, and the writers set them (terminal, HTML, JSON)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Protocol
+
+from disctrack.files.json_text import plain
+from disctrack.report.numbers import Measured
+
+if TYPE_CHECKING:
+    from disctrack.report.figures import Drawn
+
+Cell = str | Measured
+
+SEVERITIES = ("refusal", "doubt", "warning", "note")  # the gravest first
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Markup(str):
+    """HTML that goes into a page as it is; no other writer shows it."""
+
+
+class Says(Protocol):
+    """What a report asks of a finding."""
+
+    @property
+    def severity(self) -> Any:
+        """One of SEVERITIES, or an enumeration of these names."""
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """A finding that is a sentence and no more."""
+
+    sentence: str
+    severity: str = "note"
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    said: str
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list of sentences."""
+
+    said: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Named numbers and short answers, one below the other."""
+
+    rows: Sequence[tuple[str, Cell]]
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Rows of numbers and words; a row without a header names what stands in it."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    caption: str = ""
+    folded: str = ""  # title under which a long table is folded away on a page
+    classes: Sequence[str] = ()  # of each row: "failed" is set in red
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures with their captions, on pages only."""
+
+    drawn: Sequence[Drawn]
+
+
+@dataclass(frozen=True)
+class Section:
+    """Blocks under a heading; nothing where all are empty."""
+
+    title: str
+    blocks: Sequence[Any]  # Block
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a stage tells: its answer first, then how good it is, then everything else."""
+
+    title: str  # of the page
+    verdict: str
+    accuracy: str = ""  # in one line
+    findings: Sequence[Says] = ()
+    facts: Sequence[tuple[str, Cell]] = ()  # the few numbers that come first on a page
+    blocks: Sequence[Any] = ()  # Block
+    files: Sequence[Path] = ()
+    page: Path | None = None  # where to read on
+    then: str = ""  # the next command
+    data: Mapping[str, Any] = field(default_factory=dict)  # of the stage, for programs: a part of the JSON document
+
+    def graver_first(self) -> list[Says]:
+        """The findings in the order in which they are told; a cause stays before what it explains."""
+        return sorted(self.findings, key=lambda finding: SEVERITIES.index(severity(finding)))
+
+
+def severity(finding: Says) -> str:
+    """One of SEVERITIES."""
+    word = str(getattr(finding.severity, "name", finding.severity)).lower()
+    return word if word in SEVERITIES else "note"
+
+
+def is_empty(block: Any) -> bool:
+    """True where a block has nothing to show."""
+    content = next(value for name, value in vars(block).items() if name not in ("title", "header"))
+    return all(map(is_empty, content)) if isinstance(block, Section) else not content
+
+
+def figures_in(blocks: Iterable[Any]) -> list[Drawn]:
+    """All figures of the blocks, in their order."""
+    found: list[Drawn] = []
+    for block in blocks:
+        found += block.drawn if isinstance(block, Figures) else []
+        found += figures_in(block.blocks) if isinstance(block, Section) else []
+    return found
+
+
+def document(report: Report) -> dict[str, Any]:
+    """The report in JSON's types."""
+    found = {
+        "title": report.title,
+        "verdict": report.verdict,
+        "accuracy": report.accuracy,
+        "findings": [{"severity": severity(f), "sentence": f.sentence} for f in report.graver_first()],
+        "facts": {name: _cell(value) for name, value in report.facts},
+        "blocks": [shown for block in report.blocks if (shown := _block(block))],
+        "files": [str(file) for file in report.files],
+        "page": None if report.page is None else str(report.page),
+        "next": report.then,
+        **report.data,
+    }
+    return dict(plain(found))
+
+
+def restored(kept: Mapping[str, Any]) -> Report:
+    """A report from its document: what a terminal shows, and the document as data."""
+    findings = [Said(f["sentence"], f["severity"]) for f in kept["findings"]]
+    files = [Path(file) for file in kept["files"]]
+    page = Path(kept["page"]) if kept["page"] else None
+    head = kept["title"], kept["verdict"], kept["accuracy"]
+    return Report(*head, findings, files=files, page=page, then=kept["next"], data=kept)
+
+
+def _cell(cell: Cell) -> Any:
+    if isinstance(cell, Measured):
+        return {"value": cell.value, "sigma": cell.sigma, "unit": cell.unit}
+    return str(cell)
+
+
+def _block(block: Any) -> dict[str, Any] | None:
+    if isinstance(block, Section):
+        inner = [shown for b in block.blocks if (shown := _block(b))]
+        return {"title": block.title, "blocks": inner} if inner else None
+    if is_empty(block) or isinstance(block, Figures):
+        return None
+    if isinstance(block, Facts):
+        return {"facts": {name: _cell(value) for name, value in block.rows}}
+    if isinstance(block, Listing):
+        rows = [[_cell(cell) for cell in row] for row in block.rows]
+        return {"caption": block.caption or block.folded, "header": list(block.header), "rows": rows}
+    return {"text": block.said if isinstance(block, Text) else list(block.said)}

@@ -1,0 +1,103 @@
+"""A report for a terminal: at most ten lines, or all of it."""
+
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import Any, TextIO
+
+from disctrack.files.text import printable
+from disctrack.report.blocks import Cell, Facts, Items, Listing, Markup, Report, Section, Text, is_empty, severity
+
+MOST_LINES = 10
+WIDTH = 100  # of lines in a file, and at most in a terminal
+_HEAD = 13  # characters of the first column
+_MOST_OF_ONE = 4  # lines of the verdict, and of one finding; the rest stands in `full`
+_COLOURS = {"refusal": "31;1", "doubt": "31;1", "warning": "33", "verdict": "1"}
+
+
+def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[str]:
+    """Verdict, accuracy, findings, page and next command, in at most MOST_LINES."""
+    first = _entry("verdict", report.verdict, width)[:_MOST_OF_ONE] + _entry("accuracy", report.accuracy, width)[:2]
+    last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
+    entries = [_entry(severity(f), f.sentence, width)[:_MOST_OF_ONE] for f in report.graver_first()]
+    room = MOST_LINES - len(first) - len(last)
+    while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and entries:
+        entries.pop()
+    more = len(report.findings) - len(entries)
+    also = _entry("", f"and {more} more: -v shows {'it' if more == 1 else 'them'}" if more else "", width)
+    lines = [*first, *(line for entry in entries for line in entry), *also, *last]
+    return [_coloured(line) for line in lines] if colour else lines
+
+
+def full(report: Report, width: int = WIDTH) -> list[str]:
+    """All of it."""
+    lines = [report.title, ""] if report.title else []
+    lines += _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
+    for finding in report.graver_first():
+        lines += _entry(severity(finding), finding.sentence, width)
+    lines += _facts(report.facts, width) + _blocks(report.blocks, width)
+    lines += _entry("page", "" if report.page is None else str(report.page), width)
+    for i, file in enumerate(report.files):
+        lines += _entry("" if i else "files", str(file), width)
+    return lines + _entry("next", report.then, width)
+
+
+def show(report: Report, stream: TextIO | None = None, *, verbose: bool = False) -> None:
+    """Print the report; in colour where the stream is a terminal and NO_COLOR is not set (https://no-color.org)."""
+    stream = stream or sys.stdout
+    width = min(WIDTH, shutil.get_terminal_size((WIDTH, 24)).columns)
+    colour = stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    lines = full(report, width) if verbose else short(report, width, colour=colour)
+    print("\n".join(lines), file=stream, flush=True)
+
+
+def _coloured(line: str) -> str:
+    head = line[:_HEAD].rstrip()
+    return f"\x1b[{_COLOURS[head]}m{head}\x1b[0m{line[len(head) :]}" if head in _COLOURS else line
+
+
+def _entry(head: str, said: str, width: int) -> list[str]:
+    """A heading and what belongs to it, wrapped beside it; nothing where nothing is said."""
+    if not said or isinstance(said, Markup):
+        return []
+    indent = " " * (_HEAD + 1)
+    start = f"{head:<{_HEAD}} "
+    return textwrap.wrap(
+        printable(said), max(width, 40), initial_indent=start, subsequent_indent=indent,
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
+
+
+def _blocks(blocks: Iterable[Any], width: int) -> list[str]:
+    lines: list[str] = []
+    for block in blocks:
+        if is_empty(block):
+            continue
+        if isinstance(block, Section):
+            inner = _blocks(block.blocks, width)
+            lines += ["", block.title, *inner] if inner else []
+        elif isinstance(block, Text):
+            lines += [] if isinstance(block.said, Markup) else textwrap.wrap(printable(block.said), width)
+        elif isinstance(block, Items):
+            for said in block.said:
+                lines += textwrap.wrap(printable(said), width, initial_indent="- ", subsequent_indent="  ")
+        elif isinstance(block, Facts):
+            lines += _facts(block.rows, width)
+        elif isinstance(block, Listing):
+            lines += _table(block)
+    return lines
+
+
+def _facts(rows: Iterable[tuple[str, Cell]], width: int) -> list[str]:
+    return [line for name, value in rows for line in _entry(name, str(value), width)]
+
+
+def _table(listing: Listing) -> list[str]:
+    """Columns as wide as what stands in them; the last one, which may hold sentences, as long as it is."""
+    rows: list[Sequence[str]] = [listing.header, *([printable(str(cell)) for cell in row] for row in listing.rows)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(listing.header))]
+    lines = ["  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip() for row in rows]
+    title = listing.caption or listing.folded
+    return [*([title] if title else []), *lines]
