@@ -9,8 +9,8 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.significance import Whiteness, whiteness
 from disctrack.discrepancy.system import Values
-from disctrack.discrepancy.whiteness import Whiteness, whiteness
 from disctrack.frames import euler_jacobian, nodal_axes_world
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_power, kinematics

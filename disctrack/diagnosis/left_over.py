@@ -10,7 +10,7 @@ import numpy as np
 
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
+from disctrack.discrepancy.significance import ljung_box, no_memory, whiteness
 
 LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
 MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks

@@ -21,7 +21,8 @@ from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
-from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, explain, noise_variance, threshold
+from disctrack.discrepancy.noise import noise_variance
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, explain, threshold
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError

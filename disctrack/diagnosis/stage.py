@@ -32,7 +32,7 @@ from disctrack.diagnosis.regimes import regimes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
-from disctrack.discrepancy.memory import inflation, with_memory
+from disctrack.discrepancy.noise import inflation, with_memory
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, length, threshold
 from disctrack.discrepancy.shape import refine_shapes

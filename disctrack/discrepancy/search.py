@@ -17,13 +17,11 @@ from scipy import stats
 
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
-from disctrack.discrepancy.chance import Chance, chance
 from disctrack.discrepancy.fit import Fit, fit, no_fit, prior_residual
 from disctrack.discrepancy.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
-from disctrack.discrepancy.memory import inflation
-from disctrack.discrepancy.row_noise import THIRD, RowWhitened, common_modes, third_differences, whitened
+from disctrack.discrepancy.noise import THIRD, RowWhitened, common_modes, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all, score_pairs
-from disctrack.discrepancy.significance import TWO_SIDED, price_of_a_number
+from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
 from disctrack.discrepancy.system import (
     Candidate,
     Quantity,
@@ -168,17 +166,6 @@ def length(system: System, settings: Settings, noise: float, fitted: Fit, picked
     free = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
     picks = len(picked) * (threshold(system, settings, 1) - number)
     return fitted.cost / noise + free * number + picks + sum(_surprise(c, fitted) for c in picked)
-
-
-def noise_variance(system: System, fit_: Fit) -> float:
-    """Variance of the fast part of the residual over that stated, from third differences in time.
-
-    1 where there are too few samples for that.
-    """
-    difference, rows = third_differences(system, fit_)
-    if len(rows) < 20:
-        return 1.0
-    return float(np.sum(difference**2) / 20.0 / np.sum(system.weights[rows]))
 
 
 class _Search:

@@ -23,7 +23,7 @@ from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, S
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out
-from disctrack.discrepancy.noise_with_memory import SampleStretch, estimate
+from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Subset

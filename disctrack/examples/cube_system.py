@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.kit.arrays import Array, Mask
-from disctrack.discrepancy.noise_with_memory import SampleStretch, SmoothNoise, estimate
+from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
 from disctrack.discrepancy.system import System, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting, Toss, flights, resting, without_copies

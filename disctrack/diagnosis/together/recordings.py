@@ -26,8 +26,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.joint.reduction import Reduced, Reduction
 from disctrack.discrepancy.joint.sharing import Member
 from disctrack.discrepancy.joint.together import Alone
-from disctrack.discrepancy.memory import inflation
-from disctrack.discrepancy.row_noise import THIRD
+from disctrack.discrepancy.noise import THIRD, inflation
 from disctrack.discrepancy.system import Quantity, Values
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.trajectory import MarkerStatus, Trajectory

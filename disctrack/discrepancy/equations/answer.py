@@ -20,8 +20,8 @@ from disctrack.discrepancy.equations.loop import Answered, ask
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings
+from disctrack.discrepancy.significance import LAGS, ljung_box, no_memory
 from disctrack.discrepancy.system import Candidate, System
-from disctrack.discrepancy.whiteness import LAGS, ljung_box, no_memory
 from disctrack.discrepancy.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain

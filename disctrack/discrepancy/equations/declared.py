@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, unknown_name
-from disctrack.discrepancy.noise_with_memory import SmoothNoise
+from disctrack.discrepancy.noise import SmoothNoise
 from disctrack.errors import AnalysisError
 
 

@@ -25,7 +25,7 @@ from disctrack.discrepancy.equations.start import guessed, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, compress, fit, prior_rows
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.row_noise import THIRD
+from disctrack.discrepancy.noise import THIRD
 from disctrack.discrepancy.search import CLASS_GAIN, OBVIOUS, Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values

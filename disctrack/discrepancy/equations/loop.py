@@ -17,7 +17,11 @@ from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Te
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.noise import (
+from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, turn
+from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.held_out import held_out
+from disctrack.discrepancy.noise import (
     Remembering,
     autoregression,
     fast_part,
@@ -25,10 +29,6 @@ from disctrack.discrepancy.equations.noise import (
     step_of,
     with_noise,
 )
-from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, turn
-from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
-from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.search import (
     CLASS_GAIN,

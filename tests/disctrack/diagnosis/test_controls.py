@@ -9,7 +9,7 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.row_noise import common_modes
+from disctrack.discrepancy.noise import common_modes
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import explain
 from tests.disctrack.discrepancy.test_search import START, Oscillator, oscillator

@@ -17,7 +17,7 @@ from disctrack.diagnosis.stage import _doubtful
 from disctrack.diagnosis.stretch import at_rest
 from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.memory import inflation, long_run_variance
+from disctrack.discrepancy.noise import inflation, long_run_variance
 from disctrack.discrepancy.system import Quantity, System
 from disctrack.synthetic.description import CameraFault, Faults
 from disctrack.validate.points import ORDINARY, Laboratory

@@ -18,7 +18,7 @@ from disctrack.discrepancy.equations.start import at_once, guessed, misfit
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.held_out import held_out
-from disctrack.discrepancy.memory import inflation
+from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.system import Subset

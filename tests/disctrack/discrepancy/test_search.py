@@ -16,8 +16,8 @@ from disctrack.discrepancy.fit import compress, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
 from disctrack.discrepancy.search import Settings, _Search, explain, length
+from disctrack.discrepancy.significance import ljung_box, no_memory, whiteness
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp
-from disctrack.discrepancy.whiteness import ljung_box, no_memory, whiteness
 
 SIGMA = 0.01
 

@@ -1,11 +1,15 @@
-"""Sigmas of a gain of chi-square, beside arithmetic of 60 digits."""
+"""Sigmas of a gain beside arithmetic of 60 digits; probabilities by chance are uniform where nothing is missing."""
 
 import numpy as np
 import pytest
 from mpmath import mp
 from numpy.testing import assert_allclose
+from scipy import stats
 
-from disctrack.discrepancy.significance import as_sigmas
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.score import Linearisation, score_all
+from disctrack.discrepancy.significance import as_sigmas, chance, false_discovery
+from disctrack.discrepancy.system import Candidate, Quantity, System
 
 
 def exact(gain, n):
@@ -26,3 +30,72 @@ def test_sigmas_have_the_probability_of_the_gain(gain):
 def test_noise_alone_is_no_sigma():
     assert as_sigmas(0.0, 2) == as_sigmas(-1.0, 1) == 0.0
     assert as_sigmas(9.0, 3) == pytest.approx(2.18, abs=0.01)  # not 3: three numbers gain 3 on average
+
+
+class Waves(System):
+    """A line with noise of variance 1; it may lack waves that overlap, some of one sign only, and pairs of them."""
+
+    def __init__(self, data):
+        self.time = np.linspace(0.0, 1.0, 120)
+        self.data, self.weights = data, np.ones(120)
+        self.columns = {"a": np.ones(120), "b": self.time}
+        self.base = (Quantity("a", "1", 1.0), Quantity("b", "1", 1.0))
+        found = []
+        for i, rate in enumerate(np.linspace(4.0, 30.0, 25)):
+            names = (f"c{i}", f"s{i}") if i % 3 == 0 else (f"c{i}",)
+            for name, wave in zip(names, (np.cos, np.sin), strict=False):
+                self.columns[name] = wave(rate * self.time)
+            lower = 0.0 if i % 3 == 1 else -np.inf
+            quantities = tuple(Quantity(n, "1", 1.0, lower=lower) for n in names)
+            found.append(Candidate(f"wave {i}", f"wave {i}", "motion", "", "", quantities))
+        self.candidates = tuple(found)
+
+    def linearise(self, values, names):
+        residual = self.data - sum(values[n] * c for n, c in self.columns.items() if n in values)
+        columns = np.zeros((120, 1, len(names)))
+        for i, name in enumerate(names):
+            columns[:, 0, i] = self.columns[name]
+        return residual[:, None], columns
+
+
+def of(data):
+    system = Waves(data)
+    base = fit(system, system.base, {})
+    linear = Linearisation(system, base, system.candidates)
+    return chance(linear, score_all(linear, system.candidates), 1.0, draws=1000)
+
+
+@pytest.mark.statistical
+def test_the_probability_is_uniform_where_nothing_is_missing(rng):
+    found = [of(rng.standard_normal(120)) for _ in range(250)]
+    p = np.array([c.p_value for c in found])
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+    for level in (0.2, 0.05):
+        assert stats.binomtest(int(np.sum(p < level)), len(p), level).pvalue > 1e-3
+    # 25 waves that overlap are fewer independent chances, and more than none
+    assert 5 < np.median([c.tests for c in found]) < 25
+
+
+def test_what_is_there_is_improbable(rng):
+    system = Waves(np.zeros(120))
+    assert of(rng.standard_normal(120) + 2.0 * system.columns["c9"]).p_value < 1e-10
+    # a wave that may only be positive does not gain from its opposite, but its neighbours do
+    assert of(rng.standard_normal(120) - 2.0 * system.columns["c10"]).p_value < 1e-10
+    assert of(rng.standard_normal(120)).p_value > 1e-3
+
+
+def test_false_discoveries_among_many_recordings_are_as_stated(rng):
+    """Benjamini and Hochberg's own example of fifteen p values, and 300 batches with ten true effects in forty."""
+    known = [0.0001, 0.0004, 0.0019, 0.0095, 0.0201, 0.0278, 0.0298, 0.0344, 0.0459, 0.324, 0.4262, 0.5719, 0.6528,
+             0.759, 1.0]  # fmt: skip
+    assert int(np.sum(false_discovery(known) <= 0.05)) == 4
+    assert false_discovery([]).size == 0
+    shares = []
+    for _ in range(300):
+        z = rng.standard_normal(40)
+        z[:10] += 3.5
+        claimed = false_discovery(2 * stats.norm.sf(np.abs(z))) < 0.1
+        shares.append(claimed[10:].sum() / max(claimed.sum(), 1))
+    assert np.mean(shares) == pytest.approx(0.075, abs=4 * np.std(shares) / np.sqrt(300))
+    naive = 30 * 0.1 / (30 * 0.1 + 10)
+    assert np.mean(shares) < 0.5 * naive

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.discrepancy.noise_with_memory import SampleStretch, SmoothNoise, estimate
+from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
 from disctrack.examples.ball_drop import DRAG, GRAVITY, OTHERS, Drop, analyse_drops, ask, main, read_drops
 
 TIME = np.arange(45) / 15.0

@@ -21,9 +21,9 @@ from disctrack.discrepancy.equations import Equations, Parameter, Run, SmoothNoi
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import checked
 from disctrack.discrepancy.equations.formulas import formulas
-from disctrack.discrepancy.equations.noise import fast_part, step_of
 from disctrack.discrepancy.equations.page import _sentence
 from disctrack.discrepancy.equations.system import EquationSystem
+from disctrack.discrepancy.noise import fast_part, step_of
 from disctrack.errors import AnalysisError
 
 TIME = np.arange(870) * 0.01

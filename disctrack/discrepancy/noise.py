@@ -1,0 +1,401 @@
+"""What noise is: how large, whether the numbers of a row share it, and whether it remembers.
+
+Size: whatever a model of a well sampled motion lacks moves slowly from sample to sample; differences in time pass white
+noise and stop the rest. Rows: cameras that shake, clocks that jitter, frames in a wrong order look like a pose, and
+poses are what effects are read from; directions in which rows scatter more than independent noise does are weighted by
+what they scatter. Memory: where what is left lasts for many samples, an estimate scatters by the long-run variance of
+its influence function over that of independent samples (Newey and West 1987, with the bandwidth of Andrews 1991 for
+Bartlett's weights); or the data are whitened, by an autoregression or by the covariance of an error that changes
+smoothly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import comb
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+
+from calibration.kit.arrays import Array, Mask
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.nuisances import is_linear, projection
+from disctrack.discrepancy.own import Own
+from disctrack.discrepancy.system import System, Values, Wrapped
+
+if TYPE_CHECKING:
+    from disctrack.discrepancy.equations.declared import Samples
+
+MARGIN = 1.5  # over the largest eigenvalue that independent noise brings (Marchenko and Pastur's edge)
+THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
+
+
+class RowWhitened(Wrapped):
+    """A system whose rows are multiplied by a matrix, so that noise common to their numbers counts once."""
+
+    def __init__(self, system: System, matrix: Array) -> None:
+        """Matrix (w, w) acts on the numbers of every row."""
+        super().__init__(system)
+        self._matrix = matrix
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """As the system's, every row multiplied."""
+        residual, derivative = super().linearise(values, names)
+        return residual @ self._matrix.T, self._matrix @ derivative
+
+
+def third_differences(system: System, fit: Fit) -> tuple[Array, NDArray[np.intp]]:
+    """Third differences in time of the residual (k, w) where four samples follow each other, and their rows (k,).
+
+    Whatever is missing in a model of a motion that is sampled well moves slowly from sample to sample; differences of
+    third order pass white noise (variance 20) and stop the rest.
+    """
+    residual, _ = system.linearise(fit.values, [])
+    present = system.weights > 0
+    rows = np.flatnonzero(present[3:] & present[2:-1] & present[1:-2] & present[:-3])
+    return np.diff(residual, 3, axis=0)[rows], rows
+
+
+def noise_variance(system: System, fit_: Fit) -> float:
+    """Variance of the fast part of the residual over that stated, from third differences in time.
+
+    1 where there are too few samples for that.
+    """
+    difference, rows = third_differences(system, fit_)
+    if len(rows) < 20:
+        return 1.0
+    return float(np.sum(difference**2) / 20.0 / np.sum(system.weights[rows]))
+
+
+def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
+    """Directions (w, k) in which rows scatter more than independent noise does, and their variances (k,); or None."""
+    difference, rows = third_differences(system, fit)
+    full = system.weights[rows] >= difference.shape[1]  # missing numbers are zeros, not noise
+    difference = difference[full]
+    k, width = difference.shape
+    if width < 2 or k < 4 * width:
+        return None
+    eigenvalues, vectors = np.linalg.eigh(difference.T @ difference / (20.0 * k))
+    edge = (1.0 + np.sqrt(width * THIRD / k)) ** 2
+    common = eigenvalues > MARGIN * edge * np.median(eigenvalues)
+    if not common.any():
+        return None
+    return vectors[:, common], eigenvalues[common] / float(np.mean(eigenvalues[~common]))
+
+
+def whitened(system: System, modes: tuple[Array, Array] | None) -> System:
+    """The system with the scatter of these directions brought down to that of the others."""
+    if modes is None:
+        return system
+    vectors, variances = modes
+    matrix = np.eye(len(vectors)) + (vectors * (1.0 / np.sqrt(variances) - 1.0)) @ vectors.T
+    return RowWhitened(system, matrix)
+
+
+SHORTEST = 40  # samples from which a memory is looked for
+SURE = 3.0  # standard deviations of the long-run variance itself, below which it says nothing
+
+
+def inflation(system: System, fit: Fit) -> Array:
+    """(k,) by which the standard deviation of each fitted quantity grows; 1 where no memory is seen.
+
+    Linear quantities with priors keep theirs, and those that blocks of rows have of their own.
+    """
+    factors = np.ones(len(fit.quantities))
+    moved = [i for i, q in enumerate(fit.quantities) if not (is_linear(q) or q.slot)]
+    here = [fit.shared.index(fit.names[i]) for i in moved]
+    covariance = fit.covariance[np.ix_(here, here)]
+    rows = np.flatnonzero(system.weights > 0)
+    if len(rows) < SHORTEST or not moved or not covariance.any():
+        return factors
+    own = Own(system, fit.quantities)
+    residual, derivative = system.linearise(fit.values, [*own.slots, *(fit.names[i] for i in moved)])
+    derivative = own.cleared(derivative, fit.heads) if fit.heads else derivative
+    common = projection(system, fit.quantities, fit.values)
+    cleared = common.cleared(derivative.reshape(residual.size, -1))[: residual.size].reshape(derivative.shape)
+    by_number = cleared[rows] @ covariance  # (n, w, k)
+    influence = np.einsum("nw,nwk->nk", residual[rows], by_number)
+    alone = np.einsum("nwk,nwk->k", by_number, by_number)
+    power = float(np.sum(residual[rows] ** 2) / max(np.sum(system.weights[rows]), 1.0))
+    in_common = alone.copy()
+    for lag, share in enumerate(autocorrelation(residual[rows]), start=1):
+        in_common += 2 * share * np.einsum("nwk,nwk->k", by_number[lag:], by_number[:-lag])
+    for i, x, one, together in zip(moved, influence.T, alone, in_common, strict=True):
+        if power * one > 0:
+            variance, spread = long_run_variance(x)
+            ratio = variance * len(x) / (power * one)
+            factors[i] = np.sqrt(max(ratio if ratio > 1.0 + SURE * spread else 1.0, together / one))
+    return factors
+
+
+def autocorrelation(residual: Array) -> list[float]:
+    """Of the numbers (n, w) of each row with the same ones of rows 1, 2, ... later; up to where none is seen any more.
+
+    All numbers together tell it far better than the one series of a quantity's influence. A sensor's pattern of gains
+    and offsets is such a memory: images of a dot that lie within two pixels err alike.
+    """
+    found: list[float] = []
+    power = float(np.sum(residual**2)) / max(int(np.count_nonzero(residual)), 1)
+    for lag in range(1, len(residual) // 4):
+        products = residual[lag:] * residual[:-lag]  # of missing numbers zero
+        count = max(int(np.count_nonzero(products)), 1)
+        share = float(np.sum(products)) / count / power if power > 0 else 0.0
+        if share < SURE / np.sqrt(count):
+            break
+        found.append(share)
+    return found
+
+
+def long_run_variance(x: Array) -> tuple[float, float]:
+    """Variance of a sum of x (n,) over n, with its memory; and the relative standard deviation of that."""
+    n = len(x)
+    power = float(x @ x)
+    if power == 0:
+        return 0.0, 0.0
+    rho = float(np.clip((x[1:] @ x[:-1]) / power, -0.97, 0.97))
+    alpha = 4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2)
+    width = int(np.clip(np.ceil(1.1447 * (alpha * n) ** (1 / 3)), 1, n // 4))
+    total = power
+    for lag in range(1, width):
+        total += 2 * (1 - lag / width) * float(x[lag:] @ x[:-lag])
+    return total / n, float(np.sqrt(4 * width / (3 * n)))
+
+
+def with_memory(system: System, fit: Fit) -> Fit:
+    """The fit with standard deviations that know the residual's size and memory; correlations stay."""
+    factors = inflation(system, fit) * np.sqrt(max(1.0, fit.reduced_chi_square))
+    return replace(fit, covariance=fit.covariance * np.outer(factors, factors))
+
+
+@dataclass(frozen=True)
+class SmoothNoise:
+    """Covariance white^2 delta + smooth^2 exp(-(t - t')^2 / (2 memory^2))."""
+
+    white: float
+    smooth: float
+    memory: float  # in the units of time
+
+    def covariance(self, time: Array) -> Array:
+        """(n, n) of one stretch of samples; different stretches are independent."""
+        apart = (time[:, None] - time[None, :]) / self.memory
+        # a share of 1e-9 keeps the Cholesky factor regular where the white part is next to nothing
+        floor = (self.white**2 + 1e-9 * self.smooth**2) * np.eye(len(time))
+        return np.asarray(self.smooth**2 * np.exp(-0.5 * apart**2) + floor, float)
+
+    def whitening(self, time: Array) -> Array:
+        """W (n, n), lower triangular, with W covariance W^T = 1: sample by sample what those before do not foretell."""
+        root = np.linalg.cholesky(self.covariance(time))
+        return np.asarray(solve_triangular(root, np.eye(len(time)), lower=True), float)
+
+
+@dataclass(frozen=True)
+class SampleStretch:
+    """Samples that share errors, and what a model may absorb of them."""
+
+    time: Array  # (n,)
+    values: Array  # (n, c) channels with the same statistics
+    basis: Array  # (n, k)
+    part: NDArray[np.int64] | None = None  # (n,) samples of different parts have independent errors
+
+
+def estimate(stretches: Sequence[SampleStretch], start: SmoothNoise) -> SmoothNoise:
+    """Restricted maximum likelihood: what is left in all stretches after their bases are cleared out.
+
+    A memory beyond a fifth of the longest stretch is not sought: such an error looks like the motion itself.
+    """
+    # of large numbers that the bases explain, the likelihood would leave rounding
+    stretches = [
+        replace(s, values=s.values - s.basis @ np.linalg.lstsq(s.basis, s.values, rcond=None)[0]) for s in stretches
+    ]
+    longest = 0.2 * max(float(np.ptp(s.time)) for s in stretches)
+    bounds = [(np.log(1e-3 * x), np.log(1e3 * x)) for x in (start.white, start.smooth)]
+    bounds.append((np.log(0.01 * longest), np.log(longest)))
+
+    def cost(x: Array) -> float:
+        noise = SmoothNoise(*np.exp(x).tolist())
+        return sum(_minus_log_likelihood(s, noise) for s in stretches)
+
+    x = np.log([start.white, start.smooth, min(start.memory, 0.9 * longest)])
+    options = {"xatol": 0.02, "fatol": 0.1, "maxiter": 160}
+    found = minimize(cost, x, method="Nelder-Mead", bounds=bounds, options=options)
+    return SmoothNoise(*np.exp(found.x).tolist())
+
+
+def _minus_log_likelihood(s: SampleStretch, noise: SmoothNoise) -> float:
+    K = noise.covariance(s.time)
+    if s.part is not None:
+        K = np.where(s.part[:, None] == s.part[None, :], K, 0.0)
+    factor = cho_factor(K, lower=True)
+    KB, Ky = cho_solve(factor, s.basis), cho_solve(factor, s.values)
+    inner = cho_factor(s.basis.T @ KB, lower=True)
+    quadratic = np.sum(s.values * Ky) - np.sum((KB.T @ s.values) * cho_solve(inner, KB.T @ s.values))
+    determinants = 2 * sum(float(np.sum(np.log(np.diag(f[0])))) for f in (factor, inner))
+    return 0.5 * float(quadratic + s.values.shape[1] * determinants)
+
+
+_ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them
+ENOUGH_DIFFERENCES = 8  # by which a channel's noise is told
+FEWEST_DIFFERENCES = 3  # the same of few or uneven samples
+UNEVEN = 3.0  # of the spacings: nine in ten are no longer than so many times the one in ten that is shortest
+MAX_MEMORY = 24  # samples over which noise may remember
+
+
+def with_noise(samples: Sequence[Samples]) -> list[Samples]:
+    """Runs whose sigma is known: where none was given, from the fast part of the channel's data in all runs."""
+    found = list(samples)
+    for c in range(samples[0].data.shape[1]):
+        open_ = [i for i, s in enumerate(found) if np.isnan(s.sigma[:, c]).any()]
+        if not open_:
+            continue
+        values = [found[i].data[:, c] for i in open_]
+        sigma = max(fast_part(values, [found[i].time for i in open_]), step_of(values) / np.sqrt(12.0))
+        for i in open_:
+            columns = found[i].sigma.copy()
+            columns[:, c] = sigma
+            found[i] = replace(found[i], sigma=columns)
+    return found
+
+
+def fast_part(values: Sequence[Array], times: Sequence[Array] | None = None) -> float:
+    """Standard deviation of white noise on smooth signals, from differences in time.
+
+    times : of the values; few or unevenly spaced ones are differenced as they lie in time
+    """
+    estimates, counts = [], []
+    present = [np.isfinite(v) for v in values]
+    if times is not None and _sparse(times, present):
+        differences = [
+            [_divided(t[p], v[p], order) for t, v, p in zip(times, values, present, strict=True)] for order in _ORDERS
+        ]
+        fewest = FEWEST_DIFFERENCES
+    else:
+        differences = [
+            [np.diff(v, order) / np.sqrt(comb(2 * order, order)) for v in values if len(v) > order] for order in _ORDERS
+        ]
+        fewest = ENOUGH_DIFFERENCES
+    for parts in differences:
+        all_ = np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
+        if len(all_) >= fewest:
+            estimates.append(float(np.sqrt(np.mean(all_**2))))
+            counts.append(len(all_))
+    # the first order in which no more of the motion is left than its own scatter: higher ones scatter more
+    best = next(
+        (a for a, b, n in zip(estimates, estimates[1:], counts, strict=False) if a <= b * (1 + 2 / np.sqrt(n))),
+        estimates[-1] if estimates else 0.0,
+    )
+    size = max((float(np.nanmax(np.abs(v))) for v in values if np.isfinite(v).any()), default=1.0)
+    return max(best, 1e-9 * size, 1e-300)
+
+
+def _sparse(times: Sequence[Array], present: Sequence[Mask]) -> bool:
+    """Are there so few values, or so unevenly spaced ones, that differences from sample to sample mean little?"""
+    spacings = [np.diff(t[p]) for t, p in zip(times, present, strict=True) if p.sum() > 1]
+    uneven = any(np.quantile(d, 0.9) > UNEVEN * np.quantile(d, 0.1) for d in spacings)
+    return uneven or sum(len(d) for d in spacings) < ENOUGH_DIFFERENCES + max(_ORDERS)
+
+
+def _divided(time: Array, values: Array, order: int) -> Array:
+    """Divided differences, as large as the noise of one value."""
+    if len(time) <= order:
+        return np.zeros(0)
+    t, y = (np.lib.stride_tricks.sliding_window_view(x, order + 1) for x in (time, values))
+    apart = (t[:, :, None] - t[:, None, :]) / (t[:, -1:, None] - t[:, :1, None]) + np.eye(order + 1)
+    weight = 1.0 / np.prod(apart, axis=2)
+    return np.asarray(np.sum(weight * y, axis=1) / np.linalg.norm(weight, axis=1), float)
+
+
+def step_of(values: Sequence[Array]) -> float:
+    """Step of an encoder or a converter, of which all values are multiples; 0 where there is none."""
+    levels = np.unique(np.concatenate([v[np.isfinite(v)] for v in values]))
+    if len(levels) < 3:
+        return 0.0
+    gaps = np.diff(levels)
+    step = float(gaps.min())
+    if step <= 1e-12 * float(np.abs(levels).max()):
+        return 0.0
+    turns = gaps / step
+    whole = np.abs(turns - np.round(turns)) < 0.01 * np.maximum(1.0, turns * 0.01)
+    many = sum(int(np.isfinite(v).sum()) for v in values)
+    # a coarse converter shows each of its levels more than once
+    return step if whole.all() and many > 1.2 * len(levels) else 0.0
+
+
+class Remembering(Wrapped):
+    """A system whose noise remembers: every sample minus what those before it foretell of its noise.
+
+    coefficients : (w, order) of the autoregression of each channel's whitened residual; gaps begin anew.
+    """
+
+    def __init__(self, system: System, rows: Sequence[slice], coefficients: Array, present: Mask) -> None:
+        """Rows of each stretch; present (n, w) where there are data."""
+        super().__init__(system)
+        self._rows, self._present = tuple(rows), present
+        self._coefficients = coefficients
+
+    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
+        """As the system's, filtered in time along every stretch."""
+        residual, derivative = super().linearise(values, names)
+        both = np.concatenate([residual[..., None], derivative], axis=-1)
+        out = both.copy()
+        order = self._coefficients.shape[1]
+        for rows in self._rows:
+            part, new = both[rows], out[rows]
+            for lag in range(1, min(order, len(part) - 1) + 1):
+                new[lag:] -= self._coefficients[:, lag - 1, None] * part[:-lag]
+            new *= self._present[rows][..., None]
+        return out[..., 0], out[..., 1:]
+
+
+def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tuple[Array, float]:
+    """Coefficients (w, order) that make a residual (n, w) white, and its variance then over before.
+
+    Yule and Walker's equations; the order is Schwarz's choice. Missing samples count as zeros.
+    """
+    w = residual.shape[1]
+    n = int(present.sum(axis=0).max())
+    top = int(min(MAX_MEMORY, max(1, n // 40)))
+    found, ratio = np.zeros((w, top)), 0.0
+    for c in range(w):
+        covariance = np.zeros(top + 1)
+        for part in rows:
+            x = residual[part, c]
+            for lag in range(min(top, len(x) - 1) + 1):
+                covariance[lag] += x[lag:] @ x[: len(x) - lag]
+        best, variance = np.inf, covariance[0]
+        if variance <= 0:
+            continue
+        # Levinson and Durbin, order by order
+        a: Array = np.zeros(0)
+        for order in range(top + 1):
+            if order > 0:
+                k = (
+                    (covariance[order] - a @ covariance[order - 1 : 0 : -1][: order - 1]) / variance
+                    if order > 1
+                    else (covariance[1] / variance)
+                )
+                a = np.concatenate([a - k * a[::-1], [k]])
+                variance *= 1 - k * k
+            criterion = n * np.log(max(variance / covariance[0], 1e-300)) + order * np.log(n)
+            if criterion < best - 1e-9:
+                best = criterion
+                found[c] = 0.0
+                found[c, :order] = a
+                share = variance / covariance[0]
+        ratio = max(ratio, share)
+    return found, ratio
+
+
+def persistence(residual: Array, rows: Sequence[slice]) -> float:
+    """Samples until the autocorrelation of a residual (n, w) has fallen to 1/e, all channels and stretches together."""
+    longest = max(r.stop - r.start for r in rows)
+    power = np.zeros(longest)
+    for r in rows:
+        x = residual[r]
+        spectrum = np.abs(np.fft.rfft(x, 2 * len(x), axis=0)) ** 2
+        power[: len(x)] += np.fft.irfft(spectrum, axis=0).sum(axis=1)[: len(x)]
+    below = np.flatnonzero(power < power[0] / np.e)
+    return float(below[0]) if below.size else float(longest)
