@@ -13,9 +13,10 @@ from scipy.interpolate import CubicHermiteSpline
 
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import triangle
-from disctrack.diagnosis.faults import Sight, faults_of, measurement_candidates, predict, setup_of
 from disctrack.diagnosis.motion import (
     SLIP,
+    candidate_of_fault,
+    measurement_candidates,
     model_quantities,
     motion_candidates,
     slipping_start_quantities,
@@ -27,6 +28,8 @@ from disctrack.diagnosis.sought import sought
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp, Values
+from disctrack.faults.catalogue import faults_of, setup_of
+from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.rolling.effects import Effect
@@ -169,7 +172,7 @@ class DiscSystem(System):
         sizes |= {"table_height.offset": height, "table_plane.tilt_x": slope_y, "table_plane.tilt_y": slope_x}
         of_motion = motion_candidates(self.model, ("contact_radius", "contact_height"))
         of_table = ("table_height", "table_plane")
-        faults = [fault.candidate() for fault in self.faults if fault.name in ("pattern_height", *of_table)]
+        faults = [candidate_of_fault(fault) for fault in self.faults if fault.name in ("pattern_height", *of_table)]
         for candidate in (*of_motion, *faults):
             for q in candidate.quantities:
                 sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]
@@ -238,9 +241,9 @@ class DiscSystem(System):
     def static_view(self, rows: NDArray[np.intp], known: Values) -> StaticView:
         """The dots of these rows about their measured poses. known : faults that the poses were found with."""
         R, t = (np.stack([part] * 2) for part in self._measured_poses())
-        images = predict(R, t, self.rig, self.disc, known)
+        setup = setup_of(self.disc, known)
+        images, delay = predict(R, t, self.rig, self.disc, setup), setup.delay
         pixels, by_pose = images.pixels, images.by_pose
-        delay = setup_of(self.disc, known).delay
         by_time = np.gradient(pixels[:, 1], self.time, axis=0)
         if delay:  # the right camera saw a pose earlier, or later
             rows = rows[(self.time[rows] + delay > self.time[0]) & (self.time[rows] + delay < self.time[-1])]
@@ -254,7 +257,7 @@ class DiscSystem(System):
                 shifts = [fault.column(part, sight)[rows] for part in fault.parts]
                 if fault.name == "time_offset":  # at the speed that the dots are seen to have
                     shifts[0][:, 1] = by_time[rows]
-                sizes[fault.name] = {q.name: q.typical for q in fault.candidate().quantities}
+                sizes[fault.name] = {q.name: q.typical for q in candidate_of_fault(fault).quantities}
                 units = sizes[fault.name].values()
                 faults[fault.name] = np.stack([x * size for x, size in zip(shifts, units, strict=True)], axis=-1)
         nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
@@ -467,7 +470,7 @@ class DiscSystem(System):
         axes = euler_rate_axes_world(q[..., 3], q[..., 4])
         speed[..., 3:] = (axes @ speed[..., 3:, None])[..., 0]
         R, t = rotation_from_euler(q[..., 3], q[..., 4], q[..., 5]), q[..., :3]
-        images = predict(R, t, self.rig, self.disc, values)
+        images = predict(R, t, self.rig, self.disc, setup_of(self.disc, values))
         sight = Sight(self.time, R, t, speed, self.rig, self.disc, values, images)
         for fault in self.faults:
             if fault.in_images and (v := fault.numbers(values)).any():

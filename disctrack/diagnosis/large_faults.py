@@ -10,17 +10,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calibration.cameras.camera import StereoRig, placed_at
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.faults import MeasurementSetup, faults_of, setup_of
+from disctrack.diagnosis.motion import candidate_of_fault
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found, Tried
 from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError
-from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, rotation_from_vector, unwrap_euler
+from disctrack.faults.catalogue import faults_of, setup_of
+from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, unwrap_euler
 from disctrack.rolling import Model
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
@@ -53,16 +53,6 @@ class Assumed:
         return self.base.cost + free * float(np.log(max(self.base.n_data, 2)))
 
 
-def rig_as_it_is(rig: StereoRig, setup: MeasurementSetup) -> StereoRig:
-    """The rig with what became of its cameras after the calibration."""
-    poses = []
-    for (R, t), change in zip(rig.camera_poses(), setup.cameras, strict=True):
-        turn = rotation_from_vector(change.rotation).T
-        poses.append((turn @ R, turn @ (t - change.translation)))
-    left, right = (change.lens(camera) for camera, change in zip(rig.cameras, setup.cameras, strict=True))
-    return replace(rig, left=left, right=right, **placed_at(poses))
-
-
 def in_step(trajectory: Trajectory, delay: float) -> Array:
     """Dots (n, 2, m, 2) with those of the right camera at the left one's instants, by a cubic in time."""
     pixels = trajectory.markers_px.copy()
@@ -88,7 +78,7 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
     fits = fit_poses(
         in_step(trajectory, setup.delay),
         trajectory.markers_covariance_px2,
-        rig_as_it_is(trajectory.rig, setup),
+        setup.cameras_of(trajectory.rig),
         setup.centres(trajectory.disc),
         rotation_from_euler(*trajectory.q[:, 3:].T),
         trajectory.q[:, :3],
@@ -136,7 +126,7 @@ class _Static:
 
 def _found_statically(trajectory: Trajectory, model: Model, names: tuple[str, ...], known: Values) -> _Static:
     """Amounts of these faults from the dots about free poses, which are found with them in turn."""
-    candidates = [f.candidate() for f in faults_of(trajectory.disc) if f.name in names]
+    candidates = [candidate_of_fault(f) for f in faults_of(trajectory.disc) if f.name in names]
     values, gain = dict(known), 0.0
     for _ in range(ITERATIONS):
         seen, _ = with_noise_of_frames(poses_with(trajectory, values))
@@ -161,7 +151,7 @@ def _all_frames(trajectory: Trajectory) -> Stretch:
 
 def _assumed(trajectory: Trajectory, model: Model, names: tuple[str, ...], static: _Static) -> Assumed | None:
     """The motion fitted with these faults among what moves; None where that fails."""
-    candidates = tuple(f.candidate() for f in faults_of(trajectory.disc) if f.name in names)
+    candidates = tuple(candidate_of_fault(f) for f in faults_of(trajectory.disc) if f.name in names)
     seen, noise = with_noise_of_frames(poses_with(trajectory, static.values))
     try:
         stretch = free_stretch(seen)
@@ -179,7 +169,7 @@ def find_clock(system: DiscSystem) -> Assumed | None:
     speed = precession_over_steady(system)
     if STEADY[0] < speed < STEADY[1]:
         return None
-    (candidate,) = (f.candidate() for f in faults_of(system.disc) if f.name == "frame_rate")
+    (candidate,) = (candidate_of_fault(f) for f in faults_of(system.disc) if f.name == "frame_rate")
     (q,) = candidate.quantities
     change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q.lower, q.upper))
     freed = system.again(freed=(candidate,), known={**system.known, q.name: change})

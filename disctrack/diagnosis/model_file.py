@@ -8,10 +8,10 @@ import numpy as np
 
 from calibration.cameras.camera import StereoRig, placed_at, rotation_from_vector
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.faults import scene_faults, setup_of, values_in_scene
 from disctrack.diagnosis.scene_rig import scene_with_rig
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
+from disctrack.faults.catalogue import scene_faults, setup_of, values_in_scene
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
 from disctrack.synthetic.description import Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
@@ -45,7 +45,11 @@ def declared_model(trajectory: Trajectory, choice: str = PAPER) -> Declared:
     scene = load_scene(choice)
     rolling = scene.motion.rolling
     effects = effects_from_tables(rolling.effects, rolling.formulas)
-    return Declared(replace(bare, effects=effects), values_in_scene(trajectory.disc, scene), str(choice))
+    return Declared(
+        replace(bare, effects=effects),
+        values_in_scene(trajectory.disc, scene.faults, scene.cameras.frame_rate_hz),
+        str(choice),
+    )
 
 
 def model_toml(system: DiscSystem, values: Values, name: str) -> str:
@@ -76,7 +80,7 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
             centres_mm=tuple((_rounded(1e3 * x), _rounded(1e3 * y)) for x, y in disc.marker_centres_body[:, :2]),
         ),
     )
-    scene = replace(scene, faults=scene_faults(disc, values, scene))
+    scene = replace(scene, faults=scene_faults(disc, values, scene.cameras.frame_rate_hz))
     rolling = replace(
         scene.motion.rolling,
         theta_deg=float(np.degrees(state["theta"])),

@@ -1,11 +1,13 @@
-"""Effects of the motion, from the rolling model's catalogue, as candidates of the engine."""
+"""Effects of the motion and faults of the measurement, from their two catalogues, as candidates of the engine."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from disctrack.disc import Disc
 from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.faults.catalogue import TYPICAL_STEPS, Fault, faults_of
 from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, State
 
 # Parameters of one effect that act so differently that each part is a question of its own.
@@ -101,3 +103,28 @@ def slip_candidate(effect: type[Effect]) -> Candidate:
     meaning = "1 / coefficient of friction"
     inverse = Quantity(SLIP, "1", 0.1, lower=0.0, upper=1e3, typical=10.0, reciprocal="mu", meaning=meaning)
     return Candidate(effect.name, effect.name, "motion", effect.title, effect.source, (inverse,), threshold=True)
+
+
+def candidate_of_fault(fault: Fault) -> Candidate:
+    """A fault of the measurement as the engine wants it."""
+    several = len(fault.parts) > 1
+    low, high = fault.bounds
+    quantities = tuple(
+        Quantity(
+            name,
+            fault.unit,
+            fault.step,
+            lower=low,
+            upper=high,
+            meaning=f"{fault.meaning} ({part})" if several else fault.meaning,
+            typical=TYPICAL_STEPS * fault.step,
+            belongs_to=fault.belongs_to,
+        )
+        for name, part in zip(fault.names(), fault.parts, strict=True)
+    )
+    return Candidate(fault.name, fault.name, "measurement", fault.title, fault.source, quantities)
+
+
+def measurement_candidates(disc: Disc) -> tuple[Candidate, ...]:
+    """Every fault that a search may find by its quantities alone."""
+    return tuple(candidate_of_fault(fault) for fault in faults_of(disc) if fault.offered)

@@ -8,8 +8,9 @@ import numpy as np
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
+from disctrack.faults.keys import CameraFault
 from disctrack.frames import rotation_from_vector
-from disctrack.synthetic.description import CameraFault, Scene
+from disctrack.synthetic.description import Scene
 
 
 class View(NamedTuple):

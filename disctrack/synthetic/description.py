@@ -14,6 +14,7 @@ from typing import Any
 
 from disctrack.disc import AIR_DENSITY, MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
+from disctrack.faults.keys import Faults
 from disctrack.files.toml_tree import build, read_toml, toml_lines
 
 Pair = tuple[float, float]
@@ -187,57 +188,6 @@ class MotionSettings:
     poses: tuple[tuple[float, ...], ...] = ((32.0, 20.0, 12.0, 30.0, 15.0, 40.0),)
     table: str = ""
     rolling: RollingMotion = field(default_factory=RollingMotion)
-
-
-@dataclass(frozen=True)
-class CameraFault:
-    """What became of one camera after its calibration."""
-
-    rotation_deg: Triple = (0.0, 0.0, 0.0)  # rotation vector in the camera's own axes
-    translation_mm: Triple = (0.0, 0.0, 0.0)  # of the camera, in its own axes
-    focal_scale: float = 1.0
-    k1_change: float = 0.0
-    principal_point_change_px: Pair = (0.0, 0.0)
-    missing_frames: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class Occluder:
-    """A dark rod before one camera, straight in its image, from the first to the last frame named."""
-
-    camera: str = "left"
-    centre_px: Pair = (256.0, 256.0)
-    angle_deg: float = 0.0  # of its axis, from x towards y
-    width_px: float = 20.0
-    length_px: float = 1e4
-    grey: float = 40.0
-    first_frame: int = 0
-    last_frame: int = 10**9
-
-
-@dataclass(frozen=True)
-class Faults:
-    """What goes wrong and is not declared: it changes the images and truth.h5, never recording.toml."""
-
-    right_delay_s: float = 0.0  # the right camera exposes that much later than the left
-    frame_rate_hz: float = 0.0  # true frame rate; 0: the declared one
-    misprint_mm: tuple[Pair, ...] = ()  # true minus declared centre of each dot
-    misprint_sigma_mm: float = 0.0  # the same drawn at random
-    pattern_offset_mm: Pair = (0.0, 0.0)  # paper and dots glued off centre
-    pattern_turn_deg: float = 0.0  # and turned about the disc's axis
-    pattern_scale: float = 1.0  # true over declared distances of the dots from the pattern's middle
-    pattern_height_mm: float = 0.0  # of the dots above half the thickness: paper and glue
-    table_turn_deg: Pair = (0.0, 0.0)  # rotation vector, x and y, of the true table in the axes of the table view
-    table_height_mm: float = 0.0  # of the true table in those axes
-    exposure_s: float = 0.0  # true exposure; 0: that of the cameras
-    ellipse_centre_share: float = (
-        0.0  # not of the images: of whoever takes the centre of a dot's image for the image of
-    )
-    # its centre; 1: not corrected at all. Nothing to draw, but a model may know of it
-    hidden_markers: tuple[int, ...] = ()  # dots that have come off
-    left: CameraFault = field(default_factory=CameraFault)
-    right: CameraFault = field(default_factory=CameraFault)
-    occluders: tuple[Occluder, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.cameras.camera import Camera, StereoRig
 from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
+from disctrack.faults.keys import Occluder
 from disctrack.frames import rotation_from_euler
 from disctrack.synthetic import imperfect, optics
 from disctrack.synthetic.board_raster import draw_board
@@ -20,7 +21,6 @@ from disctrack.synthetic.description import (
     AppearanceSettings,
     ImperfectionSettings,
     LightSettings,
-    Occluder,
     OpticsSettings,
     Scene,
     SensorSettings,

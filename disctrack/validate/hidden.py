@@ -12,9 +12,10 @@ from numpy.random import Generator
 
 from disctrack.diagnosis.systematic import DOT_SIGMA
 from disctrack.errors import DiscTrackError
+from disctrack.faults.catalogue import faults_of
 from disctrack.rolling import CATALOGUE
-from disctrack.synthetic.description import CameraFault, Scene
-from disctrack.validate.points import ORDINARY, STATION, Fields, Laboratory, Planted
+from disctrack.synthetic.description import Scene
+from disctrack.validate.points import ORDINARY, STATION, Laboratory, Planted
 
 Plant = Callable[[float, Generator], Planted]
 
@@ -69,45 +70,18 @@ def _shaken(size: float, rng: Generator) -> Planted:
     return Planted(truth, effects=effects)
 
 
-def _clock(size: float, rng: Generator) -> Planted:
-    value = size * _sign(rng)
-    return Planted({"frame_rate.change": value}, clock=value)
-
-
-def _misprint(size: float, rng: Generator) -> Planted:
-    n_dots = Scene().declared_disc.n_markers
-    which = int(rng.integers(n_dots))
-    x, y = _direction(size, rng, 2)
-    places = [(0.0, 0.0)] * n_dots
-    places[which] = (1e3 * x, 1e3 * y)
-    return Planted({f"misprint_{which}.x": x, f"misprint_{which}.y": y}, faults={"misprint_mm": tuple(places)})
-
-
-def _fault(field: str, *keys: str, factor: float = 1.0, null: float = 0.0) -> Plant:
-    """A fault with a sign, or with a direction; `factor` from the diagnosis' unit to that of the scene's field."""
+def _wrong(name: str, size: float, visible: bool = True) -> HiddenEffect:
+    """A fault of the measurement, of one camera or dot drawn among those there are, with a sign or a direction."""
+    alike = [f for f in faults_of(Scene().declared_disc) if name in (f.name, *f.name.split("_", 1))]
 
     def plant(size: float, rng: Generator) -> Planted:
-        one = [size * _sign(rng)] if len(keys) == 1 else _direction(size, rng, len(keys))
-        return Planted(dict(zip(keys, one, strict=True)), faults=_in_scene(field, one, factor, null))
+        fault = alike[int(rng.integers(len(alike)))]
+        numbers = _direction(size, rng, len(fault.parts))
+        numbers = np.abs(numbers).tolist() if fault.bounds[0] == 0 else numbers
+        truth = dict(zip(fault.names(), numbers, strict=True))
+        return Planted(truth, wrong=truth)
 
-    return plant
-
-
-def _camera(field: str, *keys: str, factor: float = 1.0, null: float = 0.0) -> Plant:
-    """The same of either camera; keys without the camera's name."""
-
-    def plant(size: float, rng: Generator) -> Planted:
-        which = "left" if rng.random() < 0.5 else "right"
-        one = _direction(size, rng, len(keys))
-        truth = {f"{which}_{key}": v for key, v in zip(keys, one, strict=True)}
-        return Planted(truth, faults={which: CameraFault(**_in_scene(field, one, factor, null))})
-
-    return plant
-
-
-def _in_scene(field: str, numbers: list[float], factor: float, null: float) -> Fields:
-    scaled = tuple(null + factor * number for number in numbers)
-    return {field: scaled if len(scaled) > 1 else scaled[0]}
+    return HiddenEffect(name, size, alike[0].unit, plant, visible)
 
 
 HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
@@ -122,7 +96,7 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _motion("table_yielding", 1e-6, "m/N", "c"),
     _motion("creep", 2e-6, "m/s", "c"),
     HiddenEffect("table_shaken", 2e-6, "m", _shaken),
-    HiddenEffect("frame_rate", 0.012, "1", _clock),
+    _wrong("frame_rate", 0.012),
     _motion("rolling_classical", 2e-4, "m", "delta"),
     _motion("air_moffatt", 1.0, "1", "f"),
     _motion("drag_rotation", 2.5e-6, "N m s", "c"),
@@ -147,29 +121,21 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _motion("edge_radius", 1e-4, "m", "rho"),
     _motion("inertia_diametral", 0.005, "1", "e", signed=True),
     _motion("inertia_product", 1e-8, "kg m^2", "inertia_product.J_13", "inertia_product.J_23"),
-    HiddenEffect("time_offset", 1e-4, "s", _fault("right_delay_s", "time_offset.delay")),
-    HiddenEffect("turned", 2e-4, "rad", _camera(
-        "rotation_deg", *(f"turned.rotation_{axis}" for axis in "xyz"), factor=180 / np.pi)),
-    HiddenEffect("shifted", 2e-4, "m", _camera(
-        "translation_mm", *(f"shifted.translation_{axis}" for axis in "xyz"), factor=1e3)),
-    HiddenEffect("focal", 1e-3, "1", _camera("focal_scale", "focal.change", null=1.0)),
-    HiddenEffect("principal_point", 0.3, "px", _camera(
-        "principal_point_change_px", "principal_point.x", "principal_point.y")),
-    HiddenEffect("distortion", 0.05, "1", _camera("k1_change", "distortion.k1")),
-    HiddenEffect("misprint", 2e-5, "m", _misprint),
-    HiddenEffect("pattern_offset", 2e-5, "m", _fault(
-        "pattern_offset_mm", "pattern_offset.x", "pattern_offset.y", factor=1e3)),
-    HiddenEffect("pattern_rotation", 1e-3, "rad", _fault(
-        "pattern_turn_deg", "pattern_rotation.angle", factor=180 / np.pi), visible=False),
-    HiddenEffect("pattern_scale", 1e-3, "1", _fault("pattern_scale", "pattern_scale.change", null=1.0)),
-    HiddenEffect("pattern_height", 5e-5, "m", _fault("pattern_height_mm", "pattern_height.offset", factor=1e3)),
-    HiddenEffect("table_plane", 2e-4, "rad", _fault(
-        "table_turn_deg", "table_plane.tilt_x", "table_plane.tilt_y", factor=180 / np.pi)),
-    HiddenEffect("table_height", 5e-5, "m", _fault("table_height_mm", "table_height.offset", factor=1e3)),
-    HiddenEffect("exposure_blur", 2e-3, "s", lambda size, _: Planted(
-        {"exposure_blur.T2": size**2}, faults={"exposure_s": size})),
-    HiddenEffect("ellipse_centre", 1.0, "1", lambda size, _: Planted(
-        {"ellipse_centre.share": size}, faults={"ellipse_centre_share": size})),
+    _wrong("time_offset", 1e-4),
+    _wrong("turned", 2e-4),
+    _wrong("shifted", 2e-4),
+    _wrong("focal", 1e-3),
+    _wrong("principal_point", 0.3),
+    _wrong("distortion", 0.05),
+    _wrong("misprint", 2e-5),
+    _wrong("pattern_offset", 2e-5),
+    _wrong("pattern_rotation", 1e-3, visible=False),
+    _wrong("pattern_scale", 1e-3),
+    _wrong("pattern_height", 5e-5),
+    _wrong("table_plane", 2e-4),
+    _wrong("table_height", 5e-5),
+    _wrong("exposure_blur", 4e-6),
+    _wrong("ellipse_centre", 1.0),
 )  # fmt: skip
 CONTROLS: tuple[HiddenEffect, ...] = (
     HiddenEffect("nothing", 1.0, "1", lambda size, _: Planted()),
@@ -188,10 +154,9 @@ def hidden_effect(name: str) -> HiddenEffect:
 
 
 def together(planted: Sequence[Planted]) -> Planted:
-    """Several at once; of faults that exclude each other the last one holds."""
-    truth, effects, faults = (
-        {k: v for p in planted for k, v in getattr(p, kind).items()} for kind in ("truth", "effects", "faults")
+    """Several at once."""
+    truth, effects, wrong = (
+        {k: v for p in planted for k, v in getattr(p, kind).items()} for kind in ("truth", "effects", "wrong")
     )
-    clock = next((p.clock for p in reversed(planted) if p.clock), 0.0)
     laboratory = next((p.laboratory for p in reversed(planted) if p.laboratory != Laboratory()), Laboratory())
-    return Planted(truth, effects, faults, clock, laboratory)
+    return Planted(truth, effects, wrong, laboratory=laboratory)

@@ -9,7 +9,6 @@ that the table was taken from was bowed.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,8 @@ from calibration.cameras.camera import N_RIG, StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
+from disctrack.faults.catalogue import scene_faults
+from disctrack.faults.keys import Faults
 from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
@@ -26,11 +27,10 @@ from disctrack.frames import (
 )
 from disctrack.rolling import Effect, Model, simulate, steady_precession
 from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
-from disctrack.synthetic.description import Faults, Scene
+from disctrack.synthetic.description import Scene
 from disctrack.track.pose import fit_poses
 from disctrack.trajectory import Trajectory
 
-Fields = Mapping[str, Any]  # of a dataclass of the scene
 Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
@@ -65,8 +65,8 @@ class Planted:
 
     truth: Mapping[str, float] = field(default_factory=dict)
     effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
-    faults: Fields = field(default_factory=dict)  # of the measurement: fields of a scene's `Faults`
-    clock: float = 0.0  # relative change of the frame rate
+    wrong: Mapping[str, float] = field(default_factory=dict)  # of the measurement: "fault.part" of the catalogue
+    faults: Faults = field(default_factory=Faults)  # and whatever else a scene may have
     laboratory: Laboratory = field(default_factory=Laboratory)
 
 
@@ -114,10 +114,10 @@ def measured(
     motion : in place of the rolling model's   laws : by formula, that `planted` may name   disc : not the scene's
     """
     rng = np.random.default_rng([20261121, filmed.seed])
-    faults = Faults(**planted.faults)
-    rate = faults.frame_rate_hz or filmed.declared_rate * (1.0 + planted.clock)
-    scene = Scene(seed=filmed.seed if filmed.rig_seed is None else filmed.rig_seed, faults=faults)
+    scene = Scene(seed=filmed.seed if filmed.rig_seed is None else filmed.rig_seed)
     disc = disc or scene.declared_disc
+    faults = scene_faults(disc, planted.wrong, filmed.declared_rate, planted.faults)
+    scene, rate = replace(scene, faults=faults), faults.frame_rate_hz or filmed.declared_rate
     believed_rig = rig_of(scene)
     covariance = rig_covariance(believed_rig, scene)
     # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them

@@ -75,6 +75,7 @@ STAIRS = (
     ("disc", "files"),
     ("report",),
     ("trajectory", "rolling", "recording"),
+    ("faults",),
     ("track", "analyse"),
     ("synthetic", "discrepancy"),
     ("diagnosis", "calibrate"),

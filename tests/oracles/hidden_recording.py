@@ -10,14 +10,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from disctrack.synthetic.description import (
-    BoardSettings,
-    CameraSettings,
-    Faults,
-    MotionSettings,
-    RigSettings,
-    Scene,
-)
+from disctrack.faults.keys import Faults
+from disctrack.synthetic.description import BoardSettings, CameraSettings, MotionSettings, RigSettings, Scene
 from disctrack.synthetic.motion import SceneMotion
 from disctrack.synthetic.recording import write_recording
 from tests.oracles import newton_euler

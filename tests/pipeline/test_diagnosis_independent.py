@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from disctrack.cli import main
-from disctrack.synthetic.description import Faults
+from disctrack.faults.keys import Faults
 from tests.oracles import newton_euler
 from tests.oracles.hidden_recording import LEAD, body_of, full_scene, hide, small_scene
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from disctrack.cli import main
-from disctrack.synthetic.description import CameraSettings, Faults, MotionSettings, RollingMotion, Scene
+from disctrack.faults.keys import Faults
+from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
 from disctrack.synthetic.recording import write_recording
 from tests.oracles.hidden_recording import small_scene
 

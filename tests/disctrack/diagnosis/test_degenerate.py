@@ -10,7 +10,7 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.system import Quantity, System
-from disctrack.synthetic.description import Faults
+from disctrack.faults.keys import Faults
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
 

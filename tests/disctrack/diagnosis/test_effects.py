@@ -11,8 +11,8 @@ from disctrack.diagnosis.motion import motion_candidates
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
+from disctrack.faults.keys import CameraFault, Faults
 from disctrack.rolling import CATALOGUE
-from disctrack.synthetic.description import CameraFault, Faults
 from tests.oracles.measured_disc import measured
 
 # hidden effect, faults, names of which one must be given (the effect or its class), and the planted values

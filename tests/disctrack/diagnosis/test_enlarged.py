@@ -8,14 +8,17 @@ from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import rotation_from_vector
 from disctrack.diagnosis import DiscSystem, diagnose
-from disctrack.diagnosis.faults import measurement_candidates, predict
 from disctrack.diagnosis.model_file import declared_model, model_toml
+from disctrack.diagnosis.motion import measurement_candidates
 from disctrack.diagnosis.motion_start import first_state
+from disctrack.faults.catalogue import setup_of
+from disctrack.faults.dots import predict
+from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.cameras import rig_after_faults
-from disctrack.synthetic.description import Faults, load_scene
+from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import rolling_model, rolling_start
 from disctrack.synthetic.recording import true_disc_of
 from tests.oracles.measured_disc import measured
@@ -59,10 +62,12 @@ def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, e
     R = rotation_from_euler(*q[:, 3:].T)
     centres = true_disc_of(scene).disc.marker_centres_body
     rendered = rig_after_faults(rig, scene).project(centres @ np.swapaxes(R, 1, 2) + q[:, None, :3])
-    predicted = predict(np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, everything_wrong).pixels
+    predicted = predict(
+        np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, setup_of(short.disc, everything_wrong)
+    ).pixels
     # arithmetic; the faults move the dots by some pixels
     assert_allclose(np.moveaxis(rendered, -3, 1), predicted, atol=1e-9)
-    plain = predict(np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, {}).pixels
+    plain = predict(np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, setup_of(short.disc, {})).pixels
     assert np.abs(plain - predicted).max() > 0.1
 
 

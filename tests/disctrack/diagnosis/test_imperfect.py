@@ -19,7 +19,7 @@ from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_ov
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.noise import inflation, long_run_variance
 from disctrack.discrepancy.system import Quantity, System
-from disctrack.synthetic.description import CameraFault, Faults
+from disctrack.faults.keys import CameraFault, Faults
 from disctrack.validate.points import ORDINARY, Laboratory
 from tests.oracles.measured_disc import measured
 

@@ -5,11 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.faults import setup_of
-from disctrack.diagnosis.large_faults import in_step, poses_with, rig_as_it_is
+from disctrack.diagnosis.large_faults import in_step, poses_with
+from disctrack.faults.catalogue import setup_of
+from disctrack.faults.keys import CameraFault, Faults
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.cameras import rig_after_faults
-from disctrack.synthetic.description import CameraFault, Faults, Scene
+from disctrack.synthetic.description import Scene
 from disctrack.trajectory import Trajectory
 from tests.disctrack.diagnosis.test_imperfect import recording
 from tests.oracles.measured_disc import measured
@@ -21,7 +22,7 @@ SHIFTED = {f"right_shifted.translation_{a}": 1e-3 * v for a, v in zip("xyz", SHI
 
 def test_the_rig_after_a_knock_is_the_renderers():
     scene = Scene(faults=Faults(right=CameraFault(rotation_deg=TURN_DEG, translation_mm=SHIFT_MM)))
-    ours = rig_as_it_is(rig_of(scene), setup_of(scene.declared_disc, TURNED | SHIFTED))
+    ours = setup_of(scene.declared_disc, TURNED | SHIFTED).cameras_of(rig_of(scene))
     theirs = rig_after_faults(rig_of(scene), scene)
     points = np.random.default_rng(1).uniform(-0.03, 0.06, (20, 3))
     assert_allclose(ours.project(points), theirs.project(points), atol=1e-8)

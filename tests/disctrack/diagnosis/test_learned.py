@@ -25,8 +25,8 @@ from disctrack.diagnosis.pages.output import as_json
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.faults.keys import Faults
 from disctrack.rolling.effects import effect_from_formulas
-from disctrack.synthetic.description import Faults
 from tests.oracles.measured_disc import measured
 from tests.oracles.unknown_laws import recording
 

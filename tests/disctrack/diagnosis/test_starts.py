@@ -13,8 +13,9 @@ from disctrack.diagnosis.stretch import free_stretch
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import Settings
 from disctrack.errors import AnalysisError
+from disctrack.faults.keys import Faults
 from disctrack.rolling import Model, Regime, simulate, steady_precession
-from disctrack.synthetic.description import Faults, Scene
+from disctrack.synthetic.description import Scene
 from disctrack.trajectory import MarkerStatus
 from tests.oracles.measured_disc import K_M, measured
 

@@ -10,18 +10,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack import synthetic
 from disctrack.errors import OutputError, SceneError
+from disctrack.faults.keys import CameraFault, Faults, Occluder
 from disctrack.frames import vector_from_rotation
 from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.description import (
     BoardSettings,
-    CameraFault,
     CameraSettings,
-    Faults,
     GlareSettings,
     LightSettings,
     MarkerSettings,
     MotionSettings,
-    Occluder,
     RigSettings,
     Scene,
     SensorSettings,

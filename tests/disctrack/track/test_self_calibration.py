@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
 from disctrack.disc import MA_2014
+from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler, rotation_from_quaternion, rotation_from_vector, vector_from_rotation
-from disctrack.synthetic.description import CameraFault, Faults
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine.intrinsic_scatter import split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import declared_places_kept, motions_of_pattern, pattern_place

@@ -8,13 +8,13 @@ from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import N_RIG
 from disctrack.diagnosis.stage import diagnose
+from disctrack.faults.keys import Faults
 from disctrack.frames import (
     euler_from_rotation,
     quaternion_from_rotation,
     rotation_from_quaternion,
     unwrap_euler,
 )
-from disctrack.synthetic.description import Faults
 from disctrack.track.judge.doubts import off_the_table_in_words
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine import table_contact

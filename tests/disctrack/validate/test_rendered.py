@@ -8,9 +8,9 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.disc import precession_rate
+from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.synthetic import render_disc, rig_of
-from disctrack.synthetic.description import CameraFault, Faults
 from disctrack.trajectory import part
 from disctrack.validate.accuracy import accuracy_validation, complaints, imperfect_validation, sum_up, verdict
 from disctrack.validate.errors import compare, joined, noise_consistency

@@ -1,0 +1,271 @@
+"""The faults, one by one: quantities, what each alters, where a scene holds it, and its words.
+
+An entry says in `alters` which numbers of the `MeasurementSetup` it is, and in `key` which of a scene's `Faults`; where
+that is not all, in `along` what it does to the dots, and in `to_key`, `from_key` how a scene states it. Candidates of
+the diagnosis, scenes, saved models, planted faults and the page of faults are made from these entries.
+
+Quantities are addressed by name, as parameters of the effects of the motion are: "right_turned.rotation_x". Null is
+always zero: as calibrated, as declared.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from calibration.kit.arrays import Array
+from disctrack.disc import Disc
+from disctrack.faults.dots import MeasurementSetup, Sight, ellipse_centre_shift, predict
+from disctrack.faults.keys import Faults
+from disctrack.frames import CAMERAS
+
+TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
+_DEG = 180 / np.pi
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that may be wrong about the measurement."""
+
+    name: str
+    title: str  # what it is
+    source: str  # what it comes from
+    parts: tuple[str, ...]  # its numbers
+    unit: str
+    step: float  # of a fit: a hundredth of a pixel or so in the image
+    meaning: str
+    key: str  # of a scene's `Faults`: "table_height_mm", "left.rotation_deg"
+    alters: tuple[str | int | slice, ...] = ()  # place in the `MeasurementSetup`
+    factor: float = 1.0  # the scene's key holds null + factor times the numbers
+    null: float = 0.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)  # beyond which no laboratory's lies
+    belongs_to: tuple[str, ...] = ("rig",)  # what two recordings must have in common to share it
+    in_images: bool = False  # adds its number times `column` to the dots' images
+    of_poses_alone: bool = True  # may show in dots about free poses, without a model of the motion
+    offered: bool = True  # as a candidate: it needs no number that is no quantity
+    along: Callable[["Fault", str, Sight], Array] | None = None  # the column of a part; None: by difference
+    to_key: Callable[[Array, Any, float], Any] | None = None  # numbers, the key so far, declared rate [Hz] -> the key
+    from_key: Callable[[Any, float], Any] | None = None
+    seen: str = ""  # what a user notices
+    remedy: str = ""
+    declared: str = ""  # the key of recording.toml that would explain it
+
+    def names(self) -> tuple[str, ...]:
+        """Of its quantities."""
+        return tuple(f"{self.name}.{part}" for part in self.parts)
+
+    def numbers(self, values: Mapping[str, float]) -> Array:
+        """Its numbers among the values; zero where they are not."""
+        return np.array([float(values.get(name, 0.0)) for name in self.names()])
+
+    def alter(self, setup: MeasurementSetup, v: Array) -> None:
+        """Write its numbers v into the setup."""
+        *way, last = self.alters or ("",)
+        place: Any = setup
+        for step in way:
+            place = getattr(place, step) if isinstance(step, str) else place[step]
+        if not isinstance(last, str):
+            place[last] = v
+        elif last:
+            setattr(place, last, v if len(v) > 1 else float(v[0]))
+
+    def column(self, part: str, sight: Sight) -> Array:
+        """Derivative (n, 2, m, 2) of the dots' images by one of its numbers.
+
+        By central difference: what `alter` changes acts smoothly and nearly linearly, and this holds to 1e-8 of it.
+        """
+        if self.along is not None:
+            return self.along(self, part, sight)
+        name, sides = f"{self.name}.{part}", []
+        for sign in (1.0, -1.0):
+            changed = dict(sight.values) | {name: sight.values.get(name, 0.0) + sign * self.step}
+            sides.append(predict(sight.R, sight.t, sight.rig, sight.disc, setup_of(sight.disc, changed)).pixels)
+        return (sides[0] - sides[1]) / (2 * self.step)
+
+    def to_scene(self, faults: Faults, v: Array, rate: float) -> Faults:
+        """The scene's faults with these numbers; rate : declared [Hz]."""
+        camera, _, key = self.key.rpartition(".")
+        place: Any = getattr(faults, camera) if camera else faults
+        if self.to_key is not None:
+            value = self.to_key(v, getattr(place, key), rate)
+        else:
+            numbers = tuple(float(self.null + self.factor * x) for x in v)
+            value = numbers if len(numbers) > 1 else numbers[0]
+        place = replace(place, **{key: value})
+        changed: dict[str, Any] = {camera: place} if camera else vars(place)
+        return replace(faults, **changed)
+
+    def from_scene(self, faults: Faults, rate: float) -> Array:
+        """Inverse of `to_scene`."""
+        camera, _, key = self.key.rpartition(".")
+        value = getattr(getattr(faults, camera) if camera else faults, key)
+        if self.from_key is not None:
+            return np.atleast_1d(np.asarray(self.from_key(value, rate), float))
+        return np.asarray((np.atleast_1d(value) - self.null) / self.factor, float)
+
+
+def _moved(sight: Sight, camera: int, by: Array) -> Array:
+    """Shift of the dots in one camera, all of a frame by a time that is later by `by` (n,) [s]."""
+    return np.einsum("nmap,np->nma", sight.images.by_pose[:, camera], sight.speed[camera] * by[:, None])
+
+
+def _delayed(fault: Fault, part: str, sight: Sight) -> Array:
+    moved = np.zeros_like(sight.images.pixels)
+    moved[:, 1] = _moved(sight, 1, np.ones(len(sight.time)))
+    return moved
+
+
+def _faster(fault: Fault, part: str, sight: Sight) -> Array:
+    rate = 1.0 + fault.numbers(sight.values)[0]
+    earlier = -(sight.time - sight.time[0]) / rate**2
+    return np.stack([_moved(sight, camera, earlier) for camera in range(2)], axis=1)
+
+
+def _of_one_dot(fault: Fault, part: str, sight: Sight) -> Array:
+    moved, dot = np.zeros_like(sight.images.pixels), int(fault.name.partition("_")[2])
+    along = sight.R[:, :, :, fault.parts.index(part)]  # (2, n, 3) body axis in the world
+    moved[:, :, dot] = np.einsum("ncap,cnp->nca", sight.images.by_pose[:, :, dot, :, :3], along)
+    return moved
+
+
+def _blurred(fault: Fault, part: str, sight: Sight) -> Array:
+    """Second derivative of the dots' images by differences over neighbouring frames."""
+    twice = np.gradient(np.gradient(sight.images.pixels, sight.time, axis=0), sight.time, axis=0)
+    return np.asarray(twice, float) / 24
+
+
+def _with_row(dot: int, n: int, v: Array, rows: tuple[Any, ...], rate: float) -> tuple[Any, ...]:
+    """Places of n dots, of which a scene has a row each or none at all, with those of one."""
+    places = list(rows or [(0.0, 0.0)] * n)
+    places[dot] = tuple(float(1e3 * x) for x in v)
+    return tuple(places)
+
+
+def _row(dot: int, rows: tuple[Any, ...], rate: float) -> tuple[float, ...]:
+    return tuple(1e-3 * x for x in rows[dot]) if rows else (0.0, 0.0)
+
+
+CLOCKS = (
+    Fault("time_offset", "the right camera exposes later than the left", "synchronisation of the cameras",
+          ("delay",), "s", 1e-5, "right minus left", "right_delay_s", ("delay",), bounds=(-0.05, 0.05), along=_delayed,
+          seen="the dots of the two cameras contradict each other, the more the faster the disc is",
+          remedy="check the trigger; renumber the images of the camera that is ahead by whole frames"),
+    Fault("frame_rate", "the true frame rate differs from the declared one", "clock of the cameras",
+          ("change",), "1", 1e-4, "true over declared minus one", "frame_rate_hz", ("faster",), bounds=(-0.6, 1.2),
+          of_poses_alone=False, along=_faster,
+          to_key=lambda v, _, rate: float(rate * (1.0 + v[0])) if v[0] else 0.0,
+          from_key=lambda x, rate: x / rate - 1.0 if x else 0.0,
+          seen="the balance of moments asks for another gravity: g goes as the square of the rate",
+          remedy="declare the rate that the camera's software states", declared="[cameras] frame_rate_hz"),
+    Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",
+          ("T2",), "s^2", 1e-7, "square of the exposure", "exposure_s", bounds=(0.0, 1e-3), in_images=True,
+          of_poses_alone=False, along=_blurred, to_key=lambda v, *_: float(np.sqrt(max(v[0], 0.0))),
+          from_key=lambda x, _: x**2, seen="dots smeared along their way, nutation too small",
+          remedy="declare the exposure, or expose for a shorter time", declared="[cameras] exposure_us"),
+    Fault("ellipse_centre", "centres of ellipses were taken for images of the centres", "perspective of circles",
+          ("share",), "1", 0.1, "1: not corrected at all, -1: corrected twice", "ellipse_centre_share",
+          bounds=(-2.0, 2.0), in_images=True,
+          along=lambda _, part, sight: ellipse_centre_shift(sight.R[0], sight.t[0], sight.rig, sight.disc),
+          seen="dots of another program lie off", remedy="correct its centres, or measure with disctrack"),
+)  # fmt: skip
+_KNOCK = "mount, cable, knock"
+_MISSED = "both cameras contradict each other on the same dots, throughout"
+_AGAIN = "calibrate again, in the place where the recording is made"
+OF_CAMERAS = (  # of either camera
+    Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
+          "rad", 1e-5, "in its own axes", "rotation_deg", ("rotation",), _DEG, bounds=(-0.06, 0.06),
+          seen=_MISSED, remedy=_AGAIN),
+    Fault("shifted", "the {} camera moved after its calibration", _KNOCK,
+          ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
+          ("translation",), 1e3, bounds=(-0.01, 0.01), seen=_MISSED, remedy=_AGAIN),
+    Fault("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
+          "relative", "focal_scale", ("focal",), null=1.0, bounds=(-0.05, 0.05), seen=_MISSED, remedy=_AGAIN),
+    Fault("principal_point", "the principal point of the {} camera moved", "lens not fixed", ("x", "y"), "px", 0.01,
+          "in the image", "principal_point_change_px", ("centre",), bounds=(-5.0, 5.0), seen=_MISSED, remedy=_AGAIN),
+    Fault("distortion", "the distortion of the {} camera changed", "focus, aperture, other lens", ("k1",), "1", 1e-3,
+          "change of Brown's k1", "k1_change", ("k1",), bounds=(-1.0, 1.0), seen=_MISSED, remedy=_AGAIN),
+)  # fmt: skip
+_MISPRINT = Fault(
+    "misprint", "dot {} is not where it was declared", "printing", ("x", "y"), "m", 1e-6, "body axes", "misprint_mm",
+    ("misprint",), belongs_to=("disc",), along=_of_one_dot, seen="one dot misses its place in every frame",
+    remedy="measure it on the sheet", declared="[markers] centres_mm",
+)  # fmt: skip
+OF_THE_PAPER = (
+    Fault("pattern_offset", "the dots as a whole are off the disc's centre", "gluing of the paper", ("x", "y"), "m",
+          1e-6, "body axes", "pattern_offset_mm", ("pattern_offset", slice(2)), 1e3, belongs_to=("disc",),
+          seen="the centre circles about another point once a turn of the spin",
+          remedy="declare by how much the sheet can be off", declared="[markers] centre_tolerance_mm"),
+    Fault("pattern_rotation", "the dots as a whole are turned on the face",
+          "gluing; the same as another spin angle", ("angle",), "rad", 1e-5, "about e3", "pattern_turn_deg",
+          ("pattern_turn",), _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
+    Fault("pattern_scale", "the dots as a whole are printed too large", "printer", ("change",), "1", 1e-5, "relative",
+          "pattern_scale", ("pattern_growth",), null=1.0, belongs_to=("disc",),
+          seen="dots and chessboard contradict each other in their scale",
+          remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm"),
+    Fault("pattern_height", "the dots lie higher than half the thickness", "paper, glue, thickness", ("offset",), "m",
+          1e-6, "along e3", "pattern_height_mm", ("pattern_offset", slice(2, 3)), 1e3, belongs_to=("disc",),
+          seen="the disc's lowest point lies off the table",
+          remedy="measure the thickness with its paper", declared="[disc] thickness_mm"),
+)  # fmt: skip
+OF_THE_TABLE = (
+    Fault("table_plane", "the table is not parallel to the calibration's table view", "board on a burr",
+          ("tilt_x", "tilt_y"), "rad", 1e-5, "turn of the true table, calibrated axes", "table_turn_deg",
+          ("table_turn", slice(2)), _DEG, seen="the disc's lowest point rises towards one side",
+          remedy="lay the board flat, and take the table view again", declared="[table] view"),
+    Fault("table_height", "the table is not where the calibration's table view says", "thickness of the board",
+          ("offset",), "m", 1e-6, "true height of the table in the calibrated axes", "table_height_mm",
+          ("table_height",), 1e3, seen="the disc's lowest point lies off the table",
+          remedy="measure the board's thickness", declared="[table] board_thickness_mm"),
+)  # fmt: skip
+
+
+def faults_of(disc: Disc) -> tuple[Fault, ...]:
+    """All that may be wrong about the measurement of this disc."""
+    return _faults_of(disc.n_markers)
+
+
+@cache
+def _faults_of(n_markers: int) -> tuple[Fault, ...]:
+    time_offset, frame_rate, *of_images = CLOCKS
+    of_cameras = (
+        replace(fault, name=f"{camera}_{fault.name}", title=fault.title.format(camera), key=f"{camera}.{fault.key}",
+                alters=("cameras", i, *fault.alters))
+        for fault in OF_CAMERAS
+        for i, camera in enumerate(CAMERAS)
+    )  # fmt: skip
+    misprints = (
+        replace(_MISPRINT, name=f"misprint_{i}", title=_MISPRINT.title.format(i), alters=("misprint", i),
+                to_key=partial(_with_row, i, n_markers), from_key=partial(_row, i))
+        for i in range(n_markers)
+    )  # fmt: skip
+    return (time_offset, frame_rate, *of_cameras, *misprints, *OF_THE_PAPER, *OF_THE_TABLE, *of_images)
+
+
+def setup_of(disc: Disc, values: Mapping[str, float]) -> MeasurementSetup:
+    """How the measurement differs from what was declared where faults have these values; those absent are null."""
+    setup = MeasurementSetup(np.zeros((disc.n_markers, 2)))
+    for fault in faults_of(disc):
+        v = fault.numbers(values)
+        if v.any():
+            fault.alter(setup, v)
+    return setup
+
+
+def scene_faults(disc: Disc, values: Mapping[str, float], rate: float, beside: Faults | None = None) -> Faults:
+    """Faults of a scene with this disc, this declared frame rate [Hz] and these values."""
+    found = beside or Faults()
+    for fault in faults_of(disc):
+        v = fault.numbers(values)
+        if v.any():
+            found = fault.to_scene(found, v, rate)
+    return found
+
+
+def values_in_scene(disc: Disc, faults: Faults, rate: float) -> dict[str, float]:
+    """Inverse of `scene_faults`: the values that are not null."""
+    pairs = [
+        pair for fault in faults_of(disc) for pair in zip(fault.names(), fault.from_scene(faults, rate), strict=True)
+    ]
+    return {name: float(value) for name, value in pairs if value}
