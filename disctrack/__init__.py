@@ -42,10 +42,11 @@ _HOME = {
         "Provenance",
         "write_trajectory",
         "read_trajectory",
-        "write_csv",
         "write_group",
         "read_group",
     ),
+    "disctrack.trajectory.exchange.csv_table": ("write_csv",),
+    "disctrack.trajectory.exchange.formats": ("convert",),
     "disctrack.track.video_overlay": ("write_overlay",),
     "disctrack.analyse.derivatives": ("differentiate",),
     "disctrack.analyse.stage": ("run_analyse",),
@@ -98,10 +99,11 @@ if TYPE_CHECKING:
     from disctrack.trajectory import FrameStatus as FrameStatus
     from disctrack.trajectory import MarkerStatus as MarkerStatus
     from disctrack.trajectory import Trajectory as Trajectory
+    from disctrack.trajectory.exchange.csv_table import write_csv as write_csv
+    from disctrack.trajectory.exchange.formats import convert as convert
     from disctrack.trajectory.file import Provenance as Provenance
     from disctrack.trajectory.file import read_group as read_group
     from disctrack.trajectory.file import read_trajectory as read_trajectory
-    from disctrack.trajectory.file import write_csv as write_csv
     from disctrack.trajectory.file import write_group as write_group
     from disctrack.trajectory.file import write_trajectory as write_trajectory
 

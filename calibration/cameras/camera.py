@@ -315,7 +315,12 @@ def rotation_from_vector(v: Array) -> Array:
 
 
 def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:
-    """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice."""
+    """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice.
+
+    pixels : as the images show them; the lens field of the rig, if it has one, is taken off first
+    """
+    if rig.lens_field is not None:
+        pixels = rig.lens_field.corrected(pixels)
     rays = [
         np.concatenate([normalise(view, camera), np.ones((len(view), 1))], axis=-1)
         for view, camera in zip(pixels, rig.cameras, strict=True)

@@ -382,7 +382,8 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     contradicted = trajectory.frame_status == FrameStatus.CONTRADICTED
     if not np.isfinite(pixels).any() or contradicted.sum() > trajectory.measured.sum():
         return ()  # cameras that do not fit together tell no size
-    seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), trajectory.rig).reshape(n, dots, 3)
+    rig = replace(trajectory.rig, lens_field=None)  # the trajectory's points are without it already
+    seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), rig).reshape(n, dots, 3)
     i, j = np.triu_indices(dots, 1)
     expected = np.linalg.norm(declared.marker_centres_body[i] - declared.marker_centres_body[j], axis=1)
     ratio = np.linalg.norm(seen[:, i] - seen[:, j], axis=2) / expected

@@ -18,7 +18,7 @@ from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import euler_jacobian
-from disctrack.trajectory.file import Group, read_provenance, read_setup, read_trajectory, write_groups
+from disctrack.trajectory.file import Group, read_provenance, read_setup, read_trajectory, trajectory_in, write_groups
 from disctrack.trajectory.reuse import refuse_other
 
 
@@ -76,7 +76,7 @@ def run_analyse(
     """
     from disctrack.analyse.report import write_report  # matplotlib is wanted here only
 
-    path = Path(path)
+    path = trajectory_in(Path(path))
     keep(path)
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_analysis"
     refuse_other(folder / "report.html", overwrite)

@@ -30,6 +30,7 @@ from disctrack.track.measurement import ImagePairs, check_rig, measure, trajecto
 from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
+from disctrack.trajectory.exchange.csv_table import write_csv
 
 RESULTS = "results"
 
@@ -152,7 +153,7 @@ def _companions(
     """Table, pictures and video beside the trajectory; those that a reused result already has are kept."""
     prefix = "" if path.stem == "trajectory" else f"{path.stem}_"
     if options.csv:
-        storage.write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
+        write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
         yield path.with_suffix(".csv")
     if options.figures:
         from disctrack.report.figures import save_figure

@@ -15,13 +15,13 @@ from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
 from disctrack.track.measurement import open_pairs
 from disctrack.track.video_overlay import draw_pair
-from disctrack.trajectory.file import read_provenance
+from disctrack.trajectory.file import read_provenance, trajectory_in
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
-    path = arguments.trajectory
+    path = trajectory_in(arguments.trajectory)
     folder = arguments.output or path.parent / f"{path.stem}_analysis"
     tell_stale(path)
     origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})

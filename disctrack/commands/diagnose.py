@@ -13,14 +13,16 @@ from disctrack.progress import compiling, stage, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.rolling import _assembly as assembly
 from disctrack.track import run_summary as summary
+from disctrack.trajectory.file import trajectory_in
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; returns the exit code."""
-    if len(arguments.trajectory) > 1:
-        return _together(arguments)
-    path = arguments.trajectory[0]
+    paths = [trajectory_in(path) for path in arguments.trajectory]
+    if len(paths) > 1:
+        return _together(paths, arguments)
+    path = paths[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     outputs.tell_stale(path)
     model = Path(arguments.model)
@@ -50,16 +52,16 @@ def run(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _together(arguments: argparse.Namespace) -> int:
+def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
     """One answer for several files."""
-    for path in arguments.trajectory:
+    for path in paths:
         with contextlib.suppress(TrajectoryFileError):  # told of below
             outputs.tell_stale(path)
     with compiling("the simulation of motions", 30):
         assembly.prepare()
-    with steps(f"diagnose {len(arguments.trajectory)} recordings together") as step:
+    with steps(f"diagnose {len(paths)} recordings together") as step:
         outcome = run_together(
-            arguments.trajectory,
+            paths,
             arguments.output,
             model=arguments.model,
             overwrite=arguments.overwrite,

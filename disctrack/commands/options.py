@@ -92,7 +92,7 @@ def add_track(parser: argparse.ArgumentParser) -> None:
 def add_analyse(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack analyse`."""
     what = "file written by disctrack track, or a recording's folder; the file gets four more groups"
-    parser.add_argument("trajectory", type=_trajectory, help=what)
+    parser.add_argument("trajectory", type=Path, help=what)
     parser.add_argument(
         "-o", "--output", type=Path, help="folder for the report (default: NAME_analysis beside the file)"
     )
@@ -125,7 +125,7 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
 def add_diagnose(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack diagnose`."""
     files = "trajectory file, or a recording's folder; the group diagnosis is added to it. Several: one answer"
-    parser.add_argument("trajectory", type=_trajectory, nargs="+", help=files)
+    parser.add_argument("trajectory", type=Path, nargs="+", help=files)
     models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
     parser.add_argument("--model", default="paper", help=models)
     parser.add_argument(
@@ -201,9 +201,10 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "target",
         type=Path,
-        help="by its suffix: a trajectory to .csv, .mat (MATLAB), .c3d; a rig to .yml (OpenCV), .toml "
-        "(Caliscope), .cameramodel (mrcal; -left and -right are added), or from these to .h5",
+        help="by its ending: a trajectory to .csv, .mat, .c3d, .trc, .tsv (QTM), xypts.csv (DLTdv8), .nc; a rig to "
+        ".yml (OpenCV), .toml (Caliscope), .cameramodel (mrcal), camchain.yaml (Kalibr), .mat; these to .h5",
     )
+    parser.add_argument("--as", dest="form", metavar="FORMAT", help="where the ending does not tell, e.g. Pose2Sim")
     parser.add_argument(
         "--table",
         action="store_true",
@@ -252,19 +253,6 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("validation"), help="folder of tables (%(default)s)")
     parser.add_argument("--write", type=Path, metavar="FILE", help="also put the tables into this Markdown page")
     parser.add_argument("--quiet", action="store_true", help="do not tell of every recording")
-
-
-def _trajectory(text: str) -> Path:
-    """A folder stands for the trajectory in it, or in its results."""
-    path = Path(text)
-    if not path.is_dir():
-        return path
-    for file in (path / "trajectory.h5", path / "results" / "trajectory.h5"):
-        if file.is_file():
-            return file
-    raise argparse.ArgumentTypeError(
-        f"{path}: no results/trajectory.h5 in this folder; 'disctrack run {path}' makes it"
-    )
 
 
 def _corners(text: str) -> tuple[int, int]:

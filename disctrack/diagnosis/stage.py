@@ -43,7 +43,7 @@ from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
+from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory, trajectory_in
 from disctrack.trajectory.reuse import refuse_other
 
 TRIED_BESIDE = 3  # effects of the catalogue beside what was found, where what is left is not noise
@@ -454,7 +454,7 @@ def run_diagnose(
     from disctrack.diagnosis.free_runs import evidence
     from disctrack.diagnosis.pages.report import write_report  # matplotlib is wanted here only
 
-    path = Path(path)
+    path = trajectory_in(Path(path))
     keep(path)
     keep(Path(model))
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"

@@ -5,7 +5,6 @@ reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those 
 """
 
 import contextlib
-import csv
 import hashlib
 import io
 import json
@@ -92,9 +91,22 @@ def write_trajectory(
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's."""
-    with _Reading(Path(path)) as file:
+    """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's.
+
+    path : of the file, or of the folder that holds it, itself or in its `results`
+    """
+    with _Reading(trajectory_in(Path(path))) as file:
         return _trajectory(file)
+
+
+def trajectory_in(path: Path) -> Path:
+    """A folder stands for the trajectory in it, or in its results. Raises TrajectoryFileError where there is none."""
+    if not path.is_dir():
+        return path
+    for file in (path / "trajectory.h5", path / "results" / "trajectory.h5"):
+        if file.is_file():
+            return file
+    raise TrajectoryFileError(f"{path}: no results/trajectory.h5 in this folder; 'disctrack run {path}' makes it")
 
 
 def read_provenance(path: Path) -> Provenance:
@@ -194,39 +206,6 @@ def read_setup(path: Path) -> FilmedSetup:
             gravity=float(file.attrs["gravity_m_s2"]),
             fingerprint=str(file.attrs["fingerprint"]),
         )
-
-
-def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
-    """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown.
-
-    Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
-    calibration. Coordinates have seven decimals however many turns the angles have counted, sigmas seven digits.
-    """
-    path = Path(path)
-    refuse_existing(path, overwrite)
-    scale = np.array([1e3, 1e3, 1e3, *np.degrees([1.0, 1.0, 1.0])])
-    units = ["mm"] * 3 + ["deg"] * 3
-    names = [f"{name}_{unit}" for name, unit in zip(COORDINATES, units, strict=True)]
-    header = ["frame", "time_s", *names, *(n.replace("_", "_sigma_") for n in names)]
-    header += [n.replace("_", "_sigma_calibration_") for n in names]
-    header += [*(f"reprojection_rms_{camera}_px" for camera in CAMERAS), "status"]
-    table = np.column_stack(
-        [
-            trajectory.q * scale,
-            trajectory.coordinate_sigma * scale,
-            trajectory.calibration_sigma * scale,
-            trajectory.reprojection_rms_px,
-        ]
-    )
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(header)
-    for frame, time, values, status in zip(
-        trajectory.frame, trajectory.time, table, trajectory.frame_status, strict=True
-    ):
-        cells = ["" if np.isnan(v) else f"{v:.7f}" if i < 6 else f"{v:.7g}" for i, v in enumerate(values)]
-        writer.writerow([frame, f"{time:.9g}", *cells, FrameStatus(status).name.lower()])
-    write_whole(path, text.getvalue().encode())
 
 
 def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, Variable]]:

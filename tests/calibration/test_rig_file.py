@@ -6,11 +6,9 @@ from dataclasses import fields, is_dataclass, replace
 import h5py
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from calibration import Board, Camera, Observations, RigFileError, StereoRig
 from calibration.cameras.camera import N_RIG, rotation_from_vector
-from calibration.cameras.opencv_yaml import export_opencv, import_opencv
 from calibration.rig_file import CalibrationRecord, RigFile, read_rig, read_rig_file, write_rig
 
 
@@ -160,34 +158,3 @@ def test_damaged_files_give_an_error_or_a_rig_but_never_a_crash(content, tmp_pat
             continue
         refused += 1
     assert refused >= 100  # every cut file; a changed byte may hit a description only
-
-
-def test_opencv_yaml_keeps_all_but_the_covariance(rig, tmp_path):
-    export_opencv(tmp_path / "rig.yml", rig)
-    back = import_opencv(tmp_path / "rig.yml")
-    for a, b in zip(rig.cameras, back.cameras, strict=True):
-        assert_allclose(b.parameters, a.parameters, rtol=1e-15)
-        assert b.image_size == a.image_size
-    for name in ("R_right_left", "t_right_left", "R_left_world", "t_left_world"):
-        assert_allclose(getattr(back, name), getattr(rig, name), rtol=1e-14, atol=1e-16)
-    assert back.world_is_table
-    assert not back.covariance.any()
-
-
-def test_opencv_yaml_without_unit_or_with_rational_distortion_is_refused(rig, tmp_path):
-    export_opencv(tmp_path / "rig.yml", rig)
-    text = (tmp_path / "rig.yml").read_text()
-    (tmp_path / "no_unit.yml").write_text(text.replace("unit: m", "unit: foot").replace('unit: "m"', 'unit: "foot"'))
-    with pytest.raises(RigFileError, match="unit"):
-        import_opencv(tmp_path / "no_unit.yml")
-    assert_allclose(import_opencv(tmp_path / "no_unit.yml", unit=0.5).baseline, 0.5 * rig.baseline)
-    (tmp_path / "no_R.yml").write_text(text.replace("\nR:", "\nQ:"))
-    with pytest.raises(RigFileError, match="R missing"):
-        import_opencv(tmp_path / "no_R.yml")
-    for cut in range(0, len(text), 37):
-        (tmp_path / "cut.yml").write_text(text[:cut])
-        with contextlib.suppress(RigFileError):
-            import_opencv(tmp_path / "cut.yml")
-    (tmp_path / "junk.yml").write_text("%YAML:1.0\n---\nM1: [1, 2")
-    with pytest.raises(RigFileError, match=r"junk\.yml"):
-        import_opencv(tmp_path / "junk.yml")

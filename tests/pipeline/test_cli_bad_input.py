@@ -51,10 +51,9 @@ def test_a_folder_that_is_not_there(tmp_path, capsys):
 
 
 def test_a_folder_without_a_trajectory(recording, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["analyse", str(recording)])
-    assert ended.value.code == 2
-    assert f"no results/trajectory.h5 in this folder; 'disctrack run {recording}' makes it" in capsys.readouterr().err
+    assert f"no results/trajectory.h5 in this folder; 'disctrack run {recording}' makes it" in failure(
+        capsys, "analyse", recording
+    )
 
 
 def test_a_misspelt_key(recording, capsys):

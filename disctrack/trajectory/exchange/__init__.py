@@ -1,1 +1,1 @@
-"""Trajectories and rigs in the formats of other programs."""
+"""Trajectories, rigs and points in the formats of other programs: a format is a small module and a row in `formats`."""

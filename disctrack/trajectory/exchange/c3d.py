@@ -4,26 +4,24 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from disctrack.errors import OutputError
-from disctrack.files.whole import refuse_existing, whole_file
-from disctrack.frames import rotation_from_quaternion
+from disctrack.files.whole import whole_file
 from disctrack.trajectory import Trajectory
+from disctrack.trajectory.exchange.motion import body_points
 
 
-def write_c3d(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Path:
+def write_c3d(path: Path, trajectory: Trajectory) -> None:
     """Dots, centre and the tips of the body axes as points in mm, world axes, z up; times at the frame rate.
 
     The body axes are points one radius from the centre (AXIS_1, AXIS_2 in the face, AXIS_3 out of it), from which any
     program builds the rigid body; a point's residual is its one-sigma in mm, -1 in frames without a pose. C3D keeps
     single precision: 1e-4 mm at 1 m. Raises OutputError, also where ezc3d is not installed.
     """
-    refuse_existing(path, overwrite)
     try:
         import ezc3d
     except ImportError as error:
         raise OutputError(f"{path}: C3D needs ezc3d: pip install ezc3d") from error
-    points, labels = _points(trajectory)
+    points, labels = body_points(trajectory)
     sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
     file = ezc3d.c3d()
     parameters = file["parameters"]
@@ -42,7 +40,6 @@ def write_c3d(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Pa
     file.add_parameter("DISC", "MASS", 1e3 * trajectory.disc.mass)
     with whole_file(path, suffix=".c3d") as part:
         file.write(str(part))
-    return path
 
 
 _DESCRIPTIONS = {
@@ -51,12 +48,3 @@ _DESCRIPTIONS = {
     "AXIS_2": "centre + radius * second body axis",
     "AXIS_3": "centre + radius * normal of the upper face",
 }
-
-
-def _points(trajectory: Trajectory) -> tuple[Array, list[str]]:
-    """World places (n, k, 3) [m] and their labels."""
-    disc = trajectory.disc
-    body = np.concatenate([np.zeros((1, 3)), disc.radius * np.eye(3), disc.marker_centres_body])
-    R = rotation_from_quaternion(trajectory.quaternion)
-    labels = ["CENTRE", "AXIS_1", "AXIS_2", "AXIS_3", *(f"DOT_{i}" for i in range(disc.n_markers))]
-    return body @ np.swapaxes(R, 1, 2) + trajectory.q[:, None, :3], labels

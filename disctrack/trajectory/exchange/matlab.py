@@ -1,24 +1,37 @@
-"""A trajectory for MATLAB and Octave: one struct `disctrack` in a MAT file of version 5."""
+"""MAT files of version 5 for MATLAB and Octave: a trajectory as one struct, a rig as the stereo toolbox has it.
+
+Objects cannot be written into such a file, so a rig is kept as the arguments of MATLAB's own function, under its names:
+
+    s = load('rig.mat');
+    stereoParams = stereoParametersFromOpenCV(s.intrinsicMatrix1, s.distortionCoefficients1, s.intrinsicMatrix2, ...
+        s.distortionCoefficients2, s.rotationOfCamera2, s.translationOfCamera2, s.imageSize, WorldUnits=s.worldUnits);
+
+Back again: save what stereoParametersToOpenCV returns under these names. MATLAB counts rows before columns.
+"""
 
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
-from disctrack.files.whole import refuse_existing, write_whole
+from calibration.cameras.camera import StereoRig
+from disctrack.errors import RigFileError
+from disctrack.files.whole import write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, rotation_of, the_one
 from disctrack.trajectory.file import labelled
 
 
-def write_mat(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Path:
+def write_mat(path: Path, trajectory: Trajectory) -> None:
     """Every variable of the trajectory file's root and the dots, in SI and radians; NaN where there is no answer.
 
     disctrack.q (n, 6) with disctrack.q_names, q_sigma (this frame's noise), q_sigma_calibration (common to all frames);
     disctrack.units tells the unit of every field. Raises OutputError.
     """
-    refuse_existing(path, overwrite)
     root, markers, _ = labelled(trajectory)
     fields = {name: np.asarray(item.data) for name, item in root.items()}
     fields |= {f"marker_{name}": np.asarray(item.data) for name, item in markers.items()}
@@ -45,7 +58,66 @@ def write_mat(path: Path, trajectory: Trajectory, overwrite: bool = False) -> Pa
         },
         "units": {"time": "s", "q": "m, m, m, rad, rad, rad", **units},
     }
+    _save(path, {"disctrack": content})
+
+
+def write_stereo_parameters(path: Path, rig: StereoRig) -> None:
+    """Arguments of stereoParametersFromOpenCV in metres; the world frame beside them. Raises OutputError."""
+    content: dict[str, Any] = {"worldUnits": "m", "imageSize": np.array(rig.left.image_size[::-1], float)[None]}
+    for number, camera in enumerate(rig.cameras, start=1):
+        content[f"intrinsicMatrix{number}"] = camera.camera_matrix
+        content[f"distortionCoefficients{number}"] = np.array([camera.distortion])
+    content |= {"rotationOfCamera2": rig.R_right_left, "translationOfCamera2": rig.t_right_left}
+    content |= {"R_left_world": rig.R_left_world, "t_left_world": rig.t_left_world}
+    _save(path, content | {"world_is_table": rig.world_is_table})
+
+
+def read_stereo_parameters(
+    paths: Sequence[Path], *, unit: float | None = None, world_is_table: bool = False
+) -> StereoRig:
+    """A rig of such a MAT file.
+
+    unit : [m] of translationOfCamera2 where the file has no worldUnits that tell it
+    world_is_table : True if the world of R_left_world is the table, k up, whether or not the file says so
+    Raises RigFileError.
+    """
+    path = the_one(paths)
+    try:
+        found = loadmat(path)
+    except (OSError, ValueError, NotImplementedError, TypeError) as error:
+        raise RigFileError(f"{path}: not a MAT file of version 5 ({error}); save it with -v6 or -v7") from error
+    if "intrinsicMatrix1" not in found:
+        there = ", ".join(name for name in found if not name.startswith("__"))
+        raise RigFileError(
+            f"{path}: holds {there or 'nothing'}; save what stereoParametersToOpenCV returns, by its names"
+        )
+    told = str(np.ravel(found.get("worldUnits", ""))[0]) if np.size(found.get("worldUnits", "")) else ""
+    scale = unit if unit is not None else {"m": 1.0, "mm": 1e-3}.get(told)
+    if scale is None:
+        raise RigFileError(f"{path}: does not say in which unit translationOfCamera2 is; give it (0.001 for mm)")
+    size = array_of(found, "imageSize", (2,), str(path))[::-1]
+    left, right = (
+        camera_of(
+            array_of(found, f"intrinsicMatrix{number}", (3, 3), str(path)),
+            array_of(found, f"distortionCoefficients{number}", (-1,), str(path)),
+            size,
+            f"{path}: intrinsicMatrix{number}",
+        )
+        for number in (1, 2)
+    )
+    world = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0} | found
+    return StereoRig(
+        left,
+        right,
+        rotation_of(array_of(found, "rotationOfCamera2", (-1,), str(path)), f"{path}: rotationOfCamera2"),
+        array_of(found, "translationOfCamera2", (3,), str(path)) * scale,
+        rotation_of(array_of(world, "R_left_world", (-1,), str(path)), f"{path}: R_left_world"),
+        array_of(world, "t_left_world", (3,), str(path)) * scale,
+        world_is_table=world_is_table or bool(np.ravel(world["world_is_table"])[0]),
+    )
+
+
+def _save(path: Path, content: Mapping[str, Any]) -> None:
     buffer = io.BytesIO()
-    savemat(buffer, {"disctrack": content}, oned_as="column", long_field_names=True)
+    savemat(buffer, dict(content), oned_as="column", long_field_names=True)
     write_whole(path, buffer.getbuffer())
-    return path

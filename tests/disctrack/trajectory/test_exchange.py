@@ -1,18 +1,23 @@
 """Trajectories and rigs in the formats of other programs, read back by those programs' own libraries or by OpenCV."""
 
 import ast
+import contextlib
 import csv
+import re
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
+import disctrack
+from calibration import triangulate
 from calibration.cameras.camera import N_RIG, StereoRig, project
-from calibration.cameras.foreign_rigs import export_caliscope, export_mrcal, import_caliscope, import_mrcal
-from calibration.cameras.opencv_yaml import export_opencv, import_opencv
+from calibration.cameras.splines import LensField
+from calibration.rig_file import read_rig, write_rig
 from disctrack.cli import main
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, RigFileError
@@ -25,9 +30,10 @@ from disctrack.frames import (
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.c3d import write_c3d
-from disctrack.trajectory.exchange.matlab import write_mat
-from disctrack.trajectory.file import write_csv
+from disctrack.trajectory.exchange import c3d as c3d_file
+from disctrack.trajectory.exchange import caliscope, dlt, formats, matlab, mrcal, opencv, qtm, trc, xmalab
+from disctrack.trajectory.exchange.csv_table import write_csv
+from disctrack.trajectory.file import Provenance, write_trajectory
 
 
 @pytest.fixture
@@ -80,31 +86,139 @@ def by_opencv(K, D, r, t, points):
     return cv2.projectPoints(points, r, t, K, D)[0].reshape(-1, 2)
 
 
-def test_caliscope_toml_projects_as_the_rig_does(rig, world_points, tmp_path):
-    path = tmp_path / "camera_array.toml"
-    export_caliscope(path, rig)
-    cameras = tomllib.loads(path.read_text())["cameras"]
-    for number, expected in enumerate(rig.project(world_points)):
-        c = cameras[str(number)]
-        found = by_opencv(c["matrix"], c["distortions"], c["rotation"], c["translation"], world_points)
-        assert found == pytest.approx(expected, abs=1e-7)
-    again = import_caliscope(path, world_is_table=True)
-    assert again.project(world_points) == pytest.approx(rig.project(world_points), abs=1e-9)
-    assert again.world_is_table
+def cameras_of_caliscope(path):
+    """K, distortion, rotation vector, translation of each camera."""
+    tables = tomllib.loads(path.read_text())
+    for c in tables.get("cameras", {k: v for k, v in tables.items() if k != "metadata"}).values():
+        yield c["matrix"], c["distortions"], c["rotation"], c["translation"]
+
+
+def cameras_of_mrcal(path):
+    for side in ("left", "right"):
+        model = ast.literal_eval(path.with_name(f"{path.stem}-{side}.cameramodel").read_text())
+        fx, fy, cx, cy, *D = model["intrinsics"]
+        yield [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], D, model["extrinsics"][:3], model["extrinsics"][3:]
+
+
+def cameras_of_kalibr(path):
+    yaml = pytest.importorskip("yaml")
+    chain = yaml.safe_load(path.read_text())
+    for name in ("cam0", "cam1"):
+        fx, fy, cx, cy = chain[name]["intrinsics"]
+        T = np.array(chain[name].get("T_cn_cnm1", np.eye(4)))
+        K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        yield K, chain[name]["distortion_coeffs"], cv2.Rodrigues(T[:3, :3])[0], T[:3, 3]
+
+
+def cameras_of_matlab(path):
+    """As stereoParametersFromOpenCV takes them; the world beside them."""
+    s = loadmat(path)
+    assert s["imageSize"].tolist() == [[512, 512]]
+    R, t = s["R_left_world"], s["t_left_world"].ravel()
+    yield s["intrinsicMatrix1"], s["distortionCoefficients1"], cv2.Rodrigues(R)[0], t
+    turn, shift = s["rotationOfCamera2"], s["translationOfCamera2"].ravel()
+    yield s["intrinsicMatrix2"], s["distortionCoefficients2"], cv2.Rodrigues(turn @ R)[0], turn @ t + shift
+
+
+def cameras_of_opencv(path):
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    M1, D1, M2, D2, R, T, Rw, tw = (
+        file.getNode(name).mat() for name in ("M1", "D1", "M2", "D2", "R", "T", "R_left_world", "t_left_world")
+    )
+    yield M1, D1, cv2.Rodrigues(Rw)[0], tw
+    yield M2, D2, cv2.Rodrigues(R @ Rw)[0], R @ tw + T
+
+
+@pytest.mark.parametrize(
+    ("name", "cameras"),
+    [
+        ("rig.toml", cameras_of_caliscope),
+        ("rig.pose2sim.toml", cameras_of_caliscope),
+        ("rig.cameramodel", cameras_of_mrcal),
+        ("rig-camchain.yaml", cameras_of_kalibr),
+        ("rig.mat", cameras_of_matlab),
+        ("rig.yml", cameras_of_opencv),
+    ],
+)
+def test_a_rig_projects_as_ours_in_every_format_and_back(rig, world_points, tmp_path, name, cameras):
+    without_k3 = name in ("rig.pose2sim.toml", "rig-camchain.yaml")
+    if without_k3:  # formats that hold four terms
+        rig = replace(rig, left=no_k3(rig.left), right=no_k3(rig.right))
+    write_rig(tmp_path / "own.h5", rig)
+    written, notes = disctrack.convert(tmp_path / "own.h5", tmp_path / name)
+    assert "covariances" in notes[0]
+    assert len(notes) == 1
+    points = world_points if "camchain" not in name else world_points @ rig.R_left_world.T + rig.t_left_world
+    for found, expected in zip(cameras(tmp_path / name), rig.project(world_points), strict=True):
+        K, D, r, t = found
+        assert by_opencv(K, D, r, t, points) == pytest.approx(expected, abs=1e-7)
+    told = {} if "camchain" in name else {"world_is_table": True}
+    disctrack.convert(written, tmp_path / "back.h5", **told)
+    again = read_rig(tmp_path / "back.h5")
+    assert again.project(points) == pytest.approx(rig.project(world_points), abs=1e-7)
+    assert again.world_is_table == bool(told)
     assert not again.covariance.any()
 
 
-def test_mrcal_models_project_as_the_rig_does(rig, world_points, tmp_path):
-    paths = (tmp_path / "a.cameramodel", tmp_path / "b.cameramodel")
-    export_mrcal(paths, rig)
-    for path, expected in zip(paths, rig.project(world_points), strict=True):
-        model = ast.literal_eval(path.read_text())
-        fx, fy, cx, cy, *D = model["intrinsics"]
-        K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-        rt = model["extrinsics"]
-        assert by_opencv(K, D, rt[:3], rt[3:], world_points) == pytest.approx(expected, abs=1e-7)
-    again = import_mrcal(*paths)
-    assert again.project(world_points) == pytest.approx(rig.project(world_points), abs=1e-9)
+def no_k3(camera):
+    return replace(camera, distortion=(*camera.distortion[:4], 0.0))
+
+
+def test_dlt_coefficients_describe_the_points_of_xypts(rig, trajectory, tmp_path):
+    """Two files of DLTdv8 that belong together: its formula, by hand, gives the dots of every frame in metres."""
+    write_rig(tmp_path / "own.h5", rig)
+    (path,), notes = disctrack.convert(tmp_path / "own.h5", tmp_path / "clip_dltcoefs.csv")
+    assert "lens" in notes[0]
+    L = np.loadtxt(path, delimiter=",")
+    dlt.write_xypts(tmp_path / "clip_xypts.csv", trajectory)
+    with (tmp_path / "clip_xypts.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    body = trajectory.disc.marker_centres_body[4]
+    for i in np.flatnonzero(trajectory.measured)[::7]:
+        A, b = [], []
+        for c in (0, 1):
+            for axis, name in enumerate("XY"):
+                p, own, last = float(rows[i][f"pt5_cam{c + 1}_{name}"]), L[4 * axis : 4 * axis + 4, c], L[8:, c]
+                A.append(own[:3] - p * last)
+                b.append(p - own[3])
+        R = rotation_from_euler(*trajectory.q[i, 3:])
+        assert np.linalg.lstsq(np.array(A), b, rcond=None)[0] == pytest.approx(R @ body + trajectory.q[i, :3], abs=1e-8)
+    told = {"image_size": (512, 512), "unit": 1.0, "world_is_table": True}
+    disctrack.convert(path, tmp_path / "back.h5", **told)
+    again = read_rig(tmp_path / "back.h5")
+    assert again.left.parameters[:4] == pytest.approx(rig.left.parameters[:4], abs=1e-6)
+    assert again.t_left_world == pytest.approx(rig.t_left_world, abs=1e-9)
+    points = formats.read_foreign([tmp_path / "clip_xypts.csv"])
+    assert points.shape == trajectory.markers_px.shape
+    with pytest.raises(OutputError, match="points are read in Python"):
+        disctrack.convert(tmp_path / "clip_xypts.csv", tmp_path / "clip.yml")
+
+
+def with_field(rig, size=0.3):
+    """A lens that moves points by up to `size` px, smoothly but by no polynomial of Brown's."""
+    coefficients = np.random.default_rng(3).uniform(-size, size, (2, 2, 8, 8))
+    return replace(rig, lens_field=LensField(coefficients, 512 / 5))
+
+
+def test_what_a_lens_field_costs_in_another_format_is_said_and_true(rig, world_points, tmp_path):
+    """Refitted coefficients are nearer to the images than those that leave the field out; triangulation uses it."""
+    bent = with_field(rig)
+    write_rig(tmp_path / "own.h5", bent)
+    (path,), notes = disctrack.convert(tmp_path / "own.h5", tmp_path / "rig.yml")
+    said = float(re.search(r"lens field fitted by .*: images differ by (\S+) px rms", notes[1])[1])
+    shown = bent.lens_field.distorted(rig.project(world_points))
+    assert triangulate(shown, bent) == pytest.approx(world_points, abs=1e-9)
+    assert np.abs(triangulate(shown, rig) - world_points).max() > 1e-6
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.09, 0.09, 30)], [0.0]), -1).reshape(-1, 3)
+    pixels = rig.project(grid)
+    inside = ((pixels > 0) & (pixels < 511)).all(axis=(0, 2))
+    shown = bent.lens_field.distorted(pixels)[:, inside]
+    fitted = np.array([by_opencv(K, D, r, t, grid[inside]) for K, D, r, t in cameras_of_opencv(path)])
+    refitted, left_out = (np.sqrt(np.mean((p - shown) ** 2)) for p in (fitted, pixels[:, inside]))
+    assert refitted < 0.9 * left_out
+    assert refitted == pytest.approx(said, rel=0.3)  # another sample of the image
+    write_rig(tmp_path / "plain.h5", rig)
+    assert len(disctrack.convert(tmp_path / "plain.h5", tmp_path / "plain.yml").notes) == 1
 
 
 def test_our_lens_terms_are_those_of_mrcals_own_example(tmp_path):
@@ -114,7 +228,7 @@ def test_our_lens_terms_are_those_of_mrcals_own_example(tmp_path):
       'extrinsics': [0, 0, 0, %g, 0, 0], 'imagersize': [1000, 700] }"""
     (tmp_path / "l.cameramodel").write_text(text % 0.0)
     (tmp_path / "r.cameramodel").write_text(text % 0.1)
-    rig = import_mrcal(tmp_path / "l.cameramodel", tmp_path / "r.cameramodel")
+    rig = mrcal.read_mrcal([tmp_path / "l.cameramodel", tmp_path / "r.cameramodel"])
     assert project(np.array([[1.0, 2.0, 10.0]]), rig.left)[0] == pytest.approx([651.2740691, 555.2309482], abs=1e-6)
     assert rig.baseline == pytest.approx(0.1)
 
@@ -131,20 +245,20 @@ def test_models_that_are_not_browns_are_refused_by_name(text, words, tmp_path):
     file = tmp_path / "x.cameramodel"
     file.write_text(text)
     with pytest.raises(RigFileError, match=words):
-        import_mrcal(file, file)
+        mrcal.read_mrcal([file, file])
 
 
 def test_a_fisheye_and_a_third_camera_are_refused_by_name(rig, tmp_path):
     path = tmp_path / "camera_array.toml"
-    export_caliscope(path, rig)
+    caliscope.write_caliscope(path, rig)
     text = path.read_text()
     path.write_text(text.replace("fisheye = false", "fisheye = true", 1))
     with pytest.raises(RigFileError, match="camera 0: a fisheye"):
-        import_caliscope(path)
+        caliscope.read_caliscope([path])
     path.write_text(text + text.replace("[cameras.0]", "[cameras.5]").partition("[cameras.1]")[0])
     with pytest.raises(RigFileError, match="0, 1, 5; name two"):
-        import_caliscope(path)
-    assert import_caliscope(path, ("0", "1")).baseline == pytest.approx(rig.baseline)
+        caliscope.read_caliscope([path])
+    assert caliscope.read_caliscope([path], cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
 
 
 @pytest.mark.parametrize(
@@ -157,8 +271,8 @@ def test_a_fisheye_and_a_third_camera_are_refused_by_name(rig, tmp_path):
     ],
 )
 def test_what_is_not_a_camera_matrix_is_refused(rig, tmp_path, change, words):
-    export_opencv(tmp_path / "rig.yml", rig)
-    export_caliscope(tmp_path / "rig.toml", rig)
+    opencv.write_opencv(tmp_path / "rig.yml", rig)
+    caliscope.write_caliscope(tmp_path / "rig.toml", rig)
     K, source = rig.left.camera_matrix, cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
     target = cv2.FileStorage(str(tmp_path / "other.yml"), cv2.FILE_STORAGE_WRITE)
     target.write("M1", change(K))
@@ -166,11 +280,30 @@ def test_what_is_not_a_camera_matrix_is_refused(rig, tmp_path, change, words):
         target.write(name, source.getNode(name).mat())
     target.release()
     with pytest.raises(RigFileError, match=f"M1.*{words}"):
-        import_opencv(tmp_path / "other.yml", unit=1.0)
+        opencv.read_opencv([tmp_path / "other.yml"], unit=1.0)
     text = (tmp_path / "rig.toml").read_text()
     (tmp_path / "other.toml").write_text(text.replace(f"matrix = {K.tolist()}", f"matrix = {change(K).tolist()}"))
     with pytest.raises(RigFileError, match=f"camera 0.*{words}"):
-        import_caliscope(tmp_path / "other.toml")
+        caliscope.read_caliscope([tmp_path / "other.toml"])
+
+
+def test_opencv_yaml_without_unit_or_with_rational_distortion_is_refused(rig, tmp_path):
+    opencv.write_opencv(tmp_path / "rig.yml", rig)
+    text = (tmp_path / "rig.yml").read_text()
+    (tmp_path / "no_unit.yml").write_text(text.replace("unit: m", "unit: foot").replace('unit: "m"', 'unit: "foot"'))
+    with pytest.raises(RigFileError, match="unit"):
+        opencv.read_opencv([tmp_path / "no_unit.yml"])
+    assert opencv.read_opencv([tmp_path / "no_unit.yml"], unit=0.5).baseline == pytest.approx(0.5 * rig.baseline)
+    (tmp_path / "no_R.yml").write_text(text.replace("\nR:", "\nQ:"))
+    with pytest.raises(RigFileError, match="R missing"):
+        opencv.read_opencv([tmp_path / "no_R.yml"])
+    for cut in range(0, len(text), 37):
+        (tmp_path / "cut.yml").write_text(text[:cut])
+        with contextlib.suppress(RigFileError):
+            opencv.read_opencv([tmp_path / "cut.yml"])
+    (tmp_path / "junk.yml").write_text("%YAML:1.0\n---\nM1: [1, 2")
+    with pytest.raises(RigFileError, match=r"junk\.yml"):
+        opencv.read_opencv([tmp_path / "junk.yml"])
 
 
 @pytest.mark.parametrize(
@@ -185,15 +318,16 @@ def test_what_is_not_a_camera_matrix_is_refused(rig, tmp_path, change, words):
 )
 def test_what_a_camera_table_cannot_hold_is_named(rig, tmp_path, key, value, words):
     path = tmp_path / "camera_array.toml"
-    export_caliscope(path, rig)
+    caliscope.write_caliscope(path, rig)
     lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
     path.write_text("\n".join(lines))
     with pytest.raises(RigFileError, match=f"camera 0.*{words}"):
-        import_caliscope(path)
+        caliscope.read_caliscope([path])
 
 
 def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):
-    path = write_mat(tmp_path / "t.mat", trajectory)
+    path = tmp_path / "t.mat"
+    matlab.write_mat(path, trajectory)
     found = loadmat(path, simplify_cells=True)["disctrack"]
     assert np.array_equal(found["q"], trajectory.q, equal_nan=True)
     assert np.array_equal(found["q_sigma"], trajectory.coordinate_sigma, equal_nan=True)
@@ -202,15 +336,14 @@ def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):
     assert found["units"]["pose_covariance"].startswith("m and rad")
     assert found["air_density_kg_m3"] == trajectory.air_density == 0.7
     assert np.array_equal(found["marker_centre_px"], trajectory.markers_px, equal_nan=True)
-    with pytest.raises(OutputError, match="exists"):
-        write_mat(path, trajectory)
 
 
 @pytest.mark.filterwarnings("ignore:No analog data")  # there is none
 def test_c3d_is_read_by_another_library_with_gaps_as_gaps(trajectory, tmp_path):
     pytest.importorskip("ezc3d")
     c3d = pytest.importorskip("c3d")
-    path = write_c3d(tmp_path / "t.c3d", trajectory)
+    path = tmp_path / "t.c3d"
+    c3d_file.write_c3d(path, trajectory)
     with path.open("rb") as stream:
         reader = c3d.Reader(stream)
         labels = [label.strip() for label in reader.point_labels]
@@ -242,32 +375,104 @@ def test_table_has_both_sigmas_in_mm_and_deg(trajectory, tmp_path):
             assert float(rows[row][f"{name}_{ending}_{unit}"]) == pytest.approx(scale * values[row, k], rel=1e-6)
 
 
-def test_convert_goes_by_the_suffix_and_replaces_nothing(rig, tmp_path, capsys):
-    from calibration.rig_file import read_rig, write_rig
+def test_a_rigid_body_is_that_of_qualisys_own_export(trajectory, tmp_path):
+    """Roll, pitch, yaw and the order of Rot[0...8] as in a line of a real file: M510A-IRR-EKFPID-020019_6D.tsv."""
+    roll, pitch, yaw = np.radians([-0.65630, 0.09391, 0.05772])
+    real = [1.0, 0.00099, -0.00165, -0.00101, 0.99993, -0.01145, 0.00164, 0.01145, 0.99993]
 
+    def rot(roll, pitch, yaw):
+        x, y, z = (cv2.Rodrigues(a * axis)[0] for a, axis in zip((roll, pitch, yaw), np.eye(3), strict=True))
+        return (x @ y @ z).T.ravel()
+
+    assert rot(roll, pitch, yaw) == pytest.approx(real, abs=2e-5)
+    qtm.write_qtm(tmp_path / "t_6D.tsv", trajectory)
+    heads, rows = {}, []
+    for line in (tmp_path / "t_6D.tsv").read_text().splitlines():
+        key, *values = line.split("\t")
+        if key.isdecimal():
+            rows.append([float(v) for v in values])
+        else:
+            heads[key] = values
+    rows = np.array(rows)
+    assert heads["NO_OF_FRAMES"] == [str(len(trajectory))]
+    assert heads["Frame"][:5] == ["Time", "DISC X", "Y", "Z", "Roll"]
+    known = trajectory.measured
+    assert rows[known, 1:4] == pytest.approx(1e3 * trajectory.q[known, :3], abs=1e-6)
+    assert (rows[~known, 7] == -1).all()
+    R = rotation_from_euler(*trajectory.q[known, 3:].T)
+    for row, expected in zip(rows[known], R, strict=True):
+        assert pytest.approx(expected, abs=1e-9) == row[8:].reshape(3, 3).T
+        assert rot(*np.radians(row[4:7])) == pytest.approx(row[8:], abs=1e-8)
+
+
+def test_points_of_motion_capture_stand_y_up_in_a_trc_file(trajectory, tmp_path):
+    trc_reader = pytest.importorskip("trc")
+    trc.write_trc(tmp_path / "t.trc", trajectory)
+    data = trc_reader.TRCData()
+    data.load(str(tmp_path / "t.trc"))
+    assert data["Units"] == "m"
+    assert data["DataRate"] == trajectory.frame_rate
+    centre, known = np.array(data["CENTRE"]), trajectory.measured
+    assert centre[known] == pytest.approx(trajectory.q[known][:, [1, 2, 0]], abs=1e-8)
+    assert np.array(data["Time"]) == pytest.approx(trajectory.time)
+
+
+def test_xmalab_has_the_images_points_and_matrices_by_columns(trajectory, tmp_path):
+    bent = replace(trajectory, rig=with_field(trajectory.rig))
+    xmalab.write_points(tmp_path / "clip_points.csv", bent)
+    points = formats.read_foreign([tmp_path / "clip_points.csv"])
+    assert bent.rig.lens_field.corrected(points) == pytest.approx(trajectory.markers_px, abs=1e-6, nan_ok=True)
+    xmalab.write_transformations(tmp_path / "clip_transformation.csv", trajectory)
+    head, *lines = (tmp_path / "clip_transformation.csv").read_text().splitlines()
+    assert head.split(",")[12:15] == ["DISC_TX", "DISC_TY", "DISC_TZ"]
+    T = np.array([[float(v) for v in line.split(",")] for line in lines]).reshape(-1, 4, 4).swapaxes(1, 2)
+    known = trajectory.measured
+    assert T[known, :3, :3] == pytest.approx(rotation_from_euler(*trajectory.q[known, 3:].T), abs=1e-9)
+    assert T[known, :3, 3] == pytest.approx(1e3 * trajectory.q[known, :3], abs=1e-6)
+    assert np.isnan(T[~known]).all()
+
+
+def test_every_format_has_a_line_in_the_pages():
+    page = (Path(disctrack.__file__).parent / "docs/exchange.md").read_text()
+    for row in formats.ROWS:
+        assert f"| {row.name} |" in page, row.name
+        assert all(f"`{ending}`" in page for ending in row.endings)
+
+
+def test_convert_goes_by_the_ending_and_replaces_nothing(rig, trajectory, tmp_path, capsys):
     write_rig(tmp_path / "rig.h5", rig)
-    for name in ("rig.toml", "rig.yml", "rig.cameramodel"):
-        assert main(["convert", str(tmp_path / "rig.h5"), str(tmp_path / name)]) == 0
-    sides = [str(tmp_path / f"rig-{side}.cameramodel") for side in ("left", "right")]
-    for source in (["rig.toml"], ["rig.yml"], sides):
-        assert (
-            main(["convert", *(str(tmp_path / s) for s in source), str(tmp_path / "back.h5"), "--overwrite", "--table"])
-            == 0
-        )
-        assert read_rig(tmp_path / "back.h5").baseline == pytest.approx(rig.baseline)
-    for words in (["rig.toml", "back.h5", "--unit-mm", "25"], ["rig.yml", "back.h5", "--cameras", "0", "1"],
-                  ["rig.h5", "new.toml", "--table"]):  # fmt: skip
-        assert main(["convert", *(str(tmp_path / w) if "." in w else w for w in words), "--overwrite"]) == 1
-        assert f"{words[2]}: says nothing about" in capsys.readouterr().err
+
+    def converted(*words):
+        code = main(["convert", *(str(tmp_path / w) if "." in w else w for w in words)])
+        return code, capsys.readouterr()
+
+    assert converted("rig.h5", "rig.toml")[0] == converted("rig.h5", "rig.yml")[0] == 0
+    for words, said in (
+        (("rig.toml", "back.h5", "--unit-mm", "25"), "--unit-mm: says nothing about"),
+        (("rig.yml", "back.h5", "--cameras", "0", "1"), "--cameras: says nothing about"),
+        (("rig.h5", "new.toml", "--table"), "--table: says nothing about"),
+        (("rig.h5", "rig.toml"), "exists"),
+        (("rig.h5", "rig.docx"), ".cameramodel (mrcal)"),
+        (("rig.h5", "any.txt", "--as", "kalib"), "Did you mean 'Kalibr'?"),
+        (("rig.h5", "rig.c3d"), "no format of this name for a rig"),
+        (("none.yml", "back.h5"), "none.yml"),
+    ):
+        code, out = converted(*words)
+        assert code == 1
+        assert said in out.err, out.err
+    assert converted("rig.h5", "any.txt", "--as", "Pose2Sim")[0] == 0
     text = (tmp_path / "rig.yml").read_text().replace("world_is_table: 1", "world_is_table: 0")
     (tmp_path / "silent.yml").write_text(text)
     for words in ([], ["--table"]):
-        said = ["convert", str(tmp_path / "silent.yml"), str(tmp_path / "back.h5"), "--overwrite", *words]
-        assert main(said) == 0
+        assert converted("silent.yml", "back.h5", "--overwrite", *words)[0] == 0
         assert read_rig(tmp_path / "back.h5").world_is_table == bool(words)
     (tmp_path / "bare.yml").write_text(text.replace("R_left_world", "Q").replace("t_left_world", "q"))
-    assert main(["convert", str(tmp_path / "bare.yml"), str(tmp_path / "bare.h5"), "--table"]) == 1
-    assert "nothing says where the table is" in capsys.readouterr().err
-    assert main(["convert", str(tmp_path / "rig.h5"), str(tmp_path / "rig.toml")]) == 1
-    assert main(["convert", str(tmp_path / "rig.h5"), str(tmp_path / "rig.docx")]) == 1
-    assert ".cameramodel" in capsys.readouterr().err
+    assert "nothing says where the table is" in converted("bare.yml", "bare.h5", "--table")[1].err
+    results = tmp_path / "clip" / "results"
+    results.mkdir(parents=True)
+    write_trajectory(results / "trajectory.h5", trajectory, Provenance("clip", {}, {}))
+    assert (
+        converted("./clip", "clip.nc")[0] == converted("./clip", "clip.mat")[0] == converted("clip.nc", "c.yml")[0] == 0
+    )
+    assert np.array_equal(disctrack.read_trajectory(tmp_path / "clip.nc").q, trajectory.q, equal_nan=True)
+    assert loadmat(tmp_path / "clip.mat", simplify_cells=True)["disctrack"]["q"].shape == (30, 6)

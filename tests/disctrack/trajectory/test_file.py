@@ -25,6 +25,7 @@ from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.trajectory import FrameStatus, Trajectory
 from disctrack.trajectory import file as storage
+from disctrack.trajectory.exchange.csv_table import write_csv
 from disctrack.trajectory.file import (
     Group,
     Provenance,
@@ -32,7 +33,6 @@ from disctrack.trajectory.file import (
     read_group,
     read_provenance,
     read_trajectory,
-    write_csv,
     write_group,
     write_groups,
     write_trajectory,

@@ -1,30 +1,27 @@
 """Exchange of rigs with OpenCV's YAML or XML files, in the names of its stereo sample (M1 D1 M2 D2 R T)."""
 
-import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.cameras.foreign_rigs import camera_of, rotation_of
 from calibration.kit.arrays import Array
-from calibration.kit.errors import RigFileError
+from disctrack.errors import OutputError, RigFileError
+from disctrack.files.whole import whole_file
+from disctrack.trajectory.exchange.rig_parts import MAX_BYTES, camera_of, rotation_of
 
-MAX_BYTES = 10_000_000  # a rig has a few kB
 
-
-def export_opencv(path: str | os.PathLike[str], rig: StereoRig) -> None:
-    """Write intrinsics and extrinsics; lengths in metres. The covariance has no place there.
+def write_opencv(path: Path, rig: StereoRig) -> None:
+    """Write intrinsics and extrinsics; lengths in metres. Raises OutputError.
 
     M1 D1 M2 D2 R T are what cv2.stereoRectify takes; R_left_world and t_left_world hold the world frame.
     """
-    path = Path(path)
-    part = path.with_name(f"{path.stem}.part{path.suffix or '.yml'}")
-    try:
+    with whole_file(path, suffix=path.suffix) as part:
         storage = cv2.FileStorage(str(part), cv2.FILE_STORAGE_WRITE)
         if not storage.isOpened():
-            raise OSError("cannot be opened for writing")
+            raise OutputError(f"{path}: the rig cannot be written there")
         storage.write("unit", "m")
         for number, camera in enumerate(rig.cameras, start=1):
             storage.write(f"M{number}", camera.camera_matrix)
@@ -36,15 +33,11 @@ def export_opencv(path: str | os.PathLike[str], rig: StereoRig) -> None:
         storage.write("t_left_world", rig.t_left_world[:, None])
         storage.write("world_is_table", int(rig.world_is_table))
         storage.release()
-        with open(part, "rb") as handle:
-            os.fsync(handle.fileno())
-        os.replace(part, path)
-    except (OSError, cv2.error) as error:
-        raise RigFileError(f"{path}: the rig cannot be written ({error})") from error
 
 
-def import_opencv(
-    *paths: str | os.PathLike[str],
+def read_opencv(
+    paths: Sequence[Path],
+    *,
     image_size: tuple[int, int] | None = None,
     unit: float | None = None,
     world_is_table: bool = False,
@@ -60,7 +53,7 @@ def import_opencv(
     nodes: dict[str, Array] = {}
     told_metres, is_table = False, world_is_table
     names = ("M1", "D1", "M2", "D2", "R", "T", "image_size1", "image_size2", "R_left_world", "t_left_world")
-    for path in map(Path, paths):
+    for path in paths:
         storage = _opened(path)
         try:
             for name in names:

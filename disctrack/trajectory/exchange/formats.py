@@ -1,0 +1,221 @@
+"""The table of formats, and conversion by it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from calibration.cameras.camera import StereoRig
+from calibration.rig_file import SCHEMA as RIG
+from calibration.rig_file import CalibrationRecord, read_rig_file, write_rig
+from disctrack.errors import OutputError
+from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.trajectory import Trajectory
+from disctrack.trajectory.exchange import (
+    c3d,
+    caliscope,
+    csv_table,
+    dlt,
+    kalibr,
+    matlab,
+    mrcal,
+    opencv,
+    qtm,
+    trc,
+    xmalab,
+)
+from disctrack.trajectory.exchange.lens import BROWN, within_brown
+from disctrack.trajectory.exchange.rig_parts import content_of, the_one
+from disctrack.trajectory.file import read_trajectory, trajectory_in
+
+OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs go by the second name
+FOUR = BROWN[:4]
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format of another program."""
+
+    name: str
+    endings: tuple[str, ...]  # of file names; the longest that fits is meant
+    holds: str  # "trajectory", "rig" or "points"
+    write: Callable[[Path, Any], object]  # path, Trajectory or StereoRig
+    read: Callable[..., Any] | None  # paths and what is asked of the user -> StereoRig, or points (n, 2, m, 2)
+    lost: str  # what of ours it has no place for
+    source: str  # of its definition
+    # Terms of a lens that it holds, by which the others are fitted; None: it holds points without any lens
+    terms: tuple[str, ...] | None = BROWN
+    asks: tuple[str, ...] = ()  # what a reader may be told: world_is_table, cameras, image_size, unit
+    mark: str = ""  # text by which a file is told from others of its ending
+
+
+SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
+ROWS = (
+    Format("table", (".csv",), "trajectory", partial(csv_table.write_csv, overwrite=True), None,
+           "covariances, the rig, the dots", "here"),
+    Format("MATLAB", (".mat",), "trajectory", matlab.write_mat, None, "the rig", "MAT-file version 5"),
+    Format("C3D", (".c3d",), "trajectory", c3d.write_c3d, None, SIGMAS, "c3d.org"),
+    Format("TRC", (".trc",), "trajectory", trc.write_trc, None, "sigmas, the rig, the dots in the images",
+           "OpenSim: Marker (.trc) Files"),
+    Format("QTM", (".tsv",), "trajectory", qtm.write_qtm, None, SIGMAS, "Qualisys: TSV export of 6DOF data"),
+    Format("XMALab transformations", ("transformation.csv", "transformations.csv"), "trajectory",
+           xmalab.write_transformations, None, "sigmas, times, the rig, the dots", "XMALab: Trial.cpp"),
+    Format("XMALab points", ("points.csv",), "points", xmalab.write_points, xmalab.read_xmalab, "sigmas",
+           "XMALab: Trial.cpp", mark="_cam1_X"),
+    Format("DLTdv8 points", ("xypts.csv",), "points", dlt.write_xypts, dlt.read_xypts, "sigmas, the lenses: the points "
+           "are without their distortion, as dltcoefs.csv needs them", "DLTdv8 manual", mark="pt1_cam1_X"),
+    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", opencv.write_opencv, opencv.read_opencv, "covariances",
+           "OpenCV: stereo_calib sample", asks=("image_size", "unit", "world_is_table")),
+    Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", kalibr.write_kalibr, kalibr.read_kalibr,
+           "covariances, the world frame", "Kalibr: yaml formats", FOUR, mark="cam0:"),
+    Format("Caliscope", (".toml",), "rig", caliscope.write_caliscope, caliscope.read_caliscope, "covariances",
+           "Caliscope: camera_array.py", asks=("cameras", "world_is_table")),
+    Format("Pose2Sim", ("pose2sim.toml", "calib.toml"), "rig", caliscope.write_pose2sim, caliscope.read_caliscope,
+           "covariances", "Pose2Sim: calibration.py", FOUR, ("cameras", "world_is_table")),
+    Format("mrcal", (".cameramodel",), "rig", mrcal.write_mrcal, mrcal.read_mrcal, "covariances",
+           "mrcal: camera model representation", asks=("world_is_table",)),
+    Format("DLT", ("dltcoefs.csv",), "rig", dlt.write_dlt, dlt.read_dlt, "covariances, the lenses: they belong to "
+           "points without distortion, those of xypts.csv", "DLTdv8 manual", None,
+           ("image_size", "unit", "world_is_table")),
+    Format("MATLAB stereoParameters", (".mat",), "rig", matlab.write_stereo_parameters, matlab.read_stereo_parameters,
+           "covariances", "MATLAB: stereoParametersFromOpenCV", asks=("unit", "world_is_table")),
+)  # fmt: skip
+FORMATS = {row.name: row for row in ROWS}
+
+
+class Converted(NamedTuple):
+    """What was written, and what the format could not hold."""
+
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def convert(
+    source: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    target: str | os.PathLike[str],
+    *,
+    form: str | None = None,
+    overwrite: bool = False,
+    **told: Any,
+) -> Converted:
+    """A trajectory, its points or a rig from and to another program's format, by the ending of the target.
+
+    source : our trajectory or rig file, a recording's folder, or a foreign rig (two files where it keeps one a camera)
+    form : name of the target's format in `FORMATS`, where the ending does not tell
+    told : what a foreign rig does not say of itself: world_is_table, cameras (two names), image_size (width, height)
+        [px], unit [m]
+    Raises DiscTrackError that names the formats there are.
+    """
+    paths = [trajectory_in(Path(p)) for p in ([source] if isinstance(source, (str, os.PathLike)) else source)]
+    path = Path(target)
+    for one in paths:
+        keep(one)
+    refuse_existing(path, overwrite)
+    refuse_input(path)
+    told = {name: value for name, value in told.items() if value}
+    if not _is_ours(paths[0]):
+        value, record = read_foreign(paths, **told), None
+    elif told:
+        raise OutputError(f"{_options(told)}: says nothing about {paths[0]}, a file of ours; leave it out")
+    else:
+        value, record = _own(paths)
+    if path.suffix in OWN and form is None:
+        _write_own(path, value, paths[0])
+        return Converted((path,), ())
+    row = _row_for(path, form, value)
+    written = mrcal.sides_of(path) if row.name == "mrcal" else (path,)
+    for one in written:
+        refuse_existing(one, overwrite)
+    notes = [f"{row.name} has no place for {row.lost}"]
+    if row.holds == "rig":
+        value = value.rig if isinstance(value, Trajectory) else value
+        if row.terms is not None:
+            value, words = within_brown(value, row.terms, record)
+            notes += [words] if words else []
+    row.write(path, value)
+    return Converted(written, tuple(notes))
+
+
+def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
+    """A StereoRig, or points (n, 2, m, 2) [px], of another program; told: as of `convert`. Raises DiscTrackError."""
+    first = paths[0]
+    head = content_of(first)[:4096] if first.suffix in (".csv", ".yaml", ".yml") else ""
+    ranks = {row.name: _rank(row, first, head) for row in ROWS if row.read}
+    name = max(ranks, key=lambda name: ranks[name])
+    if not any(ranks[name]):
+        raise OutputError(
+            f"{first}: no file of ours, and no format of this name is read; known are {_known(FORMATS, True)}"
+        )
+    idle = [word for word in told if word not in FORMATS[name].asks]
+    if idle:
+        raise OutputError(f"{_options(idle)}: says nothing about {first} as {name}; leave it out")
+    reader = FORMATS[name].read
+    assert reader is not None
+    return reader(paths, **told)
+
+
+def _rank(row: Format, path: Path, head: str = "") -> tuple[int, int]:
+    """How well a file fits a format: by what stands in it, then by its name."""
+    ending = max((len(e) for e in row.endings if path.name.lower().endswith(e)), default=0)
+    return (len(row.mark) if row.mark and row.mark in head else 0), ending
+
+
+def _row_for(path: Path, form: str | None, value: Any) -> Format:
+    """The format to write. Raises OutputError that names those there are."""
+    kinds = ("trajectory", "points", "rig") if isinstance(value, Trajectory) else ("rig",)
+    rows = {row.name: row for row in ROWS if row.holds in kinds and not isinstance(value, np.ndarray)}
+    if not rows:
+        raise OutputError(f"{path}: points are read in Python, with `read_foreign`, and written of a trajectory")
+    if form is not None:
+        near = get_close_matches(form.lower(), [name.lower() for name in FORMATS], 1, 0.5)
+        row = rows.get(next((name for name in rows if name.lower() in (form.lower(), *near[:1])), ""))
+        if row is None or row.name.lower() != form.lower():
+            hint = f" Did you mean '{row.name}'?" if row else ""
+            raise OutputError(f"{form}: no format for a {kinds[0]}.{hint} Known are {', '.join(rows)}")
+        return row
+    row = max(rows.values(), key=lambda row: _rank(row, path))
+    if not any(_rank(row, path)):
+        raise OutputError(f"{path}: no format of this name for a {kinds[0]}; known are {_known(rows)}, and .h5")
+    return row
+
+
+def _known(rows: Mapping[str, Format], read: bool = False) -> str:
+    return ", ".join(f"{row.endings[0]} ({name})" for name, row in rows.items() if row.read or not read)
+
+
+def _options(told: Iterable[str]) -> str:
+    names = {"world_is_table": "table", "unit": "unit-mm"}
+    return ", ".join(f"--{names.get(word, word).replace('_', '-')}" for word in told)
+
+
+def _is_ours(path: Path) -> bool:
+    return path.suffix in OWN or h5py.is_hdf5(path)
+
+
+def _own(paths: Sequence[Path]) -> tuple[Trajectory | StereoRig, CalibrationRecord | None]:
+    path = the_one(paths)
+    if path.is_file() and h5py.is_hdf5(path):
+        with h5py.File(path, "r") as file:
+            is_rig = file.attrs.get("schema") == RIG
+        if is_rig:
+            content = read_rig_file(path)
+            return content.rig, content.record
+    return read_trajectory(path), None
+
+
+def _write_own(path: Path, value: Any, source: Path) -> None:
+    if h5py.is_hdf5(source):
+        write_whole(path, source.read_bytes())
+    elif isinstance(value, StereoRig):
+        write_rig(path, value)
+    else:
+        raise OutputError(f"{source}: only a rig of another program becomes a file of ours")
