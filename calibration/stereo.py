@@ -25,8 +25,7 @@ from calibration.judge.assessment import (
     stereo_covariance,
 )
 from calibration.judge.camera_moved import camera_moved, zoomed
-from calibration.judge.motion_size import likely_motion
-from calibration.judge.pairs import LEAST_PAIRS, PairsJudged
+from calibration.judge.pairs import LEAST_PAIRS, PairsJudged, likely_motion
 from calibration.judge.table_frame import rig_with_covariance
 from calibration.judge.tolerances import (
     BoardShape,

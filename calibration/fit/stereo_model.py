@@ -75,6 +75,11 @@ class StereoModel:
     # (n_views, 3, 3) and (n_views, 3) [m] of the boards at the right camera's exposure, where they moved after the left
     boards_right: tuple[Array, Array] | None = None
 
+    @property
+    def boards_in_right(self) -> tuple[Array, Array]:
+        """The same, where they did not move as well."""
+        return self.boards_right or (self.R_left_board, self.t_left_board)
+
 
 @dataclass(frozen=True)
 class Terms:

@@ -78,7 +78,7 @@ def consistency_factor(refinement: Refinement) -> float:
 def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Array:
     """Covariance (s1, s1) of the free stereo parameters, from the corners' noise and from how the views disagree.
 
-    common : (n_views, s, s) covariance of what else the views' gradients contain, see `motion_size`
+    common : (n_views, s, s) covariance of what else the views' gradients contain, see `pairs`
 
     Errors that are common to a view weigh more in some directions than in others: a board that moves between the two
     exposures spoils the pair's pose, not the focal lengths. The views' shifts, whitened by what noise would make of

@@ -1,17 +1,30 @@
-"""Whether the two images of a pair show the board in one place: views that fit after all, boards that moved between."""
+"""What each pair of images says of a board's motion between its two exposures, and which hypothesis of it holds.
+
+With a place of the board in each of its images a pair says, to first order, that the board moved by m (a turn, and a
+shift of its middle), with covariance C by the corners; less W s of it where the shared parameters take a step s. Every
+hypothesis of a pair is one of m, and compared by its likelihood with everything shared free to follow:
+
+- the images show one place, m = 0, or they do not, and m tells nothing: what chi-square the former costs, by pair;
+- all boards moved at random, m ~ N(0, S): the sizes in S are those of restricted maximum likelihood (Patterson and
+  Thompson 1971). The estimate with m = 0 stays where no pair shows a motion for itself: where a few views tell, it is
+  the steadier one, and by pairs that were synchronised the better one; its covariance contains S, as that of any
+  estimate whose weights are not those of the errors. What lies in one image as a whole for another reason, errors that
+  neighbouring corners share or a lens beyond its polynomial, is in S likewise.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
-from calibration.fit.board_motion import BoardMotion
+from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.model_choice import fit_poses
-from calibration.fit.normal_equations import inverse_covariance
+from calibration.fit.normal_equations import Problem, inverse_covariance
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
-from calibration.judge.motion_size import likely_motion
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
 MIN_POINTS = 8  # of an image, to tell the board's pose by itself
@@ -19,6 +32,9 @@ LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras sta
 # Times the usual misfit. Of Gaussian motions (F of 6 and 24 degrees of freedom) one in 10^9 is as far; the motions of
 # hand-held boards have longer tails.
 TOO_FAR = 5.0
+FREE = BoardMotion(1e3, 1e3)  # as good as nothing known beforehand
+NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
+START = ((1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5))  # [rad], and of the distance
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in the left camera's axes
 
 
@@ -32,144 +48,136 @@ def own_places(
     n, place = len(model.R_left_board), observations.view.copy()
     for k, view in enumerate(apart):
         place[(observations.view == view) & (observations.camera == 1)] = n + k
-    if not apart:
-        return observations, model
-    R, t = zip(*(right_poses[view] for view in apart), strict=True)
-    model = replace(
-        model,
-        R_left_board=np.concatenate([model.R_left_board, np.stack(R)]),
-        t_left_board=np.concatenate([model.t_left_board, np.stack(t)]),
-    )
-    return replace(observations, view=place), model
+    R = np.concatenate([model.R_left_board, *(right_poses[view][0][None] for view in apart)])
+    t = np.concatenate([model.t_left_board, *(right_poses[view][1][None] for view in apart)])
+    return replace(observations, view=place), replace(model, R_left_board=R, t_left_board=t)
 
 
 @dataclass(frozen=True)
-class PairsJudged:
-    """Which pairs show the board in one place, as cameras that were refined see it."""
+class LikelyMotion:
+    """What all pairs together say of the boards' motions."""
 
-    model: StereoModel  # its poses those of the views: of both images together, or of the left one of a pair apart
-    right_poses: dict[int, Pose]  # of the right image alone, in the left camera's axes, for pairs
-    apart: dict[int, str]  # view -> why its two images are not taken for one place
-    bad_images: dict[tuple[int, int], str]  # (view, camera) -> why it cannot be used even alone
-    left_poses: dict[int, Pose] = field(default_factory=dict)  # of the left image alone, for pairs, once judged
+    size: BoardMotion
+    pixels: float  # [px] rms displacement of a corner in the right image by such a motion
+    gradients: Array  # (n_views, s, s) covariance of what it adds to each view's gradient by the shared parameters
 
 
-def judge_pairs(
-    observations: Observations, fit: Refinement, apart: Sequence[int], elsewhere: Collection[int] = ()
-) -> PairsJudged:
-    """Compare the poses of both images together with those of each image alone.
+@dataclass(frozen=True)
+class PairMotions:
+    """The motions (m, C, W) of n pairs, each by its own two images."""
 
-    A common pose has six parameters less. What chi-square it costs, with everything that all views share refined again,
-    tells how far the board moved: some of it in every pair, as boards bend and lenses are not as modelled. A pair is
-    apart where it costs TOO_FAR (in amplitude) more than the median pair; so never more than half of them are. The
-    median of fewer than LEAST_PAIRS tells nothing, and none of so few is set apart, nor one that alone tells how the
-    cameras stand.
+    views: NDArray[np.intp]  # (n,)
+    motion: Array  # (n, 6) turn [rad] and shift of the middle [m] in the left camera's axes
+    covariance: Array  # (n, 6, 6) by the corners
+    by_shared: Array  # (n, 6, s) what a step of the shared parameters takes from it
+    alone: tuple[Array, Array]  # normal matrix (s, s) and gradient (s,) of the shared by all images, and by the prior
+    square_px: Array  # (n, 6, 6): m^T square_px m is a motion's mean square displacement [px^2] in the right image
+    noise: float  # variance about places of the images' own, in units of the corners'
+    scatter: float  # [px] the same, rms
+    problem: Problem
+    distance: float  # [m] of the boards
 
-    observations : with the views' numbers; fit : of the same, the pairs `apart` with places of their own
-    elsewhere : views at which the cameras stood otherwise to each other: no measure of what is usual
-    """
-    observations = observations[np.argsort(observations.view, kind="stable")]
-    model, n = fit.model, len(fit.model.R_left_board) - len(apart)
-    sigma = max(fit.unexplained_sigma, 1e-3)
-    places = {view: n + k for k, view in enumerate(apart)}
-    both = [
-        int(v)
-        for v in np.unique(observations.view)
-        if min(np.sum((observations.view == v) & (observations.camera == c)) for c in (0, 1)) >= MIN_POINTS
-    ]
-    begun = {v: (model.R_left_board[places.get(v, v)], model.t_left_board[places.get(v, v)]) for v in both}
-    views = replace(model, R_left_board=model.R_left_board[:n], t_left_board=model.t_left_board[:n], boards_right=None)
-    behind = np.unique(observations.view[~np.isfinite(predict_pixels(views, observations)).all(axis=1)])
-    in_sight = observations[~np.isin(observations.view, behind)]
-    together = fit_poses(in_sight, views, sigma)
-    seen_alone, alone = own_places(observations, views, both, begun)
-    seen_alone = seen_alone[np.argsort(seen_alone.view, kind="stable")]
-    alone = fit_poses(seen_alone, alone, sigma)
-    square, count = _misfit(seen_alone, alone, n + len(both))
-    image_rms = np.sqrt(square / np.maximum(count, 1))
-    typical = float(np.median(image_rms[count > 0]))
-    bad: dict[tuple[int, int], str] = {}
-    if np.sum(count > 0) >= LEAST_PAIRS:
-        for place in np.flatnonzero(image_rms > TOO_FAR * typical):
-            v = int(place) if place < n else both[place - n]
-            camera = 1 if place >= n or not np.any((observations.view == v) & (observations.camera == 0)) else 0
-            bad[v, camera] = f"RMS {image_rms[place]:.3f} px by itself, the median image has {typical:.3f} px"
-    found = {}
-    if len(both) >= LEAST_PAIRS:
-        cost = _cost_of_one_place(fit, (in_sight, together), (seen_alone, alone), both, places)
-        square_together, _ = _misfit(observations, together, n)
-        usual = cost[[v not in elsewhere for v in both]]
-        for k in np.flatnonzero(cost > TOO_FAR**2 * max(float(np.median(usual)), 6.0)):
-            misfit = np.sqrt(square_together[both[k]] / (count[both[k]] + count[n + k]))
-            found[both[k]] = f"{misfit:.2g} px if they did, where the median image has {typical:.2g} px"
-    found |= {v: "behind a camera if they did" for v in both if v in behind}
-    right = {v: (alone.R_left_board[n + k], alone.t_left_board[n + k]) for k, v in enumerate(both)}
-    left = {v: (alone.R_left_board[v], alone.t_left_board[v]) for v in both}
-    R, t = together.R_left_board.copy(), together.t_left_board.copy()
-    for v in found:
-        R[v], t[v] = left[v]
-    return PairsJudged(replace(together, R_left_board=R, t_left_board=t), right, found, bad, left)
+    @property
+    def pixels(self) -> Array:
+        """(n,) [px] rms displacement by the motions."""
+        return np.sqrt(np.einsum("ni,nij,nj->n", self.motion, self.square_px, self.motion))
+
+    def shared(self, covariance: Array, pairs: Mask, first: int | None = None) -> tuple[Array, Array]:
+        """Normal matrix and gradient of the `first` shared parameters where these motions are 0 +- `covariance`."""
+        W, m = self.by_shared[pairs, :, :first], self.motion[pairs]
+        known = np.swapaxes(np.linalg.solve(covariance[pairs], W), 1, 2)
+        information, gradient = self.alone[0][:first, :first], self.alone[1][:first]
+        return information + (known @ W).sum(0), gradient + (known @ m[..., None])[..., 0].sum(0)
+
+    def cost_of_rest(self, tied: Mask) -> Array:
+        """Chi-square (n,) that one place of the board costs each pair, where those `tied` (n,) have one each.
+
+        Each pair is compared with what the others say; 0 where they leave open what it says.
+        """
+        information, gradient = self.shared(self.covariance, tied)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        inverse = np.linalg.inv(information * scale[:, None] * scale)
+        W = self.by_shared * scale
+        left = self.motion - W @ (inverse @ (gradient * scale))
+        L = np.linalg.inv(np.linalg.cholesky(self.covariance))
+        W = L @ W
+        sign = np.where(tied, -1.0, 1.0)[:, None, None]  # what the others say, without the pair's own part
+        values, vectors = np.linalg.eigh(np.eye(6) + sign * (W @ inverse @ np.swapaxes(W, 1, 2)))
+        white = np.einsum("nji,njk,nk->ni", vectors, L, left)
+        return np.asarray(np.sum(np.where(values > 1e-6, white**2 / np.maximum(values, 1e-6), 0.0), axis=1))
+
+    def likely(self) -> LikelyMotion:
+        """The most likely size of random motions; about a minimum with one place of the board for both images."""
+        s1 = self.problem.stereo_basis.shape[1]  # the board's shape is held: it is known better than motions move it
+        everyone = np.ones(len(self.views), bool)
+        at_noise = replace(self, alone=(self.alone[0] / self.noise, self.alone[1] / self.noise))
+
+        def variances(sizes: Array) -> Array:
+            turn, part = np.exp(np.clip(sizes, np.log(NONE), 0.0))
+            return np.repeat([turn, part * self.distance], 3) ** 2
+
+        def unlikely(sizes: Array) -> float:
+            """-2 log likelihood, everything shared marginalised."""
+            V = self.noise * self.covariance + np.diag(variances(sizes))
+            information, gradient = at_noise.shared(V, everyone, s1)
+            size = np.diag(information)
+            if size.min() <= 0.0:  # motions so large that nothing is left of how the cameras stand
+                return np.inf
+            scaled = information / np.sqrt(size[:, None] * size)
+            sign, volume = np.linalg.slogdet(scaled)
+            if sign <= 0.0:
+                return np.inf
+            white = gradient / np.sqrt(size)
+            chi_square = np.sum(self.motion * np.linalg.solve(V, self.motion[..., None])[..., 0])
+            chi_square -= white @ np.linalg.solve(scaled, white)
+            return float(np.linalg.slogdet(V)[1].sum() + volume + np.log(size).sum() + chi_square)
+
+        # an attribute of `scipy` is imported when it is asked for: a measurement with a rig does not wait for it
+        rough = {"method": "Nelder-Mead", "options": {"xatol": 0.02, "fatol": 0.02}}  # of logarithms
+        tried = [scipy.optimize.minimize(unlikely, np.log(start), **rough) for start in START]
+        S = variances(min(tried, key=lambda one: float(one.fun)).x)
+        into = np.zeros((self.problem.n_views, self.by_shared.shape[-1], self.by_shared.shape[-1]))
+        known = np.linalg.solve(self.covariance, self.by_shared)
+        into[self.views] = np.swapaxes(known, 1, 2) @ (S[:, None] * known)
+        pixels = np.mean(np.einsum("nii,i->n", self.square_px, S))
+        return LikelyMotion(BoardMotion(float(S[0] ** 0.5), float(S[3] ** 0.5)), float(pixels**0.5), into)
 
 
-def _cost_of_one_place(
-    fit: Refinement,
-    together: tuple[Observations, StereoModel],
-    alone: tuple[Observations, StereoModel],
-    both: Sequence[int],
-    apart: Mapping[int, int],
-) -> Array:
-    """Chi-square that one place of the board for both images costs, for each of the pairs `both`; others as they are.
-
-    To first order about the fit, whose shared parameters follow; 0 where the other views leave them open.
-    """
-    parts = []
-    for observations, model in (together, alone):
-        problem = replace(
-            fit.problem,
-            observations=observations,
-            weights=inverse_covariance(observations.covariance, max(fit.unexplained_sigma, 1e-3) ** 2),
-            n_views=len(model.R_left_board),
-            huber=3.0,
-            motion=None,
-        )
-        normal = problem.linearise(model)
-        H, g = normal.told_by_each()
-        lost = ~(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(g).all(axis=1))  # a pose behind a camera
-        H[lost], g[lost] = 0.0, 0.0
-        parts.append((H, g, np.nan_to_num(normal.costs, posinf=1e12), normal))
-    (H_one, g_one, chi2_one, normal), (H_two, g_two, chi2_two, _) = parts
-    n = len(together[1].R_left_board)
-    pairs = np.array(both)
-    tied, own = (
-        (H_one[pairs], g_one[pairs]),
-        (H_two[pairs] + H_two[n:][: len(pairs)], g_two[pairs] + g_two[n:][: len(pairs)]),
+def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
+    """By the images that have points enough, about a minimum; the model may have places of the boards for each."""
+    problem, model, o = replace(problem, motion=FREE), split(model), problem.observations
+    normal = problem.linearise(model)
+    carried, step = normal.carried()
+    m, J = motions(model)
+    seen = [np.bincount(o.view[o.camera == c], minlength=problem.n_views) for c in (0, 1)]
+    pairs = np.flatnonzero(np.minimum(*seen) >= MIN_POINTS)
+    images = len(np.unique(2 * o.view + o.camera))
+    freedom = max(2 * len(o) - 6 * images, 1)
+    about = problem.stepped(model, np.zeros(len(normal.shared)), step)
+    right = o[o.camera == 1]
+    d_pose, squares = predict(about, right)[2], np.zeros((problem.n_views, 6, 6))
+    np.add.at(squares, right.view, np.swapaxes(d_pose, 1, 2) @ d_pose)
+    J = J[pairs]
+    back = np.linalg.inv(J[:, :, 6:])
+    squares = squares[pairs] / seen[1][pairs, None, None]
+    return PairMotions(
+        views=pairs,
+        motion=m[pairs] + (J @ step[pairs, :, None])[..., 0],
+        covariance=J @ np.linalg.solve(normal.own_held()[pairs], np.swapaxes(J, 1, 2)),
+        by_shared=J @ carried[pairs],
+        alone=normal.eliminated(),
+        square_px=np.swapaxes(back, 1, 2) @ squares @ back,
+        noise=max(float(normal.costs.sum() - np.sum(normal.own_gradient * step)), 1e-12) / freedom,
+        scatter=float(np.sqrt(2 * np.sum((o.pixels - predict_pixels(about, o)) ** 2) / freedom)),
+        problem=problem,
+        distance=float(np.median(np.linalg.norm(model.t_left_board[pairs], axis=1))) if len(pairs) else np.nan,
     )
-    is_apart = np.array([v in apart for v in both])
-    now = [np.where(is_apart.reshape(-1, *[1] * (one.ndim - 1)), two, one) for one, two in zip(tied, own, strict=True)]
-    rest = np.setdiff1d(np.arange(len(H_one)), pairs)  # views of one camera
-    H_rest, g_rest = normal.prior + H_one[rest].sum(0), normal.prior_gradient + g_one[rest].sum(0)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(now[0].sum(0) + H_rest), 1e-300))
-    cost = np.zeros(len(both))
-    for k, v in enumerate(both):
-        others = np.delete(np.arange(len(both)), k)
-        H, g = now[0][others].sum(0) + H_rest, now[1][others].sum(0) + g_rest
-        gains = []
-        for H_pair, g_pair in ((tied[0][k], tied[1][k]), (own[0][k], own[1][k])):
-            matrix, gradient = (H + H_pair) * scale[:, None] * scale, (g + g_pair) * scale
-            if not (np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 1e-15):
-                break
-            gains.append(float(gradient @ np.linalg.solve(matrix, gradient)))
-        if len(gains) == 2:
-            cost[k] = max(chi2_one[v] - chi2_two[v] - chi2_two[n + k] - gains[0] + gains[1], 0.0)
-    return cost
 
 
-def _misfit(observations: Observations, model: StereoModel, n: int) -> tuple[Array, Array]:
-    """Sum of squared distances [px^2] and number of points, per place (n,)."""
-    residuals = observations.pixels - predict_pixels(model, observations)
-    square = np.nan_to_num(np.sum(residuals**2, axis=-1), nan=1e12)
-    squares, counts = (np.bincount(observations.view, what, minlength=n) for what in (square, np.ones_like(square)))
-    return np.asarray(squares, np.float64), np.asarray(counts, np.float64)
+def likely_motion(refinement: Refinement) -> LikelyMotion | None:
+    """The most likely size of the boards' motions; None where fewer than three pairs could tell it."""
+    found = pair_motions(refinement.problem, refinement.model)
+    return found.likely() if len(found.views) >= 3 else None
 
 
 @dataclass(frozen=True)
@@ -203,41 +211,71 @@ class PairMotion:
 
 
 def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
-    """What the two images of each pair, each with a pose of its own, say of the board's motion between them.
+    """What the pairs say of the board's motion between their exposures; None with fewer than three of them."""
+    found = pair_motions(refinement.problem, refinement.model)
+    if len(found.views) < 3:
+        return None
+    noise = float(np.median(np.einsum("nij,nji->n", found.square_px, found.covariance)))
+    return PairMotion(
+        float(np.median(np.linalg.norm(found.motion[:, 3:], axis=1))),
+        float(np.median(found.pixels)),
+        found.scatter,
+        float(np.sqrt(noise * found.noise)),
+        found.likely().pixels,
+    )
 
-    To first order at the common minimum; None with fewer than three pairs.
+
+@dataclass(frozen=True)
+class PairsJudged:
+    """Which pairs show the board in one place, as cameras that were refined see it."""
+
+    model: StereoModel  # its poses those of the views: of both images together, or of the left one of a pair apart
+    right_poses: dict[int, Pose]  # of the right image alone, in the left camera's axes, for pairs
+    apart: dict[int, str]  # view -> why its two images are not taken for one place
+    bad_images: dict[tuple[int, int], str]  # (view, camera) -> why it cannot be used even alone
+    left_poses: dict[int, Pose] = field(default_factory=dict)  # of the left image alone, for pairs, once judged
+
+
+def judge_pairs(
+    observations: Observations, fit: Refinement, apart: Sequence[int], elsewhere: Collection[int] = ()
+) -> PairsJudged:
+    """Compare one place of the board for both images of a pair with a place for each.
+
+    One place has six parameters less. What chi-square it costs tells how far the board moved: some of it in every pair,
+    as boards bend and lenses are not as modelled. A pair is apart where it costs TOO_FAR (in amplitude) more than the
+    median pair; so never more than half of them are. The median of fewer than LEAST_PAIRS tells nothing, and none of so
+    few is set apart, nor one that alone tells how the cameras stand.
+
+    observations : with the views' numbers; fit : of the same, the pairs `apart` with places of their own
+    elsewhere : views at which the cameras stood otherwise to each other: no measure of what is usual
     """
-    o, weights = refinement.problem.observations, refinement.problem.weights
-    model = refinement.model
-    pixels, _, d_pose, _ = predict(model, o)
-    residuals = o.pixels - pixels
-    distances, shifts, noise, rest, whitened, freedom = [], [], [], 0.0, 0.0, 0
-    for v in np.unique(o.view):
-        own = []
-        for camera in (0, 1):
-            use = (o.view == v) & (o.camera == camera)
-            J, r, W = d_pose[use], residuals[use], weights[use]
-            if len(r) < 8:
-                break
-            WJ = W @ J
-            H, g = np.einsum("mij,mik->jk", J, WJ), np.einsum("mij,mi->j", WJ, r)
-            step = np.linalg.solve(H, g)
-            left_over = r - J @ step
-            rest, freedom = rest + float(np.sum(left_over**2)), freedom + 2 * len(r) - 6
-            whitened += float(np.einsum("mi,mij,mj->", left_over, W, left_over))
-            own.append((step, J, np.linalg.inv(H)))
-        if len(own) == 2:
-            step, J = own[1][0] - own[0][0], own[1][1]
-            middle = model.R_left_board[v] @ model.points.mean(0)
-            distances.append(float(np.linalg.norm(step[3:] + np.cross(step[:3], middle))))
-            shifts.append(float(np.sqrt(np.mean(np.sum((J @ step) ** 2, axis=-1)))))
-            noise.append(float(np.einsum("mij,jk,mik->", J, own[0][2] + own[1][2], J) / len(J)))
-    if len(shifts) < 3:
-        return None
-    freedom = max(freedom, 1)
-    at_rest = float(np.sqrt(np.median(noise) * whitened / freedom))
-    scatter = float(np.sqrt(2 * rest / freedom))
-    likely = likely_motion(refinement)
-    if likely is None:
-        return None
-    return PairMotion(float(np.median(distances)), float(np.median(shifts)), scatter, at_rest, likely.pixels)
+    o = observations[np.argsort(observations.view, kind="stable")]
+    n, sigma = len(fit.model.R_left_board) - len(apart), max(fit.unexplained_sigma, 1e-3)
+    R, t, of_right = fit.model.R_left_board, fit.model.t_left_board, np.arange(n)
+    of_right[list(apart)] = n + np.arange(len(apart))
+    begun = replace(fit.model, R_left_board=R[:n], t_left_board=t[:n], boards_right=(R[of_right], t[of_right]))
+    alone = fit_poses(o, begun, sigma, FREE)
+    weights = inverse_covariance(o.covariance, sigma**2)
+    pairs = pair_motions(replace(fit.problem, observations=o, weights=weights, n_views=n, huber=3.0), alone)
+    square = np.nan_to_num(np.sum((o.pixels - predict_pixels(alone, o)) ** 2, axis=-1), nan=1e12)
+    images, image = np.unique(2 * o.view + o.camera, return_inverse=True)
+    rms = np.sqrt(np.bincount(image, square) / np.bincount(image))
+    typical = float(np.median(rms))
+    bad = {
+        divmod(int(images[i]), 2): f"RMS {rms[i]:.3f} px by itself, the median image has {typical:.3f} px"
+        for i in np.flatnonzero(rms > TOO_FAR * typical)
+        if len(rms) >= LEAST_PAIRS
+    }
+    found = {}
+    if len(pairs.views) >= LEAST_PAIRS:
+        cost = pairs.cost_of_rest(~np.isin(pairs.views, apart))
+        usual = max(float(np.median(cost[~np.isin(pairs.views, list(elsewhere))])), 6.0)
+        for k in np.flatnonzero(cost > TOO_FAR**2 * usual):
+            found[int(pairs.views[k])] = f"{pairs.pixels[k]:.2g} px apart, where corners scatter by {typical:.2g} px"
+    boards = (alone.R_left_board, alone.t_left_board), alone.boards_in_right
+    left, right = ({int(v): (one[0][v], one[1][v]) for v in pairs.views} for one in boards)
+    R, t = R[:n].copy(), t[:n].copy()
+    for v in {*found, *apart} & set(left):
+        R[v], t[v] = left[v]
+    model = replace(begun, R_left_board=R, t_left_board=t, boards_right=None)
+    return PairsJudged(model, right, found, bad, left)

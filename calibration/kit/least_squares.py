@@ -59,7 +59,7 @@ class Normal:
         held: Array = self.own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.own.shape[-1])
         return held
 
-    def _carried(self, damping: float) -> tuple[Array, Array]:
+    def carried(self, damping: float = 0.0) -> tuple[Array, Array]:
         """How the own numbers follow the shared ones, (n, k, s), and their step at fixed shared ones (n, k)."""
         right = np.concatenate([np.swapaxes(self.cross, 1, 2), self.own_gradient[..., None]], axis=2)
         solved = np.asarray(np.linalg.solve(self.own_held(damping), right), float)
@@ -74,11 +74,11 @@ class Normal:
 
     def eliminated(self) -> tuple[Array, Array]:
         """Normal matrix (s, s) and gradient (s,) of the shared numbers with the prior, the own ones at their best."""
-        return self._without_own(*self._carried(0.0))
+        return self._without_own(*self.carried())
 
     def step(self, damping: float = 0.0) -> tuple[Array, Array]:
         """Damped step of the shared numbers (s,) and of the own ones (n, k)."""
-        carried, own = self._carried(damping)
+        carried, own = self.carried(damping)
         step = scaled_solve(*self._without_own(carried, own, damping))
         return step, own - carried @ step
 
@@ -88,7 +88,7 @@ class Normal:
 
     def covariances(self) -> tuple[Array, Array, Array]:
         """Of the shared numbers (s, s), of each block's own (n, k, k), and between shared and own (n, s, k)."""
-        carried, own = self._carried(0.0)
+        carried, own = self.carried()
         information, _ = self._without_own(carried, own)
         shared = scaled_solve(information, np.eye(len(information)))
         cross = -shared @ np.swapaxes(carried, 1, 2)
@@ -96,7 +96,7 @@ class Normal:
 
     def told_by_each(self) -> tuple[Array, Array]:
         """What each block, its own numbers eliminated, says of the shared ones: (n, s, s) and gradient (n, s)."""
-        carried, own = self._carried(0.0)
+        carried, own = self.carried()
         return self.of_each() - self.cross @ carried, self.gradient - np.einsum("nsk,nk->ns", self.cross, own)
 
     def shifts(self, first: int, common: Array | None = None) -> tuple[Array, Array, Array, Array]:

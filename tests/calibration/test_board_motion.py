@@ -12,8 +12,7 @@ from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.stereo_model import board_basis, moved, predict_pixels
 from calibration.judge.assessment import stereo_covariance
-from calibration.judge.motion_size import likely_motion
-from calibration.judge.pairs import motion_between_exposures
+from calibration.judge.pairs import likely_motion, motion_between_exposures
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
