@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.corner_fit import local_axes
 from calibration.board.target import Board
+from calibration.cameras.camera import CAMERA_NAMES
 from calibration.kit.errors import CalibrationError
-from calibration.stereo import CAMERA_NAMES, CalibrationSettings, StereoCalibration, calibrate_from_corners
+from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners
 
 LARGEST_SQUARE = 0.5  # m: beyond, millimetres were given for metres
 OVERSTATED = 0.7  # times the declared sigma: corners that scatter by less were declared worse than they are

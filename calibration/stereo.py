@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
-from calibration.cameras.camera import StereoRig
+from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.fit.lens_field import FieldFit
 from calibration.fit.model_choice import TermsTried
 from calibration.fit.pairing import count_once
@@ -44,7 +44,6 @@ from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
 from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
 
-CAMERA_NAMES = ("left", "right")
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
 
 

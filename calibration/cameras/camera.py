@@ -17,6 +17,7 @@ from calibration.cameras.splines import LensField
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 
+CAMERA_NAMES = ("left", "right")  # for people, and in files
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 N_INTRINSIC = len(INTRINSIC_PARAMETERS)
 RIG_PARAMETERS = (

@@ -10,14 +10,14 @@ boards were moved, errors have long tails: a pair's evidence is minus the logari
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.target import mirror_symmetries
-from calibration.cameras.camera import Camera, by_turning, project_with_jacobians
+from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
@@ -58,41 +58,39 @@ def count_once(views: Views, names: Names, table_view: int | None) -> None:
     Copies of a file, and frames of a video in which the board rests, are such. Raises CalibrationError where one
     camera's images show the board in one place and the other's do not.
     """
-    found = [[v for v in side if isinstance(v, CornerView)] for side in views]
-    limits = [SAME_PLACE * max(max(v.image_size) for v in side) if side else 0.0 for side in found]
+    same = [_same_place(side) for side in views]
+    found = np.array([[isinstance(view, CornerView) for view in side] for side in views])
     first: list[int] = []
-    numbers = range(len(names))
-    for v in sorted(numbers, key=lambda v: v != table_view):
-        pair = [side[v] for side in views]
-        if all(isinstance(one, BoardNotFound) for one in pair):
-            continue
-        for u in first:
-            if all(_near(one, side[u], limit) for one, side, limit in zip(pair, views, limits, strict=True)):
-                for side, name in zip(views, names[u], strict=True):
-                    side[v] = BoardNotFound(f"shows the board where {name} does, and counts once")
-                break
-        else:
+    for v in sorted(np.flatnonzero(found.any(axis=0)).tolist(), key=lambda v: v != table_view):
+        u = next((u for u in first if same[0][v, u] and same[1][v, u]), None)
+        if u is None:
             first.append(v)
-    both = [v for v in first if all(isinstance(side[v], CornerView) for side in views)]
-    for camera, (side, limit) in enumerate(zip(views, limits, strict=True)):
-        for u in both:
-            same = [v for v in both if _near(side[v], side[u], limit)]
-            if len(same) >= max(LEAST_PAIRS, 0.5 * len(both)):
-                name, other = ("left", "right")[camera], ("right", "left")[camera]
-                raise CalibrationError(
-                    f"{len(same)} {name} images show the board in one place, {names[same[0]][camera]} to "
-                    f"{names[same[-1]][camera]}, where the {other} ones show it in as many: are they copies of one? "
-                    "Every pair must be two images of one moment"
-                )
+            continue
+        for side, name in zip(views, names[u], strict=True):
+            side[v] = BoardNotFound(f"shows the board where {name} does, and counts once")
+    both = np.array([v for v in first if found[:, v].all()], int)
+    for camera, name in enumerate(CAMERA_NAMES):
+        alike = same[camera][np.ix_(both, both)]
+        if len(both) and alike.sum(axis=1).max() >= max(LEAST_PAIRS, 0.5 * len(both)):
+            which = both[alike[alike.sum(axis=1).argmax()]]
+            raise CalibrationError(
+                f"{len(which)} {name} images show the board in one place, {names[which[0]][camera]} to "
+                f"{names[which[-1]][camera]}, where the {CAMERA_NAMES[1 - camera]} ones show it in as many: are they "
+                "copies of one? Every pair must be two images of one moment"
+            )
 
 
-def _near(one: CornerView | BoardNotFound, other: CornerView | BoardNotFound, limit: float) -> bool:
-    """Whether two images of a camera show the board in one place, to `limit` [px] rms; or both do not show it."""
-    if isinstance(one, BoardNotFound) or isinstance(other, BoardNotFound):
-        return isinstance(one, BoardNotFound) and isinstance(other, BoardNotFound)
-    seen = one.accepted & other.accepted
-    square = np.sum((one.points - other.points)[seen] ** 2, axis=1)
-    return len(square) > 0 and float(np.mean(square)) < limit**2
+def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
+    """(n, n) whether two images of a camera show the board in one place; or both do not show it."""
+    found = np.array([isinstance(view, CornerView) for view in side], bool)
+    same = ~found[:, None] & ~found
+    seen = [np.where(view.accepted[:, None], view.points, np.nan) for view in side if isinstance(view, CornerView)]
+    limit = SAME_PLACE * max((max(view.image_size) for view in side if isinstance(view, CornerView)), default=0)
+    for v, points in zip(np.flatnonzero(found), seen, strict=True):
+        square = np.sum((np.stack(seen) - points) ** 2, axis=2)
+        common = np.isfinite(square)
+        same[v, found] = np.where(common, square, 0.0).sum(axis=1) < limit**2 * common.sum(axis=1)
+    return same
 
 
 def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: Array, camera: Camera) -> BoardPlaces:
@@ -114,8 +112,7 @@ def apart(left: BoardPlaces, right: BoardPlaces, R_pair: Array, t_pair: Array) -
     back = np.swapaxes(R_pair, 1, 2)[:, None]
     turn = rotation_vectors(back @ right.R @ np.swapaxes(left.R, 1, 2))
     shift = (back @ (right.middle - t_pair[:, None])[..., None])[..., 0] - left.middle
-    B = np.zeros((len(R_pair), 1, 6, 6))
-    B[..., :3, :3] = B[..., 3:, 3:] = back
+    B = _both(back, back)
     step = np.concatenate([turn, shift], axis=-1)
     known = np.linalg.solve(left.covariance + B @ right.covariance @ np.swapaxes(B, 2, 3), step[..., None])[..., 0]
     return np.asarray(np.sqrt(np.maximum(np.sum(step * known, axis=-1), 0.0)), np.float64)
@@ -144,14 +141,14 @@ class Pairing:
         return max(float(np.quantile(self.distance, 0.25)), self.floor)
 
     @property
-    def median(self) -> float:
-        """[px] Distance of half of the pairs."""
-        return float(np.median(self.distance))
-
-    @property
     def agrees(self) -> Mask:
         """(n,) pairs that tell of this place."""
         return self.distance < TOO_FAR * self.usual
+
+    def is_likelier(self, stored: Pairing) -> bool:
+        """True if it is to be believed against the pairs as they are stored."""
+        beyond = stored.evidence + 2.0 * np.log(NEARER)
+        return self.evidence > beyond and 2 * int(self.agrees.sum()) > len(self.distance)
 
 
 def likeliest(left: BoardPlaces, turns_of_right: Sequence[BoardPlaces], floor: float) -> Pairing:
@@ -167,10 +164,9 @@ def likeliest(left: BoardPlaces, turns_of_right: Sequence[BoardPlaces], floor: f
     likelihood[np.arange(len(own)), own] = 0.0  # each lies at the place that it tells of
     best = int(np.argmax(likelihood.sum(axis=1)))
     order, near = distance[:, best].argmin(axis=0), nearest[best]
-    evidence = float(likelihood[best].sum() / max(n - 1, 1))
+    found = Pairing(R[best], t[best], order, near, float(likelihood[best].sum() / max(n - 1, 1)), floor)
     shifts = np.stack([told_by(left, right)[1] for right in turns_of_right])[order, np.arange(n)]
-    found = Pairing(R[best], t[best], order, near, evidence, floor)
-    return Pairing(R[best], np.median(shifts[found.agrees], axis=0), order, near, evidence, floor)
+    return replace(found, t_right_left=np.median(shifts[found.agrees], axis=0))
 
 
 def board_turns(nominal: Array, orders: Sequence[NDArray[np.intp]]) -> list[Array]:
@@ -182,6 +178,38 @@ def board_turns(nominal: Array, orders: Sequence[NDArray[np.intp]]) -> list[Arra
         turn[:2, :2] = U @ Vt
         found.append(turn)
     return found
+
+
+@dataclass(frozen=True)
+class Order:
+    """A hypothesis of which images are pairs: left view v and the right one v + late, or last - v + late."""
+
+    late: int = 0
+    reversed: bool = False
+    mirrored: bool = False  # the images of one camera
+
+    def partner(self, v: int, names: Names) -> int:
+        """The right view of a left one."""
+        return (len(names) - 1 - v if self.reversed else v) + self.late
+
+    def told(self, found: Pairing, both: Sequence[int], stored: Pairing, names: Names) -> str:
+        """Why the pairs `both`, left views of this order, are believed against those stored, and what to do."""
+        if self.mirrored:
+            return (
+                f"the images of one of the two cameras are mirrored: if they are, {found.agrees.sum()} of {len(both)} "
+                f"pairs tell of one place of the cameras, as stored {stored.agrees.sum()}. Switch the mirroring off "
+                "where that camera's images are exported, or flip all of them, those of the motion too; so, too, if "
+                "it looks through a mirror"
+            )
+        v = both[int(np.argmin(found.distance))]
+        which = "in reversed order" if self.reversed else f"{abs(self.late)} {'late' if self.late > 0 else 'early'}"
+        return (
+            f"the left and the right views are no pairs as they are stored: the right ones come {which}. So paired, "
+            f"they tell of one place of the cameras to {np.median(found.distance):.2g} px, as stored to "
+            f"{np.median(stored.distance):.2g} px: {names[v][0]} shows the board where "
+            f"{names[self.partner(v, names)][1]} does. A frame was lost, or one camera began earlier: name or move "
+            "the files so that pairs have one number"
+        )
 
 
 def paired(
@@ -198,65 +226,48 @@ def paired(
     names : (left, right) of all views; orders : of the target's points that look the same
     """
     left, right = sides
-    turns = [right.turned(turn) for turn in board_turns(nominal, orders)]
+    turns = {
+        False: [right.turned(turn) for turn in board_turns(nominal, orders)],
+        True: [right.turned(turn, True) for turn in board_turns(nominal, mirror_symmetries(nominal[:, :2]))],
+    }
     place = [{view: i for i, view in enumerate(side)} for side in views]
-    last = len(names) - 1
 
-    def by(step: int, late: int, tried: Sequence[BoardPlaces]) -> tuple[list[int], Pairing] | None:
-        """Left view v with the right one v + late, or with last - v + late."""
-        partner = {v: (v if step > 0 else last - v) + late for v in views[0]}
-        both = [v for v in views[0] if partner[v] in place[1]]
-        if len(both) < (1 if (step, late) == (1, 0) else LEAST_PAIRS):
+    def by(order: Order, least: int = LEAST_PAIRS) -> tuple[Pairing, list[int]] | None:
+        both = [v for v in views[0] if order.partner(v, names) in place[1]]
+        if len(both) < least or not turns[order.mirrored]:
             return None
-        a, b = np.array([place[0][v] for v in both]), np.array([place[1][partner[v]] for v in both])
-        return both, likeliest(left[a], [one[b] for one in tried], floor)
+        a, b = [place[0][v] for v in both], [place[1][order.partner(v, names)] for v in both]
+        return likeliest(left[np.array(a)], [one[np.array(b)] for one in turns[order.mirrored]], floor), both
 
-    stored = by(1, 0, turns)
-    if stored is None:
+    as_stored = by(Order(), 1)
+    if as_stored is None:
         raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
-    both, found = stored
+    stored, both = as_stored
     n = len(both)
-    if n < LEAST_PAIRS - 1 or (found.agrees.all() and found.usual < TOO_FAR * floor):
-        return found, ()
-    mirrors = [right.turned(turn, True) for turn in board_turns(nominal, mirror_symmetries(nominal[:, :2]))]
-    mirrored = by(1, 0, mirrors) if mirrors else None
-    if mirrored and _is_likelier(mirrored[1], found):
-        raise CalibrationError(
-            f"the images of one of the two cameras are mirrored: if they are, {mirrored[1].agrees.sum()} of {n} pairs "
-            f"tell of one place of the cameras, as stored {found.agrees.sum()}. Switch the mirroring off where that "
-            "camera's images are exported, or flip all of them, those of the motion too; so, too, if it looks through "
-            "a mirror"
-        )
+    if n < LEAST_PAIRS - 1 or (stored.agrees.all() and stored.usual < TOO_FAR * floor):
+        return stored, ()
     shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) <= n - LEAST_PAIRS]
-    others = {(step, k): by(step, k, turns) for step in (1, -1) for k in shifts if (step, k) != (1, 0)}
-    _refuse_other_order(found, {which: one for which, one in others.items() if one is not None}, names)
-    notes = _late(left, turns, place, both, found, names)
-    if notes and 2 * found.agrees.sum() <= n:
-        raise CalibrationError(f"{'; '.join(notes)}. As stored {found.agrees.sum()} of {n} pairs are right")
-    return found, notes
+    tried = [Order(k, backwards) for backwards in (False, True) for k in shifts if k or backwards]
+    rivals = {order: found for order in (Order(mirrored=True), *tried) if (found := by(order)) is not None}
+    if rivals:
+        likely = max(rivals, key=lambda order: rivals[order][0].evidence)
+        if rivals[likely][0].is_likelier(stored):
+            raise CalibrationError(likely.told(*rivals[likely], stored, names))
+    _require_agreement(stored, [found.evidence for order, (found, _) in rivals.items() if not order.mirrored])
+    notes = _late(
+        left, turns[False], place, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names
+    )
+    if notes and 2 * stored.agrees.sum() <= n:
+        raise CalibrationError(f"{'; '.join(notes)}. As stored {stored.agrees.sum()} of {n} pairs are right")
+    return stored, notes
 
 
-def _refuse_other_order(
-    stored: Pairing, others: Mapping[tuple[int, int], tuple[list[int], Pairing]], names: Names
-) -> None:
-    """Raise CalibrationError where pairs in another order (step, late) agree and those stored do not, or none do."""
-    if not others:
+def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
+    """Raise CalibrationError where pairs lie together no better than those of other orders, with this evidence, do."""
+    n = len(stored.distance)
+    if n < 2 * LEAST_PAIRS or not others or stored.usual < TOO_FAR * stored.floor:
         return
-    n, last = len(stored.distance), len(names) - 1
-    (step, late), (whose, best) = max(others.items(), key=lambda item: item[1][1].evidence)
-    if _is_likelier(best, stored):
-        v = whose[int(np.argmin(best.distance))]
-        partner = (v if step > 0 else last - v) + late
-        which = "in reversed order" if step < 0 else f"{abs(late)} {'late' if late > 0 else 'early'}"
-        raise CalibrationError(
-            f"the left and the right views are no pairs as they are stored: the right ones come {which}. So paired, "
-            f"they tell of one place of the cameras to {best.median:.2g} px, as stored to {stored.median:.2g} px: "
-            f"{names[v][0]} shows the board where {names[partner][1]} does. A frame was lost, or one camera began "
-            "earlier: name or move the files so that pairs have one number"
-        )
-    chance = float(np.median([one.evidence for _, one in others.values()]))
-    agree = stored.evidence > chance + 2.0 * np.log(BY_CHANCE) or stored.usual < TOO_FAR * stored.floor
-    if n >= 2 * LEAST_PAIRS and not agree:
+    if stored.evidence <= float(np.median(others)) + 2.0 * np.log(BY_CHANCE):
         raise CalibrationError(
             f"the {n} pairs tell of no common place of the cameras: they differ by {stored.usual:.2g} px and more, as "
             f"images do that are no pairs. Other orders, up to {MOST_LATE} views late or early, and mirrored images "
@@ -264,41 +275,37 @@ def _refuse_other_order(
         )
 
 
-def _is_likelier(one: Pairing, stored: Pairing) -> bool:
-    return one.evidence > stored.evidence + 2.0 * np.log(NEARER) and 2 * int(one.agrees.sum()) > len(one.distance)
-
-
 def _late(
     left: BoardPlaces,
     turns: Sequence[BoardPlaces],
     place: Sequence[Mapping[int, int]],
-    both: Sequence[int],
+    odd: Sequence[int],
     found: Pairing,
     names: Names,
 ) -> tuple[str, ...]:
-    """A warning about pairs that agree with the others if the right view is a later or an earlier one."""
-    runs: dict[int, list[int]] = {}
-    for v in (v for v, fits in zip(both, found.agrees, strict=True) if not fits):
-        for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs):
-            if k == 0 or v + k not in place[1]:
-                continue
+    """A warning about pairs, of those that do not fit, that would with a later or an earlier right view."""
+    rest, told = list(odd), []
+    for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
+        which = []
+        for v in (v for v in rest if v + k in place[1]):
             a, b = np.array([place[0][v]]), np.array([place[1][v + k]])
-            here = [apart(left[a], one[b], found.R_right_left[None], found.t_right_left[None]).min() for one in turns]
-            if min(here) < TOO_FAR * found.usual:
-                runs.setdefault(k, []).append(v)
-                break
-    return tuple(
-        f"{names[which[0]][0]} to {names[which[-1]][0]}: {len(which)} pairs agree with the others if the right view "
-        f"{abs(k)} {'later' if k > 0 else 'earlier'} is taken ({names[which[0] + k][1]} in place of "
-        f"{names[which[0]][1]}): a frame was lost there. Name or move the files so that pairs have one number"
-        for k, which in runs.items()
-        if len(which) >= LEAST_PAIRS - 1
-    )
+            at = found.R_right_left[None], found.t_right_left[None]
+            if min(apart(left[a], one[b], *at).min() for one in turns) < TOO_FAR * found.usual:
+                which.append(v)
+        rest = [v for v in rest if v not in which]
+        if len(which) >= LEAST_PAIRS - 1:
+            told.append(
+                f"{names[which[0]][0]} to {names[which[-1]][0]}: {len(which)} pairs agree with the others if the right "
+                f"view {abs(k)} {'later' if k > 0 else 'earlier'} is taken ({names[which[0] + k][1]} in place of "
+                f"{names[which[0]][1]}): a frame was lost there. Name or move the files so that pairs have one number"
+            )
+    return tuple(told)
 
 
 def _both(turn: Array, shift: Array) -> Array:
-    B = np.zeros((6, 6))
-    B[:3, :3], B[3:, 3:] = turn, shift
+    """(..., 6, 6) of rotations (..., 3, 3) of a turn and of a shift."""
+    B = np.zeros((*turn.shape[:-2], 6, 6))
+    B[..., :3, :3], B[..., 3:, 3:] = turn, shift
     return B
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import Camera, rotation_from_vector
+from calibration.cameras.camera import CAMERA_NAMES, Camera, rotation_from_vector
 from calibration.fit.pairing import FLOOR, Names, Pose, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Mask
@@ -30,7 +30,7 @@ def start_camera(
             objects.append(nominal[observations.point[use]].astype(np.float32))
             images.append(observations.pixels[use].astype(np.float32))
             views.append(int(view))
-    name = ("left", "right")[index]
+    name = CAMERA_NAMES[index]
     if len(views) < MIN_VIEWS:
         raise CalibrationError(
             f"{name} camera: the target is found in {len(views)} views, at least {MIN_VIEWS} are needed "

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN, StereoRig
+from calibration.cameras.camera import CAMERA_NAMES, OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN, StereoRig
 from calibration.cameras.causes import causes
 from calibration.fit.model_choice import TermsTried
 from calibration.fit.normal_equations import Problem, minimise
@@ -285,7 +285,7 @@ def _warnings(
     chosen: TermsTried | None,
 ) -> tuple[str, ...]:
     found = []
-    for name, value in zip(("left", "right"), share, strict=True):
+    for name, value in zip(CAMERA_NAMES, share, strict=True):
         if value < MIN_COVERAGE:
             found.append(
                 f"{name} camera: corners cover {100 * value:.0f} % of the image (good: above "

@@ -12,14 +12,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from calibration.cameras.camera import Camera, project
+from calibration.cameras.camera import CAMERA_NAMES, Camera, project
 from calibration.fit.pairing import apart, places_of, rotation_vectors, told_by
 from calibration.fit.start import start_camera
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.judge.pairs import PairsJudged
 from calibration.kit.arrays import Array
 
-LEAST = 6  # pairs: of fewer a step cannot be told from motions of the boards
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
 STEP = 4.0
@@ -102,7 +101,7 @@ def zoomed(
         change = focal[2] / focal[1] - 1.0
         if abs(change) > ZOOM and square[0] > BY_ZOOM * (square[1] + square[2]):
             found[index] = (
-                f"the {('left', 'right')[index]} camera was zoomed or focused anew while the views were taken: its "
+                f"the {CAMERA_NAMES[index]} camera was zoomed or focused anew while the views were taken: its "
                 f"focal length is {focal[1]:.0f} px in the {len(moved.stretches[moved.kept])} views that are used, "
                 f"{focal[2]:.0f} px here. If the motion was recorded so, calibrate from these views alone"
             )
@@ -117,69 +116,55 @@ def camera_moved(
     observations : with the views' numbers; pairs : as judged by cameras that were refined, `model` has those
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
-    views, places, between = _places(observations, pairs, model)
-    if len(views) < LEAST:
+    sides, R_pair, t_pair = [], model.R_right_left, model.t_right_left
+    views = np.array([v for v in pairs.right_poses if v in pairs.left_poses], int)
+    if len(views) < 2 * LEAST_SIDE:
         return None
-    steps: list[Step] = []
-    ends = [0, *_steps(between, places, views, (0, len(views)), steps), len(views)]
-    if not steps:
-        return None
-    stretches = tuple(tuple(views[a:b]) for a, b in pairwise(ends))
-    sizes = [len(stretch) for stretch in stretches]
-    kept = int(np.argmax(sizes))
-    if table_view is not None:
-        kept = int(np.searchsorted([step.view for step in sorted(steps, key=lambda s: s.view)], table_view, "right"))
-    return CameraMoved(tuple(sorted(steps, key=lambda step: step.view)), stretches, kept)
-
-
-def _places(observations: Observations, pairs: PairsJudged, model: StereoModel) -> tuple[list[int], Array, Array]:
-    """Views of pairs, how the cameras stand by each alone, turn and shift (n, 6) from `model`, and how far apart.
-
-    The latter (n, n) [px] by the covariance of the places that each image alone gives the board; see `fit.pairing`.
-    """
-    R_pair, t_pair = model.R_right_left, model.t_right_left
-    in_right = {
-        v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items() if v in pairs.left_poses
-    }
-    in_left = {v: pairs.left_poses[v] for v in in_right}
-    sides = []
-    for index, poses in enumerate((in_left, in_right)):
+    in_right = {v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items()}
+    for index, poses in enumerate((pairs.left_poses, in_right)):
         mine = observations[observations.camera == index]
-        points = {v: model.points[mine.point[mine.view == v]] for v in poses}
-        sides.append(places_of(poses, points, model.points, model.cameras[index]))
-    tells = np.flatnonzero(np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0))
-    left, right = (side[tells] for side in sides)
+        points = {v: model.points[mine.point[mine.view == v]] for v in views}
+        sides.append(places_of({v: poses[v] for v in views}, points, model.points, model.cameras[index]))
+    tells = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
+    views, (left, right) = views[tells], (side[tells] for side in sides)
     R, t = told_by(left, right)
     between = apart(left, right, R, t)
-    places = np.concatenate([rotation_vectors(R @ R_pair.T), t - t_pair], axis=1)
-    return np.array(list(in_left), int)[tells].tolist(), places, 0.5 * (between + between.T)
+    cuts = _cuts(0.5 * (between + between.T))
+    if not cuts:
+        return None
+    stretches = np.split(np.arange(len(views)), [at for at, _, _ in cuts])
+    steps = []
+    for (at, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
+        # in plain units: boards that moved scatter a turn and a shift that nearly cancel in the image
+        turn = np.median(rotation_vectors(R[after] @ R_pair.T), axis=0)
+        turn -= np.median(rotation_vectors(R[before] @ R_pair.T), axis=0)
+        shift = np.median(t[after], axis=0) - np.median(t[before], axis=0)
+        steps.append(Step(int(views[at]), float(np.linalg.norm(turn)), float(np.linalg.norm(shift)), pixels, scatter))
+    kept = int(np.argmax([len(stretch) for stretch in stretches]))
+    if table_view is not None:
+        kept = int(np.searchsorted([step.view for step in steps], table_view, "right"))
+    return CameraMoved(tuple(steps), tuple(tuple(views[s].tolist()) for s in stretches), kept)
 
 
-def _steps(between: Array, places: Array, views: Sequence[int], part: tuple[int, int], steps: list[Step]) -> list[int]:
-    """Where steps are among a part of the pairs, in order: the clearest one, then those on either side of it."""
-    begin, end = part
-    if end - begin < 2 * LEAST_SIDE:
+def _cuts(between: Array) -> list[tuple[int, float, float]]:
+    """Where n pairs part, in order: the clearest step, then those on either side of it; `Step.pixels` and `scatter`.
+
+    between : (n, n) [px] by which what the pairs tell of the cameras differs
+    """
+    n, place = len(between), np.arange(len(between))
+    if n < 2 * LEAST_SIDE:
         return []
 
     def to_sides(cut: int) -> tuple[Array, Array]:
-        """Median distances (2, n) of each pair to those of its own side, and to those of the other."""
-        own, other = np.empty(end - begin), np.empty(end - begin)
-        for side, opposite in ((slice(begin, cut), slice(cut, end)), (slice(cut, end), slice(begin, cut))):
-            here = slice(side.start - begin, side.stop - begin)
-            within = between[side, side][~np.eye(side.stop - side.start, dtype=bool)]
-            own[here] = np.median(within.reshape(side.stop - side.start, -1), axis=1)
-            other[here] = np.median(between[side, opposite], axis=1)
-        return own, other
+        """Median distances (n,) of each pair to those of its own side, and to those of the other."""
+        same = (place[:, None] < cut) == (place < cut)
+        own, other = (np.where(which, between, np.nan) for which in (same & (place[:, None] != place), ~same))
+        return np.nanmedian(own, axis=1), np.nanmedian(other, axis=1)
 
-    at = min(range(begin + LEAST_SIDE, end - LEAST_SIDE + 1), key=lambda cut: to_sides(cut)[0].sum())
+    at = min(range(LEAST_SIDE, n - LEAST_SIDE + 1), key=lambda cut: float(to_sides(cut)[0].sum()))
     own, other = to_sides(at)
-    pixels = float(np.median(other))
-    scatter = float(max(np.median(own[: at - begin]), np.median(own[at - begin :])))
+    pixels, scatter = float(np.median(other)), float(max(np.median(own[:at]), np.median(own[at:])))
     if not pixels > STEP * scatter or np.mean(own > other) > ASTRAY:
         return []
-    # in plain units: boards that moved scatter a turn and a shift that nearly cancel in the image
-    change = np.median(places[at:end], axis=0) - np.median(places[begin:at], axis=0)
-    turn, shift = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-    steps.append(Step(views[at], float(turn), float(shift), pixels, scatter))
-    before, after = (_steps(between, places, views, side, steps) for side in ((begin, at), (at, end)))
-    return [*before, at, *after]
+    after = [(at + cut, other, own) for cut, other, own in _cuts(between[at:, at:])]
+    return [*_cuts(between[:at, :at]), (at, pixels, scatter), *after]

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from calibration.cameras.camera import Camera
+from calibration.cameras.camera import CAMERA_NAMES, Camera
 from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array
 
@@ -40,7 +40,7 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
             continue
         if rational < CLEARLY * polynomial:
             found.append(
-                f"the {('left', 'right')[index]} lens is wider than the model: a polynomial in the radius leaves "
+                f"the {CAMERA_NAMES[index]} lens is wider than the model: a polynomial in the radius leaves "
                 f"{polynomial:.2f} px in views left out, a rational function {rational:.2f} px, and that is not "
                 "supported. Results are wrong by as much: take a lens below some 90 deg, or crop the images to the "
                 "middle"
