@@ -7,14 +7,23 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.target import Board, Target, target_of
-from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, RIG_PARAMETERS, Allowance, Camera, StereoRig
+from calibration.cameras.camera import (
+    CAMERA_NAMES,
+    INTRINSIC_PARAMETERS,
+    N_INTRINSIC,
+    N_RIG,
+    RIG_PARAMETERS,
+    Allowance,
+    Camera,
+    StereoRig,
+)
 from calibration.cameras.splines import LensField
 from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array, Mask
@@ -25,6 +34,51 @@ SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1
 MAX_VALUES = 50_000_000  # of one dataset: beyond, the file is not a rig whatever it says
 _READ_ERRORS = (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError, IndexError)
+
+
+class Dataset(NamedTuple):
+    """What a dataset of a rig file holds."""
+
+    shape: tuple[int | str, ...]  # a name is a size that the file itself tells
+    units: str = ""
+    description: str = ""
+    kind: str = "f"  # of its values, as NumPy abbreviates it
+
+
+_OF_CAMERA = {
+    "intrinsics": Dataset((N_INTRINSIC,), "px (first four), 1", ", ".join(INTRINSIC_PARAMETERS)),
+    "image_size": Dataset((2,), "px", "width, height", "iu"),
+}
+_OF_RIG = {
+    "R_right_left": Dataset((3, 3), "1", "rotation from left to right camera axes"),
+    "t_right_left": Dataset((3,), "m", "origin of the left camera in right camera axes"),
+    "R_left_world": Dataset((3, 3), "1", "rotation from world to left camera axes"),
+    "t_left_world": Dataset((3,), "m", "origin of the world in left camera axes"),
+    "covariance": Dataset(
+        (N_RIG, N_RIG),
+        "products of the units of the parameters (px, 1, rad, m)",
+        "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
+    ),
+}
+_OF_OBSERVATIONS = {
+    "view": Dataset(("seen",), "1", "index of the place", "iu"),
+    "camera": Dataset(("seen",), "1", "0 left, 1 right", "iu"),
+    "point": Dataset(("seen",), "1", "board point", "iu"),
+    "pixels": Dataset(("seen", 2), "px", "located corner"),
+    "pixels_covariance": Dataset(("seen", 2, 2), "px^2", "of the located corner, from the image's own noise"),
+}
+_OF_RECORD = {
+    "board_points": Dataset(("points", 3), "m", "target points in board axes as refined"),
+    "board_thickness": Dataset((), "m", "from the table to the printed face"),
+    "unexplained_sigma": Dataset((), "px", "per axis, added to each corner's own noise"),
+    "R_left_board": Dataset(
+        ("places", 3, 3), "1", "rotation from board to left camera axes, per place: views, then right images apart"
+    ),
+    "t_left_board": Dataset(("places", 3), "m", "corner 0 in left camera axes, per place"),
+    "kept": Dataset(("seen",), "1", "1 where the corner was used", "u"),
+    "residuals": Dataset(("seen", 2), "px", "located minus predicted corner"),
+}
+_AS_JSON = ("settings", "figures", "versions", "warnings", "view_names", "rejected_views")
 
 
 @dataclass(frozen=True)
@@ -62,6 +116,7 @@ class RigFile:
 def record_of(calibration: StereoCalibration) -> CalibrationRecord:
     """What is worth keeping of a calibration, without the images."""
     r = calibration.refinement
+    tried = ("n_parameters", "rms_px", "held_out_rms_px", "held_out_chi_square", "noise_px")
     figures = {
         "rms_px": calibration.rms_px,
         "rms_per_camera_px": list(calibration.rms_per_camera_px),
@@ -70,15 +125,7 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         "iterations": r.iterations,
         "converged": r.converged,
         "cross_validation": [
-            {
-                "distortion": c.terms.distortion,
-                "board": c.terms.board,
-                "parameters": c.n_parameters,
-                "rms_px": c.rms_px,
-                "held_out_rms_px": c.held_out_rms_px,
-                "held_out_chi_square": c.held_out_chi_square,
-                "noise_px": c.noise_px,
-            }
+            {"distortion": c.terms.distortion, "board": c.terms.board, **{name: getattr(c, name) for name in tried}}
             for c in calibration.candidates
         ],
         "assessment": asdict(calibration.assessment),
@@ -88,16 +135,12 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         n = len(model.R_left_board)
         apart = (*apart, *range(n - len(apart)), *apart)
         observations = replace(observations, view=observations.view + n * observations.camera)
-        R, t = (
-            np.concatenate(both)
-            for both in zip((model.R_left_board, model.t_left_board), model.boards_right, strict=True)
-        )
+        boards = zip((model.R_left_board, model.t_left_board), model.boards_right, strict=True)
+        R, t = (np.concatenate(both) for both in boards)
         model = replace(model, R_left_board=R, t_left_board=t, boards_right=None)
+    same = ("board", "board_points", "table_view", "board_thickness", "rejected_views", "warnings")
     return CalibrationRecord(
-        board=calibration.board,
-        board_points=calibration.board_points,
-        table_view=calibration.table_view,
-        board_thickness=calibration.board_thickness,
+        **{name: getattr(calibration, name) for name in same},
         view_names=tuple((str(a), str(b)) for a, b in calibration.view_names),
         observations=observations,
         kept=r.kept,
@@ -107,9 +150,7 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         t_left_board=model.t_left_board,
         settings=_plain(asdict(calibration.settings)),
         figures=_plain(figures),
-        rejected_views=dict(calibration.rejected_views),
         rejected_corners=tuple(calibration.rejected_corners()),
-        warnings=tuple(calibration.warnings),
         versions=versions(),
         apart=apart,
     )
@@ -175,26 +216,11 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
     """A rig as datasets of an HDF5 group. (A trajectory file holds the same numbers with labelled axes.)"""
     group.attrs["world"] = "table, k up" if rig.world_is_table else "axes of the left camera"
     group.attrs["world_is_table"] = int(rig.world_is_table)
-    for name, camera in zip(("left", "right"), rig.cameras, strict=True):
-        _put(
-            group,
-            f"{name}_intrinsics",
-            camera.parameters,
-            "px (first four), 1",
-            f"{name} camera: {', '.join(INTRINSIC_PARAMETERS)}",
-        )
-        _put(group, f"{name}_image_size", camera.image_size, "px", f"{name} camera: width, height")
-    _put(group, "R_right_left", rig.R_right_left, "1", "rotation from left to right camera axes")
-    _put(group, "t_right_left", rig.t_right_left, "m", "origin of the left camera in right camera axes")
-    _put(group, "R_left_world", rig.R_left_world, "1", "rotation from world to left camera axes")
-    _put(group, "t_left_world", rig.t_left_world, "m", "origin of the world in left camera axes")
-    _put(
-        group,
-        "covariance",
-        rig.covariance,
-        "products of the units of the parameters (px, 1, rad, m)",
-        "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
-    )
+    for name, camera in zip(CAMERA_NAMES, rig.cameras, strict=True):
+        for (what, row), value in zip(_OF_CAMERA.items(), (camera.parameters, camera.image_size), strict=True):
+            _put(group, f"{name}_{what}", value, row.units, f"{name} camera: {row.description}")
+    for name, row in _OF_RIG.items():
+        _put(group, name, getattr(rig, name), row.units, row.description)
     group["covariance"].attrs["parameters"] = ", ".join(RIG_PARAMETERS)
     for name, (values, units, told, attributes) in beyond_model(rig).items():
         _put(group, name, values, units, told)
@@ -242,38 +268,23 @@ def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
 
 def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     write_attributes(group, {"settings": record.settings, "figures": record.figures, "versions": record.versions})
-    group.attrs["settings"] = json.dumps(record.settings)
-    group.attrs["figures"] = json.dumps(record.figures)
-    group.attrs["versions"] = json.dumps(record.versions)
-    group.attrs["warnings"] = json.dumps(record.warnings)
-    group.attrs["view_names"] = json.dumps(record.view_names)
-    group.attrs["rejected_views"] = json.dumps(record.rejected_views)
+    for name in _AS_JSON:
+        group.attrs[name] = json.dumps(getattr(record, name))
     if record.apart:
         group.attrs["apart"] = json.dumps(record.apart)
     group.attrs["table_view"] = -1 if record.table_view is None else record.table_view
-    text = h5py.string_dtype()
-    group.create_dataset("rejected_corners", data=json.dumps(record.rejected_corners), dtype=text)
-    group["rejected_corners"].attrs["description"] = "JSON list of view, camera, corner, reason"
-    group.create_dataset("board", data=json.dumps(record.board.described()), dtype=text)
-    group["board"].attrs["description"] = "JSON object: kind of target and its fields, lengths in m"
-    _put(group, "board_points", record.board_points, "m", "target points in board axes as refined")
-    _put(group, "board_thickness", record.board_thickness, "m", "from the table to the printed face")
-    _put(group, "unexplained_sigma", record.unexplained_sigma, "px", "per axis, added to each corner's own noise")
-    _put(
-        group,
-        "R_left_board",
-        record.R_left_board,
-        "1",
-        "rotation from board to left camera axes, per place: views, then right images apart",
-    )
-    _put(group, "t_left_board", record.t_left_board, "m", "corner 0 in left camera axes, per place")
+    for name, what, told in (
+        ("rejected_corners", record.rejected_corners, "JSON list of view, camera, corner, reason"),
+        ("board", record.board.described(), "JSON object: kind of target and its fields, lengths in m"),
+    ):
+        group.create_dataset(name, data=json.dumps(what), dtype=h5py.string_dtype())
+        group[name].attrs["description"] = told
     o = record.observations
-    for name, description in (("view", "index of the place"), ("camera", "0 left, 1 right"), ("point", "board point")):
-        _put(group, name, getattr(o, name).astype(np.int64), "1", description)
-    _put(group, "pixels", o.pixels, "px", "located corner")
-    _put(group, "pixels_covariance", o.covariance, "px^2", "of the located corner, from the image's own noise")
-    _put(group, "kept", record.kept.astype(np.uint8), "1", "1 where the corner was used")
-    _put(group, "residuals", record.residuals, "px", "located minus predicted corner")
+    seen = (o.view, o.camera, o.point, o.pixels, o.covariance)
+    values = {name: getattr(record, name) for name in _OF_RECORD} | dict(zip(_OF_OBSERVATIONS, seen, strict=True))
+    for name, row in (_OF_RECORD | _OF_OBSERVATIONS).items():
+        value = np.asarray(values[name])
+        _put(group, name, value.astype(np.uint8) if row.kind == "u" else value, row.units, row.description)
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -314,19 +325,17 @@ def read_rig_file(path: str | os.PathLike[str]) -> RigFile:
         ) from error
 
 
-def _get(group: h5py.Group, name: str, shape: tuple[int | None, ...], kind: str = "f") -> NDArray:
-    """A dataset after a look at its shape and kind, so that no hostile size is ever read."""
+def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | None = None) -> NDArray:
+    """A dataset after a look at its shape and kind, so that no hostile size is ever read; unknown sizes are free."""
     if name not in group:
         raise RigFileError(f"{group.name}/{name} is missing; present: {', '.join(group)}")
     dataset = group[name]
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kind:
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in row.kind:
         raise RigFileError(f"{group.name}/{name} does not hold numbers of the right kind")
-    if len(dataset.shape) != len(shape) or any(
-        w is not None and n != w for n, w in zip(dataset.shape, shape, strict=True)
-    ):
+    shape = tuple((sizes or {}).get(n) if isinstance(n, str) else n for n in row.shape)
+    same = len(dataset.shape) == len(shape) and all(w in (n, None) for n, w in zip(dataset.shape, shape, strict=True))
+    if not same or dataset.size > MAX_VALUES:
         raise RigFileError(f"{group.name}/{name} has shape {dataset.shape}, expected {shape}")
-    if dataset.size > MAX_VALUES:
-        raise RigFileError(f"{group.name}/{name} has {dataset.size} values, more than any rig")
     values = np.asarray(dataset[()])
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise RigFileError(f"{group.name}/{name} holds values that are not finite")
@@ -336,36 +345,22 @@ def _get(group: h5py.Group, name: str, shape: tuple[int | None, ...], kind: str 
 def read_rig_group(group: h5py.Group) -> StereoRig:
     """Inverse of `write_rig_group`. Raises RigFileError on content that is not a rig."""
     cameras = []
-    for name in ("left", "right"):
-        width, height = (int(n) for n in _get(group, f"{name}_image_size", (2,), "iu"))
-        parameters = _get(group, f"{name}_intrinsics", (9,))
+    for name in CAMERA_NAMES:
+        parameters, (width, height) = (_get(group, f"{name}_{what}", row) for what, row in _OF_CAMERA.items())
         if not (0 < width < 10**6 and 0 < height < 10**6 and parameters[0] > 0 and parameters[1] > 0):
             raise RigFileError(f"{group.name}: {name} camera of {width} x {height} px, focal lengths {parameters[:2]}")
-        cameras.append(Camera.from_parameters(parameters, (width, height)))
-    rotations = {name: _get(group, name, (3, 3)) for name in ("R_right_left", "R_left_world")}
-    for name, R in rotations.items():
-        if not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
+        cameras.append(Camera.from_parameters(parameters, (int(width), int(height))))
+    values: dict[str, Any] = {name: _get(group, name, row) for name, row in _OF_RIG.items()}
+    for name in ("R_right_left", "R_left_world"):
+        if not (np.abs(values[name] @ values[name].T - np.eye(3)).max() < 1e-6 and np.linalg.det(values[name]) > 0):
             raise RigFileError(f"{group.name}/{name} is not a rotation")
-    covariance = _get(group, "covariance", (N_RIG, N_RIG))
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = covariance / scale / scale[:, None]
-    if (
-        np.diag(covariance).min() < 0
-        or np.abs(correlation).max() > 1 + 1e-6
-        or not np.allclose(correlation, correlation.T)
-    ):
+    variance = np.diag(values["covariance"])
+    scale = np.sqrt(np.maximum(variance, 1e-300))
+    correlation = values["covariance"] / scale / scale[:, None]
+    if variance.min() < 0 or np.abs(correlation).max() > 1 + 1e-6 or not np.allclose(correlation, correlation.T):
         raise RigFileError(f"{group.name}/covariance is not a covariance")
-    return StereoRig(
-        left=cameras[0],
-        right=cameras[1],
-        R_right_left=rotations["R_right_left"],
-        t_right_left=_get(group, "t_right_left", (3,)),
-        R_left_world=rotations["R_left_world"],
-        t_left_world=_get(group, "t_left_world", (3,)),
-        covariance=covariance,
-        world_is_table=bool(group.attrs.get("world_is_table", 0)),
-        **read_beyond_model(group),
-    )
+    is_table = bool(group.attrs.get("world_is_table", 0))
+    return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values, **read_beyond_model(group))
 
 
 def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
@@ -377,7 +372,7 @@ def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
 
 
 def _allowances(group: h5py.Group) -> tuple[Allowance, ...]:
-    shifts = _get(group, "allowances", (None, N_RIG))
+    shifts = _get(group, "allowances", Dataset(("causes", N_RIG)))
     causes, assumed = (json.loads(group["allowances"].attrs[name]) for name in ("causes", "assumed"))
     if not len(shifts) == len(causes) == len(assumed) <= N_RIG:
         raise RigFileError(f"{group.name}/allowances: {len(shifts)} rows, {len(causes)} causes, {len(assumed)} marks")
@@ -385,7 +380,8 @@ def _allowances(group: h5py.Group) -> tuple[Allowance, ...]:
 
 
 def _lens_field(group: h5py.Group) -> LensField:
-    coefficients, spacing = _get(group, "lens_field", (2, 2, None, None)), float(_get(group, "lens_field_spacing", ()))
+    coefficients = _get(group, "lens_field", Dataset((2, 2, "rows", "columns")))
+    spacing = float(_get(group, "lens_field_spacing", Dataset(())))
     if min(coefficients.shape[2:]) < 4 or not spacing > 0:
         raise RigFileError(f"{group.name}/lens_field of shape {coefficients.shape}, spacing {spacing} is not a field")
     return LensField(coefficients, spacing)
@@ -397,44 +393,41 @@ def _board(group: h5py.Group) -> Target:
             return target_of(json.loads(group["board"].asstr()[()]))
         except CalibrationError as error:
             raise RigFileError(f"{group.name}: {error}") from error
-    counts = _get(group, "inner_corners", (2,), "iu")  # files that knew chessboards only
-    return Board((int(counts[0]), int(counts[1])), float(_get(group, "square", ())))
+    counts = _get(group, "inner_corners", Dataset((2,), kind="iu"))  # files that knew chessboards only
+    return Board((int(counts[0]), int(counts[1])), float(_get(group, "square", Dataset(()))))
 
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:
-    def attribute(name: str) -> Any:
-        return json.loads(group.attrs[name])
-
-    board = _board(group)
-    n = len(board.points)
-    pixels = _get(group, "pixels", (None, 2))
-    apart = json.loads(group.attrs.get("apart", "[]"))
-    m, n_views = len(pixels), len(attribute("view_names")) + len(apart)
-    indices = [_get(group, name, (m,), "iu").astype(np.intp) for name in ("view", "camera", "point")]
-    for name, index, limit in zip(("view", "camera", "point"), indices, (n_views, 2, n), strict=True):
-        if m and not (index.min() >= 0 and index.max() < limit):
+    texts = {name: json.loads(group.attrs[name]) for name in _AS_JSON}
+    board, apart = _board(group), json.loads(group.attrs.get("apart", "[]"))
+    sizes = {
+        "points": len(board.points),
+        "places": len(texts["view_names"]) + len(apart),
+        "seen": len(group["pixels"]),
+    }
+    seen, values = (
+        {name: _get(group, name, row, sizes) for name, row in rows.items()} for rows in (_OF_OBSERVATIONS, _OF_RECORD)
+    )
+    for name, limit in (("view", sizes["places"]), ("camera", 2), ("point", sizes["points"])):
+        index = seen[name] = seen[name].astype(np.intp)
+        if len(index) and not (index.min() >= 0 and index.max() < limit):
             raise RigFileError(f"{group.name}/{name} points beyond the {limit} there are")
     table_view = int(group.attrs["table_view"])
     rejected = json.loads(group["rejected_corners"].asstr()[()])
+    known: dict[str, Any] = texts | values
     return CalibrationRecord(
-        board=board,
-        board_points=_get(group, "board_points", (n, 3)),
-        table_view=None if table_view < 0 else table_view,
-        board_thickness=float(_get(group, "board_thickness", ())),
-        view_names=tuple((str(a), str(b)) for a, b in attribute("view_names")),
-        observations=Observations(
-            indices[0], indices[1], indices[2], pixels, _get(group, "pixels_covariance", (m, 2, 2))
-        ),
-        kept=_get(group, "kept", (m,), "u").astype(bool),
-        residuals=_get(group, "residuals", (m, 2)),
-        unexplained_sigma=float(_get(group, "unexplained_sigma", ())),
-        R_left_board=_get(group, "R_left_board", (n_views, 3, 3)),
-        t_left_board=_get(group, "t_left_board", (n_views, 3)),
-        settings=attribute("settings"),
-        figures=attribute("figures"),
-        rejected_views={int(v): str(reason) for v, reason in attribute("rejected_views").items()},
-        rejected_corners=tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rejected),
-        warnings=tuple(attribute("warnings")),
-        versions=attribute("versions"),
-        apart=tuple(int(v) for v in apart),
+        **known
+        | {
+            "board": board,
+            "table_view": None if table_view < 0 else table_view,
+            "observations": Observations(*seen.values()),
+            "kept": values["kept"].astype(bool),
+            "board_thickness": float(values["board_thickness"]),
+            "unexplained_sigma": float(values["unexplained_sigma"]),
+            "view_names": tuple((str(a), str(b)) for a, b in texts["view_names"]),
+            "rejected_views": {int(v): str(reason) for v, reason in texts["rejected_views"].items()},
+            "rejected_corners": tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rejected),
+            "warnings": tuple(texts["warnings"]),
+            "apart": tuple(int(v) for v in apart),
+        }
     )
