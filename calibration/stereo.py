@@ -13,17 +13,11 @@ from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.fit.lens_field import FieldFit
 from calibration.fit.model_choice import TermsTried
-from calibration.fit.pairing import count_once
+from calibration.fit.pairing import Names, Views, count_once
 from calibration.fit.refinement import Refinement
 from calibration.fit.start import MIN_VIEWS, start_stereo
 from calibration.fit.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
-from calibration.judge.assessment import (
-    Assessment,
-    assess,
-    consistency_factor,
-    half_set_differences,
-    stereo_covariance,
-)
+from calibration.judge.assessment import Assessment, Judged, assess, stereo_covariance
 from calibration.judge.camera_moved import camera_moved, zoomed
 from calibration.judge.pairs import LEAST_PAIRS, PairsJudged, likely_motion
 from calibration.judge.table_frame import rig_with_covariance
@@ -42,7 +36,7 @@ from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError
 from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
-from calibration.stereo_fit import FreeTerms, JointFit, fit_jointly
+from calibration.stereo_fit import Begun, FreeTerms, JointFit, fit_jointly
 
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
 
@@ -71,7 +65,6 @@ class StereoCalibration(Brief):
     rig: StereoRig  # with covariance (30, 30)
     refinement: Refinement  # observations, residuals, what was kept
     board: Target
-    board_points: Array  # (n, 3) [m] as refined; the declared ones where the board is taken as flat
     settings: CalibrationSettings
     table_view: int | None
     board_thickness: float  # [m]
@@ -90,10 +83,15 @@ class StereoCalibration(Brief):
         used = len(self.view_names) - len(self.rejected_views)
         return {
             "views": f"{used} of {len(self.view_names)}",
-            "rms": f"{self.rms_px:.4f} px",
+            "stereo misfit": f"{self.assessment.stereo_misfit_px:.4f} px in views left out",
             **self.rig.facts(),
             "verdict": self.assessment.verdict,
         }
+
+    @property
+    def board_points(self) -> Array:
+        """(n, 3) [m] as refined; the declared ones where the board is taken as flat."""
+        return self.refinement.model.points
 
     @property
     def rms_px(self) -> float:
@@ -101,24 +99,20 @@ class StereoCalibration(Brief):
         return self.refinement.rms()
 
     @property
-    def rms_per_camera_px(self) -> tuple[float, float]:
-        """The same for the left and for the right camera."""
-        camera = self.refinement.observations.camera
-        return self.refinement.rms(camera == 0), self.refinement.rms(camera == 1)
+    def rms_per_camera_px(self) -> tuple[float, ...]:
+        """The same of each camera."""
+        return tuple(self.refinement.rms(self.refinement.observations.camera == c) for c in range(len(CAMERA_NAMES)))
 
     @property
     def rms_per_view_px(self) -> Array:
         """(n_views, 2 cameras) [px]; NaN where a view was not used."""
-        o, view = self.refinement.observations, self.views_of_observations()
-        return np.array(
-            [[self.refinement.rms((view == v) & (o.camera == c)) for c in (0, 1)] for v in range(len(self.view_names))]
-        )
+        image = 2 * self.views_of_observations() + self.refinement.observations.camera
+        return np.array([self.refinement.rms(image == i) for i in range(2 * len(self.view_names))]).reshape(-1, 2)
 
     def views_of_observations(self) -> NDArray[np.intp]:
         """(m,) the number of the view, also where its right image has a place of the board of its own."""
-        return np.concatenate([np.arange(len(self.view_names)), np.array(self.apart, np.intp)])[
-            self.refinement.observations.view
-        ]
+        places = np.concatenate([np.arange(len(self.view_names)), np.array(self.apart, np.intp)])
+        return places[self.refinement.observations.view]
 
     def rejected_corners(self) -> list[tuple[int, int, int, str]]:
         """(view, camera, corner, reason) of every corner that was found but not used."""
@@ -226,91 +220,101 @@ def calibrate_from_corners(
     count_once(views, names, table_view)
     rejected, warnings = _views_not_found(views, names)
     _require_views(views, names, rejected, table_view)
-    sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
-    start = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
-    warnings += start.notes
-    if board.symmetry > 1:
-        for v, order in start.orders.items():
-            view = views[1][v]
-            views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
-        warnings.append(_choice_of_origin(board))
-    observations = _observations(views)
-    wide = too_wide(observations, board.points, start.model.cameras)
-    pairs = PairsJudged(start.model, start.right_poses, {}, {}, start.left_poses)
-    # seen best by cameras that no pair has pulled yet
-    moved = camera_moved(observations, pairs, start.model, table_view)
-    if moved and (lenses := zoomed(observations, moved, board.points, start.model.cameras)):
-        for camera, why in lenses.items():
-            for v in moved.others:
-                views[camera][v] = BoardNotFound(why)
+    begun, zoomed_views = _begin(views, board, names, table_view)
+    if zoomed_views:
+        for camera, v, why in zoomed_views:
+            views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names, progress)
-    if moved:
-        pairs = moved.set_apart(pairs)
-    elif len(start.right_poses) >= LEAST_PAIRS:
-        # a pose by one camera alone, from rough intrinsics, may be degrees off: refined cameras judge these pairs anew
-        pairs = replace(pairs, apart={v: "" for v in start.right_poses if not start.agrees[v]})
     report("refining")
-    seen = np.bincount(observations.point, minlength=len(board.points))
+    seen = np.bincount(begun.observations.point, minlength=len(board.points))
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
     free = FreeTerms(
         shapes if settings.board == "auto" else (settings.board,),
         RICHEST if settings.distortion == "auto" else settings.distortion,
         settings.equal_aspect,
     )
-    fit = fit_jointly(observations, pairs, board.points, free, names, table_view, moved, bool(wide), report)
-    rejected |= fit.lost
-    apart = _told_apart(fit, names, bool(wide), table_view)
-    _require_fitted(fit, rejected, apart, wide, table_view)
+    fit = fit_jointly(begun, board.points, free, names, table_view, report)
+    apart = _told_apart(fit, names, bool(begun.wide), table_view)
+    _require_fitted(fit, rejected | fit.lost, apart, begun.wide, table_view)
     report("judging")
-    inflation = max(consistency_factor(fit.refinement), 1.0)
-    shape = board_shape(fit.refinement, board.points, inflation)
-    refinement = as_made(fit.refinement, board.points, shape)
-    covariance, shape_note = _covariance(refinement, board, shapes, settings.board, shape, inflation)
-    origin = on_the_table(board.points, shape)
-    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
-    with_board = with_tolerances(
-        replace(rig, lens_field=fit.lens.field if fit.lens else None),
-        board.points,
-        table_view,
-        board_thickness,
-        settings.tolerances,
-        shape,
-    )
-    halves = half_set_differences(refinement, inflation)
-    assessment = assess(refinement, fit.candidates, rig, with_board, table_view, inflation, halves, fit.motion, wide)
+    rejected = dict(sorted((rejected | fit.lost).items()))
+    judged, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness)
+    assessment = assess(replace(judged, wide=begun.wide))
     return StereoCalibration(
-        rig=with_board,
-        refinement=refinement,
+        rig=judged.rig_with_board,
+        refinement=judged.refinement,
         board=board,
-        board_points=refinement.model.points,
         settings=settings,
         table_view=table_view,
         board_thickness=board_thickness,
         view_names=names,
         corner_views=(tuple(views[0]), tuple(views[1])),
-        rejected_views=dict(sorted(rejected.items())),
+        rejected_views=rejected,
         apart=tuple(sorted(fit.pairs.apart)),
         candidates=fit.candidates,
         assessment=assessment,
-        warnings=(*warnings, *fit.notes, *apart, *shape_note, *assessment.warnings),
+        warnings=(*warnings, *begun.notes, *fit.notes, *apart, *shape_note, *assessment.warnings),
         lens=fit.lens,
         shape=shape,
     )
 
 
-def _covariance(
-    refinement: Refinement, board: Target, shapes: tuple[str, ...], told: str, shape: BoardShape, inflation: float
-) -> tuple[Array, list[str]]:
-    """Covariance of the free stereo parameters, and a warning where the board has another shape than it was given.
+def _begin(
+    views: Views, board: Target, names: Names, table_view: int | None
+) -> tuple[Begun, list[tuple[int, int, str]]]:
+    """What a joint fit begins with; and the images (camera, view, why) that a zoomed lens took, if any.
 
-    shapes : that its points tell; told : which one the user wants, or auto
+    A board that looks the same after a turn gets one order of its corners in both cameras, in place.
     """
+    sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
+    start = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
+    notes = [*start.notes]
+    if board.symmetry > 1:
+        for v, order in start.orders.items():
+            view = views[1][v]
+            views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
+        notes.append(_choice_of_origin(board))
+    observations = _observations(views)
+    wide = too_wide(observations, board.points, start.model.cameras)
+    pairs = PairsJudged(start.model, start.right_poses, {}, {}, start.left_poses)
+    # seen best by cameras that no pair has pulled yet
+    moved = camera_moved(observations, pairs, start.model, table_view)
+    lenses = zoomed(observations, moved, board.points, start.model.cameras) if moved else {}
+    if moved:
+        pairs = moved.set_apart(pairs)
+    elif len(start.right_poses) >= LEAST_PAIRS:
+        # a pose by one camera alone, from rough intrinsics, may be degrees off: refined cameras judge these pairs anew
+        pairs = replace(pairs, apart={v: "" for v in start.right_poses if not start.agrees[v]})
+    images = [(camera, v, why) for camera, why in lenses.items() for v in (moved.others if moved else ())]
+    return Begun(observations, pairs, moved, wide, tuple(notes)), images
+
+
+def _judged(
+    fit: JointFit,
+    board: Target,
+    shapes: tuple[str, ...],
+    settings: CalibrationSettings,
+    table_view: int | None,
+    board_thickness: float,
+) -> tuple[Judged, BoardShape, list[str]]:
+    """The rig with its covariance, the board's shape, and a warning where it has another one than it was given.
+
+    shapes : that the board's points tell
+    """
+    inflation = max(fit.refinement.disagreement, 1.0)
+    shape = board_shape(fit.refinement, board.points, inflation)
+    refinement, note = as_made(fit.refinement, board.points, shape), []
     unseen = None if refinement.problem.motion is not None else likely_motion(refinement)
     covariance = stereo_covariance(refinement, unseen.gradients if unseen else None)
-    if refinement.terms.board not in shapes:
-        return covariance, []
-    left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
-    return covariance + left_out, [_not_as_told(told, shape, sigmas)] if sigmas > 1.0 else []
+    if refinement.terms.board in shapes:
+        left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
+        covariance, note = covariance + left_out, [_not_as_told(settings.board, shape, sigmas)] if sigmas > 1.0 else []
+    origin = on_the_table(board.points, shape)
+    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
+    rig = replace(rig, lens_field=fit.lens.field if fit.lens else None)
+    with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
+    judged = Judged(refinement, fit.candidates, rig, with_board, table_view, inflation, fit.motion)
+    return judged, shape, note
 
 
 def _require_fitted(
@@ -335,21 +339,17 @@ def _require_fitted(
             )
 
 
-def _views_not_found(
-    views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]], names: Sequence[tuple[str, str]]
-) -> tuple[dict[int, str], list[str]]:
+def _views_not_found(views: Views, names: Names) -> tuple[dict[int, str], list[str]]:
     """Views that neither camera can use, and warnings about those that only one can."""
     rejected: dict[int, str] = {}
     alone: dict[str, list[str]] = {}
     for v, pair in enumerate(zip(*views, strict=True)):
-        missing = [(c, view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
+        missing = [(names[v][c], view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
         if len(missing) == 2:
-            (_, left), (_, right) = missing
-            one, other = names[v]
+            (one, left), (other, right) = missing
             rejected[v] = f"{one} and {other}: {left}" if left == right else f"{one}: {left}; {other}: {right}"
         elif missing:
-            camera, reason = missing[0]
-            alone.setdefault(reason, []).append(names[v][camera])
+            alone.setdefault(missing[0][1], []).append(missing[0][0])
     warnings = [
         f"{', '.join(which)}: left out, the other image of the pair is used for its own camera: {reason}"
         for reason, which in alone.items()
@@ -358,19 +358,13 @@ def _views_not_found(
     return rejected, warnings + notes
 
 
-def _require_views(
-    views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]],
-    names: Sequence[tuple[str, str]],
-    rejected: dict[int, str],
-    table_view: int | None,
-) -> None:
+def _require_views(views: Views, names: Names, rejected: dict[int, str], table_view: int | None) -> None:
     if not views[0]:
         raise CalibrationError("no calibration views were given")
     for camera, side in enumerate(views):
         found = sum(isinstance(view, CornerView) for view in side)
         if found < MIN_VIEWS:
-            missing = ((name[camera], view) for name, view in zip(names, side, strict=True))
-            reasons = {name: view.reason for name, view in missing if isinstance(view, BoardNotFound)}
+            reasons = {names[v][camera]: view.reason for v, view in enumerate(side) if isinstance(view, BoardNotFound)}
             raise CalibrationError(
                 f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
                 f"are needed (10 to 20 are good). {_listed(reasons)}"
@@ -395,21 +389,14 @@ def _listed(reasons: dict[str, str]) -> str:
     return "; ".join(shown) + (f"; and {more} more" if more else "")
 
 
-def _observations(views: tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]) -> Observations:
+def _observations(views: Views) -> Observations:
     parts: list[tuple[NDArray, ...]] = []
     for camera, side in enumerate(views):
         for v, view in enumerate(side):
             if isinstance(view, CornerView):
                 index = np.flatnonzero(view.accepted)
-                parts.append(
-                    (
-                        np.full(len(index), v),
-                        np.full(len(index), camera),
-                        index,
-                        view.points[index],
-                        view.covariance[index],
-                    )
-                )
+                place = (np.full(len(index), number) for number in (v, camera))
+                parts.append((*place, index, view.points[index], view.covariance[index]))
     return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -421,7 +408,7 @@ def _choice_of_origin(board: Target) -> str:
     )
 
 
-def _told_apart(fit: JointFit, names: Sequence[tuple[str, str]], wide: bool, table_view: int | None) -> list[str]:
+def _told_apart(fit: JointFit, names: Names, wide: bool, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used each for its own camera."""
     told = [fit.moved.told(names, table_view)] if fit.moved else []
     apart = {v: why for v, why in fit.pairs.apart.items() if not (fit.moved and v in fit.moved.others)}

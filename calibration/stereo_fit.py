@@ -1,6 +1,6 @@
 """The rounds of a joint fit of both cameras: the board's shape, which images are pairs, what moved, the lenses."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from calibration.fit.board_motion import BoardMotion
 from calibration.fit.lens_field import FieldFit, fit_lens_field
 from calibration.fit.model_choice import TermsTried, choose_board
+from calibration.fit.pairing import Names
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import Observations
 from calibration.judge.camera_moved import CameraMoved, camera_moved
@@ -15,7 +16,6 @@ from calibration.judge.pairs import PairMotion, PairsJudged, judge_pairs, motion
 from calibration.kit.arrays import Array
 
 REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
-Names = Sequence[tuple[str, str]]
 Refined = tuple[Refinement, tuple[TermsTried, ...]]
 
 
@@ -26,6 +26,17 @@ class FreeTerms:
     boards: tuple[str, ...]  # of stereo_model.BOARD_MODELS, simplest first
     distortion: str  # key of stereo_model.DISTORTION_MODELS
     equal_aspect: bool
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What a joint fit begins with, by rough cameras."""
+
+    observations: Observations
+    pairs: PairsJudged  # as roughly judged, with the poses to start from
+    moved: CameraMoved | None
+    wide: tuple[str, ...]  # on lenses that are wider than the model, which is a reason why an image may not fit
+    notes: tuple[str, ...]  # about views that are no pairs
 
 
 @dataclass(frozen=True)
@@ -48,28 +59,23 @@ class JointFit:
 
 
 def fit_jointly(
-    observations: Observations,
-    pairs: PairsJudged,
+    begun: Begun,
     nominal: Array,
     free: FreeTerms,
     names: Names,
     table_view: int | None = None,
-    moved: CameraMoved | None = None,
-    wide: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
-    pairs : as roughly judged, with the poses to start from; names : (left, right) of every view
-    table_view : where a camera was moved, the cameras' places are those at this view; moved : as seen by the start
-    wide : a lens is wider than the model, which is a reason why an image may not fit
+    names : (left, right) of every view; table_view : where a camera was moved, the cameras' places are those at it
     """
+    observations, used, moved = begun.observations, begun.pairs, begun.moved
 
     def refined(by: PairsJudged, boards: tuple[str, ...], motion: BoardMotion | None = None) -> Refined:
         places = own_places(observations, by.model, sorted(by.apart), by.right_poses)
         return choose_board(*places, nominal, boards, free.distortion, free.equal_aspect, report, motion)
 
-    used = pairs
     refinement, candidates = refined(used, free.boards)
     lost: dict[int, str] = {}
     notes: list[str] = []
@@ -79,7 +85,7 @@ def fit_jointly(
         pairs = pairs if moved is None else moved.set_apart(pairs)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
-        observations, used, more, texts = _without_images(observations, pairs, names, wide)
+        observations, used, more, texts = _without_images(observations, pairs, names, bool(begun.wide))
         lost, notes = lost | more, [*notes, *texts]
         refinement, again = refined(used, (refinement.terms.board,))
         candidates = (*candidates, *again)

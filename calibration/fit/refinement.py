@@ -36,6 +36,14 @@ class Refinement:
     iterations: int
     converged: bool
 
+    @property
+    def disagreement(self) -> float:
+        """Variance of the parameters as the views disagree about them, over what the corners' noise predicts.
+
+        1 for a right model, and more where errors are common to the corners of a view.
+        """
+        return self.normal.disagreement(self.problem.stereo_basis.shape[1])
+
     def rms(self, select: Mask | None = None) -> float:
         """Root mean square distance [px] of the kept observations, or of some of them."""
         use = self.kept if select is None else self.kept & select

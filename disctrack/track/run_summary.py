@@ -17,15 +17,15 @@ LEAST_SIZE = 1e-5  # relative: a change of the rig's size that is worth a line
 
 
 def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) -> list[str]:
-    """Views used, RMS, baseline, what the uncertainty is, verdict, what was left out and why."""
+    """Views used, misfit of views left out, baseline, what the uncertainty is, verdict, what was left out and why."""
     n, assessment = len(found.view_names) + len(problems), found.assessment
-    left, right = found.rms_per_camera_px
+    error = f" ({1e3 * assessment.held_out_error:.4f} mm in space)" if np.isfinite(assessment.held_out_error) else ""
     used = n - len(problems) - len(found.rejected_views)
     lines = [
         _line(
             "calibration",
-            f"{used} of {n} views ({assessment.pairs} by both cameras), rms {found.rms_px:.4f} px (left {left:.4f}, "
-            f"right {right:.4f}), baseline {found.rig.baseline * 1e3:.3f} mm",
+            f"{used} of {n} views ({assessment.pairs} by both cameras), stereo misfit of views left out "
+            f"{assessment.stereo_misfit_px:.4f} px{error}, baseline {found.rig.baseline * 1e3:.3f} mm",
         ),
         _line("rig", _rig_text(found.rig)),
         _line("model", _model_text(found)),

@@ -97,7 +97,7 @@ def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
     error = triangulate(true_rig.project(points), found.rig) - points
     from calibration.judge.assessment import point_uncertainty
 
-    _, sigma = point_uncertainty(found.rig, points)
+    sigma = point_uncertainty(found.rig, points)
     assert np.abs(error / sigma).max() < 4.5
     assert np.abs(error).max() < 20e-6  # cameras of 240 x 192 px, 0.55 mm per px, 8 views
     assert sigma.max() < 20e-6
