@@ -32,7 +32,7 @@ MIN_BLUR = 0.3  # px, just above the square pixel's own: edges may be sharper, b
 NEAR = 0.3  # sigmas that a full step may still move the corner where no smaller residual is found
 _FAR = 5.0  # sigmas from an edge: S has reached its level to 6e-7
 _X, _W = np.polynomial.legendre.leggauss(8)
-_N_NODES = 8
+_N_NODES = len(_X)
 _SQRT_HALF = math.sqrt(0.5)
 
 # What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices

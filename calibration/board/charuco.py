@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values, in_file_units
 from calibration.board.corner_fit import CornerView, fit_view
-from calibration.board.target import CharucoBoard
+from calibration.board.target import LEAST_POINTS, CharucoBoard
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 from calibration.kit.grey_levels import level_step
-
-LEAST_CORNERS = 8  # of one view: fewer do not start its pose
 
 
 def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFound:
@@ -26,21 +24,21 @@ def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFo
     step = level_step(grey)
     values = grey // step if step > 1 else grey
     corners, ids = _detected(as_8_bit(values), board)
-    if len(ids) < LEAST_CORNERS:  # prints with light and dark exchanged are about, too: their markers say so
+    if len(ids) < LEAST_POINTS:  # prints with light and dark exchanged are about, too: their markers say so
         negative = np.asarray(values.max() - values, values.dtype)
         found, numbers = _detected(as_8_bit(negative), board)
         if len(numbers) > len(ids):
             values, corners, ids = negative, found, numbers
     columns, rows = board.inner_corners
-    if len(ids) < LEAST_CORNERS:
+    if len(ids) < LEAST_POINTS:
         return BoardNotFound(
-            f"{len(ids)} corners of {board} found, at least {LEAST_CORNERS} are needed: is it sharp and lit, and are "
+            f"{len(ids)} corners of {board} found, at least {LEAST_POINTS} are needed: is it sharp and lit, and are "
             "squares, dictionary, square_mm and marker_mm those of the print?"
         )
     rough, seen = _whole_grid(corners, ids, board)
     plain = 0.5 * (1.0 - board.marker / board.square)
     view = fit_view(np.ascontiguousarray(values, np.float64), rough, (columns, rows), seen, plain)
-    if view.accepted.sum() < LEAST_CORNERS:
+    if view.accepted.sum() < LEAST_POINTS:
         return BoardNotFound(
             f"only {view.accepted.sum()} of the {seen.sum()} corners of {board} in view lie on a regular grid: is the "
             "board bent, and is marker_mm the side of the markers?"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board._corner_kernel import N_CORNER, fit_corners
-from calibration.board.robust_corners import LEAST_SIGMA, WINDOW, saddle_points, smooth_grid
+from calibration.board.robust_corners import LEAST_SIGMA, WINDOW, degree_for, saddle_points, smooth_grid
 from calibration.kit.arrays import Array, Mask
 
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
@@ -24,7 +24,6 @@ MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of tw
 BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
 MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered or in glare
 ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
-CORNERS_FOR_DEGREE = (6, 15, 30, 45)  # of a polynomial: 2.5 to 3 corners for each of its coefficients
 MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 
 
@@ -273,8 +272,7 @@ def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
     use = ok & (levels[:, 0] > 0) & (levels[:, 1] != 0)
     ratio = np.zeros(len(points))
     ratio[use] = np.log(np.abs(levels[use, 1] / levels[use, 0]))
-    n = int(use.sum())
-    degree = sum(n >= least for least in CORNERS_FOR_DEGREE)
+    degree = degree_for(int(use.sum()), 4)
     if not degree:
         return np.zeros((len(points), 2))
     centre, scale = points[use].mean(0), np.ptp(points[use], axis=0).max() / 2

@@ -13,7 +13,6 @@ from calibration.kit.arrays import Array, Mask
 WINDOW = 0.35  # of a square: half width of the window of the saddle point
 MANY_PIXELS = 4e6
 LEAST_SIGMA = 0.05  # px, of a corner that no model fits
-_TERMS = ((30, 3), (18, 2), (0, 1))  # from so many corners on, degree of the polynomial in the two indices
 
 
 def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
@@ -33,6 +32,11 @@ def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
     return found.astype(float)
 
 
+def degree_for(n: int, most: int) -> int:
+    """Of a polynomial in two coordinates by n corners: three for each of its coefficients."""
+    return max(d for d in range(most + 1) if 3 * (d + 1) * (d + 2) <= 2 * n or d == 0)
+
+
 def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tuple[Array, float]:
     """Where the other corners put each corner (n, 2) [px], and the sigma per axis of the corners' scatter about it.
 
@@ -47,7 +51,7 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
         H, _ = cv2.findHomography(board[seen], points[seen])
     image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(H, float).T
     plane = image[:, :2] / image[:, 2:]
-    degree = next(d for least, d in _TERMS if seen.sum() >= least)
+    degree = max(degree_for(int(seen.sum()), 3), 1)
     u, v = 2 * board[:, 0] / (columns - 1) - 1, 2 * board[:, 1] / (rows - 1) - 1
     A = np.stack([u**a * v**b for a in range(degree + 1) for b in range(degree + 1 - a)], axis=-1)
     target = points - plane

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
+LEAST_POINTS = 8  # of a view: fewer do not tell its pose
 SAME_PLACE = 0.01  # of the smallest distance between points: a reflection that maps points that close is a symmetry
 
 

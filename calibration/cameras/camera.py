@@ -30,7 +30,7 @@ RIG_PARAMETERS = (
 )
 N_RIG = len(RIG_PARAMETERS)  # 30
 # Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
-OF_LEFT, OF_RIGHT = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
+OF_CAMERAS = OF_LEFT, OF_RIGHT = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
 PAIR_TURN, PAIR_SHIFT = slice(18, 21), slice(21, 24)
 WORLD_TURN, WORLD_SHIFT = slice(24, 27), slice(27, 30)
 
@@ -252,36 +252,51 @@ class StereoRig(Brief):
     def project_with_jacobians(self, points_world: Array) -> tuple[Array, Array, Array]:
         """Pixels (..., 2, n, 2), d/d point_world (..., 2, n, 2, 3) and d/d RIG_PARAMETERS (..., 2, n, 2, 30)."""
         points_world = np.asarray(points_world, float)
-        points_left = points_world @ self.R_left_world.T + self.t_left_world
-        pixels_left, d_left, d_k_left = project_with_jacobians(points_left, self.left)
-        turned_right = points_left @ self.R_right_left.T
-        pixels_right, d_right, d_k_right = project_with_jacobians(turned_right + self.t_right_left, self.right)
-        d_right_left = d_right @ self.R_right_left  # d pixel_right / d point_left
-
         arm_world = points_world @ self.R_left_world.T
-        d_rig = np.zeros((*points_world.shape[:-2], 2, points_world.shape[-2], 2, N_RIG))
-        d_rig[..., 0, :, :, OF_LEFT] = d_k_left
-        d_rig[..., 1, :, :, OF_RIGHT] = d_k_right
-        d_rig[..., 1, :, :, PAIR_TURN] = by_turning(d_right, turned_right)
-        d_rig[..., 1, :, :, PAIR_SHIFT] = d_right
-        for camera, d_point in enumerate((d_left, d_right_left)):
-            d_rig[..., camera, :, :, WORLD_TURN] = by_turning(d_point, arm_world)
-            d_rig[..., camera, :, :, WORLD_SHIFT] = d_point
-        d_world = np.stack([d_left @ self.R_left_world, d_right_left @ self.R_left_world], axis=-4)
-        return np.stack([pixels_left, pixels_right], axis=-3), d_world, d_rig
+        points_left = arm_world + self.t_left_world
+        d_rig = np.zeros((*points_world.shape[:-2], len(OF_CAMERAS), points_world.shape[-2], 2, N_RIG))
+        pixels, d_world = [], []
+        for i, (R, t) in enumerate(pair_poses(self.R_right_left, self.t_right_left)):
+            turned = points_left @ R.T
+            pixel, d_point, d_rig[..., i, :, :, OF_CAMERAS[i]] = project_with_jacobians(turned + t, self.cameras[i])
+            if i:  # the first camera's axes are those of the pair
+                d_rig[..., i, :, :, PAIR_TURN] = by_turning(d_point, turned)
+                d_rig[..., i, :, :, PAIR_SHIFT] = d_point
+                d_point = d_point @ R
+            d_rig[..., i, :, :, WORLD_TURN] = by_turning(d_point, arm_world)
+            d_rig[..., i, :, :, WORLD_SHIFT] = d_point
+            pixels.append(pixel)
+            d_world.append(d_point @ self.R_left_world)
+        return np.stack(pixels, axis=-3), np.stack(d_world, axis=-4), d_rig
 
     def perturbed(self, delta: Array) -> StereoRig:
         """The rig after a small change delta (30,) of RIG_PARAMETERS (SI units, rotation vectors in radians)."""
         delta = np.asarray(delta, float)
+        left, right = stepped(self.cameras, delta)
         return replace(
             self,
-            left=Camera.from_parameters(self.left.parameters + delta[OF_LEFT], self.left.image_size),
-            right=Camera.from_parameters(self.right.parameters + delta[OF_RIGHT], self.right.image_size),
+            left=left,
+            right=right,
             R_right_left=rotation_from_vector(delta[PAIR_TURN]) @ self.R_right_left,
             t_right_left=self.t_right_left + delta[PAIR_SHIFT],
             R_left_world=rotation_from_vector(delta[WORLD_TURN]) @ self.R_left_world,
             t_left_world=self.t_left_world + delta[WORLD_SHIFT],
         )
+
+
+def stepped(cameras: Sequence[Camera], step: Array) -> tuple[Camera, Camera]:
+    """Both cameras after a step of RIG_PARAMETERS, of which those before the first place are enough."""
+    found = (
+        Camera.from_parameters(camera.parameters + step[own], camera.image_size)
+        for camera, own in zip(cameras, OF_CAMERAS, strict=True)
+    )
+    left, right = found
+    return left, right
+
+
+def pair_poses(R_right_left: Array, t_right_left: Array) -> tuple[tuple[Array, Array], ...]:
+    """R (3, 3) and t (3,) [m] of each camera against the first."""
+    return (np.eye(3), np.zeros(3)), (R_right_left, t_right_left)
 
 
 def by_turning(d_point: Array, arm: Array) -> Array:

@@ -18,8 +18,10 @@ import numpy as np
 
 from calibration.cameras.splines import LensField, spline_weights
 from calibration.fit.board_motion import motions
+from calibration.fit.model_choice import FOLDS
 from calibration.fit.normal_equations import inverse_covariance
 from calibration.fit.refinement import Refinement, refine_stereo
+from calibration.fit.start import GOOD_VIEWS
 from calibration.fit.stereo_model import Observations, predict
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
@@ -27,8 +29,6 @@ from calibration.kit.least_squares import eliminate
 CELLS = 5  # of the spline's grid along the longer side of the image; twice as many of the finer one
 PRIORS_PX = (0.01, 0.03, 0.1)  # standard deviation of a coefficient; views left out choose
 FINER_PX = (0.003, 0.01, 0.03)  # the same of a coefficient of the finer grid
-FOLDS = 5
-MIN_VIEWS = 8
 BETTER = 2.5  # standard errors by which the views that were left out must be met better
 LEAST_GAIN = 0.03  # and part of their chi-square: less is not worth its parameters
 
@@ -50,7 +50,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
     """
     used = refinement.observations[refinement.kept]
     views = np.unique(used.view)
-    if len(views) < MIN_VIEWS:
+    if len(views) < GOOD_VIEWS:
         return None
     coarse, finer = _grid(refinement, CELLS), _grid(refinement, 2 * CELLS)
     priors = [coarse.precision(sigma) for sigma in PRIORS_PX]

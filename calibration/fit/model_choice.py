@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.fit.board_motion import BoardMotion, split
-from calibration.fit.normal_equations import Problem, inverse_covariance, minimise
+from calibration.fit.normal_equations import Problem, inverse_covariance, minimise, quadratic
 from calibration.fit.refinement import Refinement, refine_stereo
 from calibration.fit.stereo_model import (
     BOARD_MODELS,
@@ -24,11 +24,10 @@ from calibration.fit.stereo_model import (
     Terms,
     predict_pixels,
 )
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 
 HOPELESS = 1.5  # times the noise of the best model, left in the views it was fitted to: not worth views left out
 FOLDS = 5
-LEAST_TRIANGULATED = 8  # corners of a view: a board of fewer fits whatever they are
 NEGLIGIBLE = 1e-5  # of chi-square, still to be gained: of 10^4 points, a third of a sigma of one parameter
 TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
 SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler model may be worse
@@ -48,50 +47,6 @@ class TermsTried:
     per_view: Array  # (n_views,) the same, NaN where a view was not used
 
 
-def held_out(
-    refinement: Refinement, sigma: float, good: Mask, motion: BoardMotion | None = None
-) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp], Array]:
-    """Per view, each view left out in turn: chi-square (truncated) of all points, squared distance [px^2] of good ones.
-
-    sigma : unexplained noise [px] for the comparison, the same for every candidate
-    good : (m,) the observations that count in the distance
-    motion : of the boards between the exposures, for the comparison
-    returns : chi-square, squared distance, number of all and of good points, rms error in space [m], each (n_views,)
-    """
-    used = refinement.observations[refinement.kept]
-    everything = refinement.observations
-    n_views = refinement.problem.n_views
-    chi2, square = np.full(n_views, np.nan), np.full(n_views, np.nan)
-    count, good_count, error = np.zeros(n_views, int), np.zeros(n_views, int), np.full(n_views, np.nan)
-    views = np.unique(used.view)
-    weights = inverse_covariance(used.covariance, sigma**2)
-    whole = replace(refinement.problem, observations=used, weights=weights, motion=motion)
-    for fold in range(min(FOLDS, len(views))):
-        left_out = views[fold :: min(FOLDS, len(views))]
-        train = ~np.isin(used.view, left_out)
-        problem = replace(whole, observations=used[train], weights=whole.weights[train])
-        model = minimise(
-            problem,
-            refinement.model,
-            iterations=8,
-            tolerance=NEGLIGIBLE,
-            damping=1e-7,
-            rough=True,
-        ).model
-        tested = np.isin(everything.view, left_out)
-        test = everything[tested]
-        model = fit_poses(test, model, sigma, motion)
-        residuals = test.pixels - predict_pixels(model, test)
-        distance = np.einsum("mi,mij,mj->m", residuals, inverse_covariance(test.covariance, sigma**2), residuals)
-        for v in left_out:
-            of_view = test.view == v
-            chi2[v] = np.minimum(distance[of_view], TRUNCATE).sum()
-            square[v] = np.sum(residuals[of_view & good[tested]] ** 2)
-            count[v], good_count[v] = of_view.sum(), (of_view & good[tested]).sum()
-            error[v] = error_in_space(model, test[of_view & good[tested]])
-    return chi2, square, count, good_count, error
-
-
 def error_in_space(model: StereoModel, seen: Observations) -> float:
     """Rms distance [m] of a view's corners, triangulated, from the board where they put it best; NaN by one camera."""
     left, right = (seen[seen.camera == camera] for camera in (0, 1))
@@ -99,7 +54,7 @@ def error_in_space(model: StereoModel, seen: Observations) -> float:
     rig = StereoRig(*model.cameras, model.R_right_left, model.t_right_left, np.eye(3), np.zeros(3))
     found = triangulate(np.stack([left.pixels[a], right.pixels[b]]), rig)
     met = np.isfinite(found).all(axis=1)
-    if met.sum() < LEAST_TRIANGULATED:
+    if met.sum() < LEAST_POINTS:
         return float("nan")
     board, found = model.points[common][met], found[met]
     d, e = board - board.mean(0), found - found.mean(0)
@@ -126,20 +81,35 @@ def fit_poses(
 
 
 def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
-    """The row of one fitted model, by the noise, the good points and the boards' motion of another; see `held_out`."""
-    sigma = quietest.unexplained_sigma
-    chi2, square, count, good_count, error = held_out(refinement, sigma, quietest.kept, quietest.problem.motion)
-    with np.errstate(invalid="ignore"):
-        per_view = chi2 / np.where(count > 0, count, np.nan)
+    """The row of one fitted model: each view left out in turn, its own pose fitted.
+
+    The noise, the points that count in distances and the boards' motion are those of another fit, for all candidates.
+    """
+    o, problem, views = refinement.observations, refinement.problem, np.unique(refinement.problem.observations.view)
+    used, sigma, motion = o[refinement.kept], quietest.unexplained_sigma, quietest.problem.motion
+    weights = inverse_covariance(used.covariance, sigma**2)
+    residuals, tested, errors = np.zeros_like(o.pixels), np.isin(o.view, views), []
+    for fold in range(min(FOLDS, len(views))):
+        left_out = views[fold :: min(FOLDS, len(views))]
+        train, test = ~np.isin(used.view, left_out), np.isin(o.view, left_out)
+        others = replace(problem, observations=used[train], weights=weights[train], motion=motion)
+        model = minimise(others, refinement.model, iterations=8, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
+        model = fit_poses(o[test], model, sigma, motion)
+        residuals[test] = o.pixels[test] - predict_pixels(model, o[test])
+        errors += [error_in_space(model, o[quietest.kept & (o.view == v)]) for v in left_out]
+    chi_square = np.minimum(quadratic(inverse_covariance(o.covariance, sigma**2), residuals), TRUNCATE)
+    chi_square = np.where(np.isfinite(chi_square), chi_square, TRUNCATE)  # behind a camera
+    sums, count = (np.bincount(o.view[tested], of, problem.n_views) for of in (chi_square[tested], None))
+    good, error = tested & quietest.kept, np.array(errors)[np.isfinite(errors)]
     return TermsTried(
         terms=refinement.terms,
-        n_parameters=refinement.problem.stereo_basis.shape[1] + refinement.problem.shape_basis.shape[-1],
+        n_parameters=problem.stereo_basis.shape[1] + problem.shape_basis.shape[-1],
         rms_px=refinement.rms(),
-        held_out_rms_px=float(np.sqrt(np.nansum(square) / max(good_count.sum(), 1))),
-        held_out_error=float(np.sqrt(np.mean(error[np.isfinite(error)] ** 2))) if np.isfinite(error).any() else np.nan,
-        held_out_chi_square=float(np.nansum(chi2) / max(count.sum(), 1)),
+        held_out_rms_px=float(np.sqrt(np.nansum(residuals[good] ** 2) / max(good.sum(), 1))),
+        held_out_error=float(np.sqrt(np.mean(error**2))) if len(error) else np.nan,
+        held_out_chi_square=float(sums.sum() / max(count.sum(), 1)),
         noise_px=sigma,
-        per_view=per_view,
+        per_view=sums / np.where(count > 0, count, np.nan),
     )
 
 

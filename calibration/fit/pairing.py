@@ -21,11 +21,12 @@ from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
-FLOOR = 1e-3  # of the image's longer side: rough cameras put boards no better
-SAME_PLACE = 1e-3  # of the image's longer side: lenses and boards err alike where corners differ by less
+FLOOR = 1e-3  # of the image's longer side: rough cameras put boards no better; views that differ by less are one
 NEARER = 3.0  # times that the pairs of another hypothesis lie together better than those stored, to be believed
 BY_CHANCE = 2.0  # times that pairs lie together better than images of other pairs do: less is no agreement
-TOO_FAR = 5.0  # times the usual distance: of another place
+# Times the usual distance: of another place. Of Gaussian motions (F of 6 and 24 degrees of freedom) one in 10^9 is as
+# far; the motions of hand-held boards have longer tails.
+TOO_FAR = 5.0
 MOST_LATE = 8  # views by which the two cameras may differ
 LEAST_PAIRS = 4  # of a hypothesis
 TRIED = 30  # pairs whose place is tried for all
@@ -85,7 +86,7 @@ def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
     found = np.array([isinstance(view, CornerView) for view in side], bool)
     same = ~found[:, None] & ~found
     seen = [np.where(view.accepted[:, None], view.points, np.nan) for view in side if isinstance(view, CornerView)]
-    limit = SAME_PLACE * max((max(view.image_size) for view in side if isinstance(view, CornerView)), default=0)
+    limit = FLOOR * max((max(view.image_size) for view in side if isinstance(view, CornerView)), default=0)
     for v, points in zip(np.flatnonzero(found), seen, strict=True):
         square = np.sum((np.stack(seen) - points) ** 2, axis=2)
         common = np.isfinite(square)

@@ -15,8 +15,7 @@ from calibration.fit.stereo_model import Observations, StereoModel, Terms, board
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
-FREE_ROUNDS = 6  # of rejection, in which a point may come back; then it may not, so that the rounds come to an end
-MAX_ROUNDS = 12
+FREE_ROUNDS = 6  # of rejection, in which a point may come back; in as many more it may not, so that they come to an end
 MOST_DISAGREEMENT = 100.0  # of views among each other that is believed, and the least: few of them tell it badly
 
 
@@ -91,7 +90,7 @@ def refine_stereo(
         kept, extra = begin.kept, begin.unexplained_sigma**2
     if motion is not None:
         model = split(model)
-    for turn in range(MAX_ROUNDS):
+    for turn in range(2 * FREE_ROUNDS):
         used = observations[kept]
         weights = inverse_covariance(used.covariance, extra)
         problem = Problem(used, weights, stereo_basis, shape_basis, n_views, prior=prior, motion=motion)
@@ -119,7 +118,7 @@ def refine_stereo(
         if motion is not None and moved_as is not None:
             settled = settled and motion.is_near(moved_as)
         extra = new_extra
-        if settled or turn == MAX_ROUNDS - 1:  # what is returned belongs to the points that were fitted
+        if settled or turn == 2 * FREE_ROUNDS - 1:  # what is returned belongs to the points that were fitted
             break
         kept = new_kept
     # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that

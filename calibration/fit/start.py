@@ -7,16 +7,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, rotation_from_vector
 from calibration.fit.pairing import FLOOR, Names, Pose, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
-MIN_POINTS = 8  # of one view in one camera, to start its pose
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
 ONE_PLACE = 1e-3  # of the board's distance: rays that meet at 0.06 deg tell no distance
 MIN_VIEWS = 3  # Zhang: fewer do not determine a camera
+GOOD_VIEWS = 8  # fewer judge neither lenses nor one another
 
 
 def start_camera(
@@ -26,7 +27,7 @@ def start_camera(
     objects, images, views = [], [], []
     for view in np.unique(observations.view):
         use = (observations.view == view) & (observations.camera == index)
-        if use.sum() >= MIN_POINTS:
+        if use.sum() >= LEAST_POINTS:
             objects.append(nominal[observations.point[use]].astype(np.float32))
             images.append(observations.pixels[use].astype(np.float32))
             views.append(int(view))

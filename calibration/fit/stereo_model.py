@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import (
     N_INTRINSIC,
-    OF_LEFT,
-    OF_RIGHT,
+    OF_CAMERAS,
     PAIR_SHIFT,
     PAIR_TURN,
     Camera,
     by_turning,
+    pair_poses,
     project,
     project_with_jacobians,
     rotation_from_vector,
+    stepped,
 )
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
@@ -148,12 +149,9 @@ def predict_pixels(model: StereoModel, observations: Observations) -> Array:
     """Pixels (m, 2) alone."""
     _, arm, t = _arms(model, observations)
     pixels = np.empty((len(observations), 2))
-    for index, camera in enumerate(model.cameras):
+    for index, (R, shift) in enumerate(pair_poses(model.R_right_left, model.t_right_left)):
         seen = observations.camera == index
-        points = arm[seen] + t[seen]
-        if index == 1:
-            points = points @ model.R_right_left.T + model.t_right_left
-        pixels[seen] = project(points, camera)
+        pixels[seen] = project((arm[seen] + t[seen]) @ R.T + shift, model.cameras[index])
     return pixels
 
 
@@ -165,19 +163,15 @@ def predict(model: StereoModel, observations: Observations) -> tuple[Array, Arra
     pixels, d_pose = np.empty((m, 2)), np.empty((m, 2, 6))
     d_left = d_pose[..., 3:]
     d_stereo = np.zeros((m, 2, N_STEREO))
-    for index, camera in enumerate(model.cameras):
+    for index, (R_pair, t_pair) in enumerate(pair_poses(model.R_right_left, model.t_right_left)):
         seen = np.flatnonzero(observations.camera == index)
-        if index == 0:
-            pixels[seen], d_left[seen], d_stereo[seen, :, :N_INTRINSIC] = project_with_jacobians(
-                points_left[seen], camera
-            )
-            continue
-        turned = points_left[seen] @ model.R_right_left.T
-        pixels[seen], d_right, d_k = project_with_jacobians(turned + model.t_right_left, camera)
-        d_stereo[seen, :, N_INTRINSIC : 2 * N_INTRINSIC] = d_k
-        d_stereo[seen, :, 2 * N_INTRINSIC : 2 * N_INTRINSIC + 3] = by_turning(d_right, turned)
-        d_stereo[seen, :, 2 * N_INTRINSIC + 3 :] = d_right
-        d_left[seen] = d_right @ model.R_right_left
+        turned = points_left[seen] @ R_pair.T
+        pixels[seen], d_point, d_stereo[seen, :, OF_CAMERAS[index]] = project_with_jacobians(
+            turned + t_pair, model.cameras[index]
+        )
+        if index:  # the first camera's axes are those of the pair
+            d_stereo[seen, :, PAIR_TURN], d_stereo[seen, :, PAIR_SHIFT] = by_turning(d_point, turned), d_point
+        d_left[seen] = d_point @ R_pair
     d_pose[..., :3] = by_turning(d_left, arm)
     return pixels, d_stereo, d_pose, d_left @ R
 
@@ -187,10 +181,7 @@ def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array,
     R, t = model.R_left_board[observations.view], model.t_left_board[observations.view]
     if model.boards_right is not None:
         right = observations.camera == 1
-        R, t = (
-            np.where(right.reshape(-1, *[1] * (one.ndim - 1)), of[observations.view], one)
-            for one, of in zip((R, t), model.boards_right, strict=True)
-        )
+        R[right], t[right] = (of[observations.view[right]] for of in model.boards_right)
     return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
 
 
@@ -204,10 +195,7 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
         R, t = model.boards_right
         boards_right = rotation_from_vector(poses[:, 6:9]) @ R, t + poses[:, 9:]
     return StereoModel(
-        cameras=(
-            Camera.from_parameters(model.cameras[0].parameters + stereo[OF_LEFT], model.cameras[0].image_size),
-            Camera.from_parameters(model.cameras[1].parameters + stereo[OF_RIGHT], model.cameras[1].image_size),
-        ),
+        cameras=stepped(model.cameras, stereo),
         R_right_left=rotation_from_vector(stereo[PAIR_TURN]) @ model.R_right_left,
         t_right_left=model.t_right_left + stereo[PAIR_SHIFT],
         R_left_board=turns @ model.R_left_board,

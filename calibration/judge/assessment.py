@@ -9,13 +9,13 @@ from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.cameras.causes import causes
 from calibration.fit.model_choice import TermsTried
 from calibration.fit.refinement import Refinement
+from calibration.fit.start import GOOD_VIEWS
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
-MIN_GOOD_VIEWS = 8
 # Of a point's distance, excellent, good and usable: 0.05, 0.5 and 5 mm at half a metre. Images of half the size, or of
 # half the noise, say as much about cameras that are as wrong.
 GRADES = (1e-4, 1e-3, 1e-2)
@@ -254,7 +254,7 @@ def _warnings(found: Assessment, judged: Judged) -> list[str]:
             "two axes"
         )
     n_views = len(np.unique(refinement.observations.view[refinement.kept]))
-    if n_views < MIN_GOOD_VIEWS:
+    if n_views < GOOD_VIEWS:
         told.append(f"{n_views} views are few (good: 10 to 20)")
     if found.inflation > TWICE:
         told.append(
@@ -283,7 +283,7 @@ def _verdict(found: Assessment, judged: Judged) -> tuple[Grade, str]:
         if np.isfinite(value):
             part = f"{1e3 * value:.3g} mm, {100 * value / found.distance:.2g} % of the distance"
             reasons.append((int(np.searchsorted(GRADES, value / found.distance)), f"{what} {part}"))
-    if found.pairs < MIN_GOOD_VIEWS:
+    if found.pairs < GOOD_VIEWS:
         reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
     if found.stereo_misfit_px > TWICE * rms:
         reasons.append((2, f"views left out give {found.stereo_misfit_px:.3f} px where those fitted give {rms:.3f} px"))

@@ -19,23 +19,20 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from calibration.board.target import LEAST_POINTS
 from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.model_choice import fit_poses
 from calibration.fit.normal_equations import Problem, inverse_covariance
+from calibration.fit.pairing import TOO_FAR, Pose
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
 from calibration.kit.arrays import Array, Mask
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
-MIN_POINTS = 8  # of an image, to tell the board's pose by itself
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
-# Times the usual misfit. Of Gaussian motions (F of 6 and 24 degrees of freedom) one in 10^9 is as far; the motions of
-# hand-held boards have longer tails.
-TOO_FAR = 5.0
-FREE = BoardMotion(1e3, 1e3)  # as good as nothing known beforehand
+FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
 START = ((1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5))  # [rad], and of the distance
-Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in the left camera's axes
 
 
 def own_places(
@@ -150,7 +147,7 @@ def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
     carried, step = normal.carried()
     m, J = motions(model)
     seen = [np.bincount(o.view[o.camera == c], minlength=problem.n_views) for c in (0, 1)]
-    pairs = np.flatnonzero(np.minimum(*seen) >= MIN_POINTS)
+    pairs = np.flatnonzero(np.minimum(*seen) >= LEAST_POINTS)
     images = len(np.unique(2 * o.view + o.camera))
     freedom = max(2 * len(o) - 6 * images, 1)
     about = problem.stepped(model, np.zeros(len(normal.shared)), step)

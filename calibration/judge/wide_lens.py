@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from calibration.cameras.camera import CAMERA_NAMES, Camera
+from calibration.fit.start import GOOD_VIEWS
 from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array
 
@@ -11,7 +12,7 @@ WIDE = 0.8  # half the image's diagonal in focal lengths, 77 deg across: below, 
 # Misfit of views left out, rational over polynomial. A 150 deg lens had 0.42 and 0.47, the 34 cameras of seventeen
 # other foreign sets 0.95 to 1.09 but for one of seven views (0.76).
 CLEARLY = 0.7
-LEAST_VIEWS, MOST_VIEWS = 8, 30  # OpenCV's time grows with the cube of them
+MOST_VIEWS = 30  # OpenCV's time grows with the cube of them
 
 
 def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[str, ...]:
@@ -30,7 +31,7 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
             if use.sum() >= 12:
                 objects.append(nominal[observations.point[use]].astype(np.float32))
                 images.append(observations.pixels[use].astype(np.float32))
-        if len(objects) < LEAST_VIEWS:
+        if len(objects) < GOOD_VIEWS:
             continue
         try:
             polynomial, rational = (
