@@ -87,12 +87,11 @@ def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
     """
     o, problem, views = refinement.observations, refinement.problem, np.unique(refinement.problem.observations.view)
     used, sigma, motion = o[refinement.kept], quietest.unexplained_sigma, quietest.problem.motion
-    weights = inverse_covariance(used.covariance, sigma**2)
     residuals, tested, errors = np.zeros_like(o.pixels), np.isin(o.view, views), []
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
         train, test = ~np.isin(used.view, left_out), np.isin(o.view, left_out)
-        others = replace(problem, observations=used[train], weights=weights[train], motion=motion)
+        others = replace(problem, motion=motion).seeing(used[train], sigma**2)
         model = minimise(others, refinement.model, iterations=8, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
         model = fit_poses(o[test], model, sigma, motion)
         residuals[test] = o.pixels[test] - predict_pixels(model, o[test])

@@ -58,6 +58,10 @@ class Problem:
     prior: Prior | None = None  # of the cameras
     motion: BoardMotion | None = None  # of the boards between the two exposures, for a model that has such places
 
+    def seeing(self, observations: Observations, extra: float) -> Problem:
+        """The same with other observations, whose covariances are by `extra` [px^2] larger in both axes."""
+        return replace(self, observations=observations, weights=inverse_covariance(observations.covariance, extra))
+
     def with_shape(self, nominal: Array, basis: Array) -> Problem:
         """The same with points (n, 3) that may move along `basis` (n, 3, s2), and what is known of that beforehand."""
         prior = self.prior and replace(self.prior, board=board_prior(nominal, basis))

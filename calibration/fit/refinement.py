@@ -10,7 +10,7 @@ import scipy
 
 from calibration.fit.board_motion import BoardMotion, learnt, split
 from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
-from calibration.fit.priors import Prior, priors_of
+from calibration.fit.priors import priors_of
 from calibration.fit.stereo_model import Observations, StereoModel, Terms, board_basis, predict_pixels, restricted
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
@@ -49,9 +49,16 @@ class Refinement:
         return float(np.sqrt(np.mean(np.sum(self.residuals[use] ** 2, axis=-1)))) if use.any() else float("nan")
 
 
-def _degrees_of_freedom(problem: Problem, n_kept: int) -> int:
-    seen = len(np.unique(problem.observations.view))
-    return 2 * n_kept - problem.stereo_basis.shape[1] - problem.shape_basis.shape[-1] - 6 * seen
+def _degrees_of_freedom(problem: Problem) -> int:
+    used = problem.observations
+    seen = len(np.unique(used.view))
+    left = 2 * len(used) - problem.stereo_basis.shape[1] - problem.shape_basis.shape[-1] - 6 * seen
+    if left <= 0:
+        raise CalibrationError(
+            f"{len(used)} points in {seen} views are fewer than the parameters to be found: take more views, or fewer "
+            "free terms"
+        )
+    return left
 
 
 def refine_stereo(
@@ -78,53 +85,29 @@ def refine_stereo(
     """
     terms = terms or Terms()
     observations = observations[np.argsort(observations.view, kind="stable")]
-    n_views = len(start.R_left_board)
-    stereo_basis, shape_basis = terms.stereo_basis(), board_basis(nominal, terms.board)
-    kept = np.ones(len(observations), bool)
-    model, total = restricted(start if begin is None else begin.model, nominal, terms), 0
-    prior = priors_of(model, nominal, shape_basis) if priors else None
+    shape_basis = board_basis(nominal, terms.board)
+    model = restricted(start if begin is None else begin.model, nominal, terms)
     motion = begin.problem.motion if motion is None and begin is not None else motion
+    problem = Problem(
+        observations,
+        inverse_covariance(observations.covariance, 0.0),
+        terms.stereo_basis(),
+        shape_basis,
+        len(start.R_left_board),
+        prior=priors_of(model, nominal, shape_basis) if priors else None,
+    )
     if begin is None:
-        model, extra = _robust_start(observations, model, stereo_basis, shape_basis, n_views, prior)
+        kept = np.ones(len(observations), bool)
+        model, extra = _robust_start(problem, model)
     else:
         kept, extra = begin.kept, begin.unexplained_sigma**2
-    if motion is not None:
-        model = split(model)
-    for turn in range(2 * FREE_ROUNDS):
-        used = observations[kept]
-        weights = inverse_covariance(used.covariance, extra)
-        problem = Problem(used, weights, stereo_basis, shape_basis, n_views, prior=prior, motion=motion)
-        dof: float = _degrees_of_freedom(problem, len(used))
-        if dof <= 0:
-            raise CalibrationError(
-                f"{len(used)} points in {len(np.unique(used.view))} views are fewer than the parameters to be found: "
-                "take more views, or fewer free terms"
-            )
-        minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
-        model, total, moved_as = minimum.model, total + minimum.iterations, motion
-        if motion is not None:
-            motion, determined = learnt(motion, model, minimum.normal.covariances()[1][:n_views])
-            dof -= determined
-        if prior is not None:
-            disagreement = float(np.nan_to_num(minimum.normal.disagreement(stereo_basis.shape[1])))
-            weight = min(max(disagreement, 1.0 / MOST_DISAGREEMENT), MOST_DISAGREEMENT)
-            prior = replace(prior, weight=weight)
-        residuals = observations.pixels - predict_pixels(model, observations)
-        new_extra = _extra_variance(residuals[kept], used.covariance, dof)
-        new_kept = _mahalanobis2(residuals, observations.covariance, new_extra) < reject_beyond**2
-        if turn >= FREE_ROUNDS:
-            new_kept &= kept
-        settled = abs(new_extra - extra) <= 0.01 * extra + 1e-10 and bool((new_kept == kept).all())
-        if motion is not None and moved_as is not None:
-            settled = settled and motion.is_near(moved_as)
-        extra = new_extra
-        if settled or turn == 2 * FREE_ROUNDS - 1:  # what is returned belongs to the points that were fitted
-            break
-        kept = new_kept
+    rough = replace(problem, motion=motion), model if motion is None else split(model)
+    problem, model, kept, extra, dof, total = _settled(*rough, kept, extra, reject_beyond)
+    used = observations[kept]
     # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that
     # nothing is left of where the rough rounds happened to stop
     for _ in range(2):
-        problem = replace(problem, weights=inverse_covariance(used.covariance, extra), prior=prior, motion=motion)
+        problem = problem.seeing(used, extra)
         minimum = minimise(problem, model, tolerance=1e-14, damping=1e-6)
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict_pixels(model, observations)
@@ -145,27 +128,51 @@ def refine_stereo(
     )
 
 
-def _robust_start(
-    observations: Observations,
-    model: StereoModel,
-    stereo_basis: Array,
-    shape_basis: Array,
-    n_views: int,
-    prior: Prior | None,
-) -> tuple[StereoModel, float]:
+def _settled(
+    problem: Problem, model: StereoModel, kept: Mask, extra: float, reject_beyond: float
+) -> tuple[Problem, StereoModel, Mask, float, float, int]:
+    """Rounds of a rough fit until noise, points, boards' motion and the prior's weight belong together.
+
+    problem : of all observations, of which those `kept` are fitted first; extra : [px^2] beside their own noise
+    returns : problem and model, points that were fitted, extra variance, degrees of freedom, steps that were taken
+    """
+    observations, total = problem.observations, 0
+    for turn in range(2 * FREE_ROUNDS):
+        used, motion, prior = observations[kept], problem.motion, problem.prior
+        problem = problem.seeing(used, extra)
+        dof: float = _degrees_of_freedom(problem)
+        minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
+        model, total = minimum.model, total + minimum.iterations
+        steady = True
+        if motion is not None:
+            moves, determined = learnt(motion, model, minimum.normal.covariances()[1][: problem.n_views])
+            dof, steady = dof - determined, moves.is_near(motion)
+            problem = replace(problem, motion=moves)
+        if prior is not None:
+            disagreement = float(np.nan_to_num(minimum.normal.disagreement(problem.stereo_basis.shape[1])))
+            weight = min(max(disagreement, 1.0 / MOST_DISAGREEMENT), MOST_DISAGREEMENT)
+            problem = replace(problem, prior=replace(prior, weight=weight))
+        residuals = observations.pixels - predict_pixels(model, observations)
+        before, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
+        good = _mahalanobis2(residuals, observations.covariance, extra) < reject_beyond**2
+        good = good & kept if turn >= FREE_ROUNDS else good
+        if steady and abs(extra - before) <= 0.01 * before + 1e-10 and bool((good == kept).all()):
+            break
+        if turn < 2 * FREE_ROUNDS - 1:  # what is returned belongs to the points that were fitted
+            kept = good
+    return problem, model, kept, extra, dof, total
+
+
+def _robust_start(problem: Problem, model: StereoModel) -> tuple[StereoModel, float]:
     """Huber's fit with the noise set by the median residual, and the extra variance [px^2] it shows."""
-    flat = shape_basis[..., :0]
+    observations = problem.observations
     model = replace(model, boards_right=None)
-    extra = 0.0
-    for basis in (flat, shape_basis) if shape_basis.shape[-1] else (flat,):
+    for basis in (problem.shape_basis[..., :0], problem.shape_basis)[: 1 + bool(problem.shape_basis.shape[-1])]:
         for _ in range(2):
-            residuals = observations.pixels - predict_pixels(model, observations)
-            extra = _median_variance(residuals)
-            weights = inverse_covariance(observations.covariance, extra)
-            problem = Problem(observations, weights, stereo_basis, basis, n_views, huber=2.0, prior=prior)
-            model = minimise(problem, model, iterations=30, tolerance=1e-5, rough=True).model
-    residuals = observations.pixels - predict_pixels(model, observations)
-    return model, _median_variance(residuals)
+            extra = _median_variance(observations.pixels - predict_pixels(model, observations))
+            rough = replace(problem.seeing(observations, extra), shape_basis=basis, huber=2.0)
+            model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
+    return model, _median_variance(observations.pixels - predict_pixels(model, observations))
 
 
 def _median_variance(residuals: Array) -> float:

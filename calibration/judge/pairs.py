@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from calibration.board.target import LEAST_POINTS
 from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.model_choice import fit_poses
-from calibration.fit.normal_equations import Problem, inverse_covariance
+from calibration.fit.normal_equations import Problem
 from calibration.fit.pairing import TOO_FAR, Pose
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
@@ -252,8 +252,7 @@ def judge_pairs(
     of_right[list(apart)] = n + np.arange(len(apart))
     begun = replace(fit.model, R_left_board=R[:n], t_left_board=t[:n], boards_right=(R[of_right], t[of_right]))
     alone = fit_poses(o, begun, sigma, FREE)
-    weights = inverse_covariance(o.covariance, sigma**2)
-    pairs = pair_motions(replace(fit.problem, observations=o, weights=weights, n_views=n, huber=3.0), alone)
+    pairs = pair_motions(replace(fit.problem.seeing(o, sigma**2), n_views=n, huber=3.0), alone)
     square = np.nan_to_num(np.sum((o.pixels - predict_pixels(alone, o)) ** 2, axis=-1), nan=1e12)
     images, image = np.unique(2 * o.view + o.camera, return_inverse=True)
     rms = np.sqrt(np.bincount(image, square) / np.bincount(image))
