@@ -226,13 +226,7 @@ def calibrate_from_corners(
             views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names, progress)
     report("refining")
-    seen = np.bincount(begun.observations.point, minlength=len(board.points))
-    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
-    free = FreeTerms(
-        shapes if settings.board == "auto" else (settings.board,),
-        RICHEST if settings.distortion == "auto" else settings.distortion,
-        settings.equal_aspect,
-    )
+    shapes, free = _free(begun.observations, board, settings)
     fit = fit_jointly(begun, board.points, free, names, table_view, report)
     apart = _told_apart(fit, names, bool(begun.wide), table_view)
     _require_fitted(fit, rejected | fit.lost, apart, begun.wide, table_view)
@@ -257,6 +251,17 @@ def calibrate_from_corners(
         lens=fit.lens,
         shape=shape,
     )
+
+
+def _free(
+    observations: Observations, board: Target, settings: CalibrationSettings
+) -> tuple[tuple[str, ...], FreeTerms]:
+    """Which shapes the board's points tell, and what the fit may change."""
+    seen = np.bincount(observations.point, minlength=len(board.points))
+    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
+    boards = shapes if settings.board == "auto" else (settings.board,)
+    distortion = RICHEST if settings.distortion == "auto" else settings.distortion
+    return shapes, FreeTerms(boards, distortion, settings.equal_aspect)
 
 
 def _begin(

@@ -7,6 +7,7 @@ measured inside the squares, so that every corner has a variance and a chi-squar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -92,12 +93,10 @@ def fit_view(
         known = np.concatenate([bends, _contrast_gradient(points, ok, fit.found[:, 5:7])], axis=1)
         starts = np.where(ok[:, None], fit.found, starts)
     fit = _with_smaller_windows(grey, fit, windows, starts, known, noise)
-    displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
-    return _judged(grey, fit, displaced, noise, axes, rough, inner_corners, seen, plain)
+    return _judged(grey, fit, noise, axes, rough, inner_corners, seen, plain)
 
 
-@dataclass(frozen=True)
-class _Fit:
+class _Fit(NamedTuple):
     """What the kernel returns for the corners of a view."""
 
     found: Array
@@ -124,29 +123,19 @@ def _with_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array,
         smaller[:, 10:12] *= factor
         again = _Fit(*fit_corners(grey, smaller, starts[bad], known[bad], noise, 30, 1e-5))
         better = again.chi_square < 0.5 * fit.chi_square[bad]
-        merged = [np.array(getattr(fit, name)) for name in ("found", "covariance", "sums", "converged")]
-        for old, name in zip(merged, ("found", "covariance", "sums", "converged"), strict=True):
-            old[bad[better]] = getattr(again, name)[better]
-        fit = _Fit(*merged)
+        fit = _Fit(fit.found.copy(), fit.covariance.copy(), fit.sums.copy(), fit.converged.copy())
+        for old, new in zip(fit, again, strict=True):
+            old[bad[better]] = new[better]
     return fit
-
-
-def _grid_homography(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
-    columns, rows = inner_corners
-    j, i = np.mgrid[:rows, :columns]
-    board = np.stack([i.ravel(), j.ravel()], axis=-1).astype(float)
-    if ok.sum() < 8:
-        ok = np.ones(len(points), bool)
-    H, _ = cv2.findHomography(board[ok], points[ok])
-    return np.asarray(H, float)
 
 
 def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
     """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
     columns, rows = inner_corners
-    H = _grid_homography(points, ok, inner_corners)
     j, i = np.mgrid[:rows, :columns]
     board = np.stack([i.ravel(), j.ravel(), np.ones(i.size)], axis=-1).astype(float)
+    use = ok if ok.sum() >= 8 else np.ones(len(points), bool)
+    H = np.asarray(cv2.findHomography(board[use, :2], points[use])[0], float)
     w = board @ H[2]
     image = (board @ H[:2].T) / w[:, None]
     return np.stack([(H[:2, axis] - image * H[2, axis]) / w[:, None] for axis in (0, 1)], axis=1)
@@ -291,7 +280,6 @@ def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
 def _judged(
     grey: Array,
     fit: _Fit,
-    displaced: Array,
     noise: Array,
     axes: Array,
     rough: Array,
@@ -301,6 +289,7 @@ def _judged(
 ) -> CornerView:
     """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
     found, sums = fit.found, fit.sums
+    displaced = _displacement(np.where(seen[:, None], found[:, :2], rough), axes, counts)
     spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
     with np.errstate(invalid="ignore", divide="ignore"):

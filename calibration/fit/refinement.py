@@ -83,19 +83,13 @@ def refine_stereo(
 
     Raises CalibrationError if the views cannot determine the parameters.
     """
-    terms = terms or Terms()
-    observations = observations[np.argsort(observations.view, kind="stable")]
+    terms, observations = terms or Terms(), observations[np.argsort(observations.view, kind="stable")]
     shape_basis = board_basis(nominal, terms.board)
     model = restricted(start if begin is None else begin.model, nominal, terms)
     motion = begin.problem.motion if motion is None and begin is not None else motion
-    problem = Problem(
-        observations,
-        inverse_covariance(observations.covariance, 0.0),
-        terms.stereo_basis(),
-        shape_basis,
-        len(start.R_left_board),
-        prior=priors_of(model, nominal, shape_basis) if priors else None,
-    )
+    prior = priors_of(model, nominal, shape_basis) if priors else None
+    weights, bases = inverse_covariance(observations.covariance, 0.0), (terms.stereo_basis(), shape_basis)
+    problem = Problem(observations, weights, *bases, len(start.R_left_board), prior=prior)
     if begin is None:
         kept = np.ones(len(observations), bool)
         model, extra = _robust_start(problem, model)
