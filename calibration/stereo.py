@@ -16,7 +16,7 @@ from calibration.fit.model_choice import TermsTried
 from calibration.fit.pairing import Names, Views, count_once
 from calibration.fit.refinement import Refinement
 from calibration.fit.start import MIN_VIEWS, start_stereo
-from calibration.fit.stereo_model import BOARD_MODELS, DISTORTION_MODELS, RICHEST, Observations
+from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, Judged, assess, stereo_covariance
 from calibration.judge.camera_moved import camera_moved, zoomed
 from calibration.judge.pairs import LEAST_PAIRS, PairsJudged, likely_motion
@@ -52,10 +52,8 @@ class CalibrationSettings:
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)
 
     def __post_init__(self) -> None:
-        if self.distortion not in ("auto", *DISTORTION_MODELS):
-            raise CalibrationError(f"distortion {self.distortion!r}: choose auto, {', '.join(DISTORTION_MODELS)}")
-        if self.board not in ("auto", *BOARD_MODELS):
-            raise CalibrationError(f"board model {self.board!r}: choose auto, {', '.join(BOARD_MODELS)}")
+        free = RICHEST if self.distortion == "auto" else self.distortion
+        Terms(free, "flat" if self.board == "auto" else self.board)  # raises CalibrationError on what it does not know
 
 
 @dataclass(frozen=True, repr=False)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.chebyshev import chebvander
 
 from calibration.cameras.splines import LensField
 from calibration.kit.arrays import Array
@@ -135,14 +134,9 @@ def normalise(pixels: Array, camera: Camera) -> Array:
     if pixels.size > 2 * _AT_ONCE:
         parts = np.array_split(pixels.reshape(-1, 2), pixels.size // (2 * _AT_ONCE) + 1)
         return np.concatenate([normalise(part, camera) for part in parts]).reshape(pixels.shape)
-    x, y = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
-    return np.stack(_undistorted(x, y, x, y, camera), axis=-1)
-
-
-def _undistorted(x: Array, y: Array, a: Array, b: Array, camera: Camera, iterations: int = 20) -> tuple[Array, Array]:
-    """What Brown's distortion takes to x, y, from a, b near it by Newton's method; NaN where it does not get there."""
+    a, b = x, y = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
     with np.errstate(all="ignore"):  # beyond the fold the iteration may run away; it is judged below
-        for _ in range(iterations):
+        for _ in range(20):
             xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
             rx, ry = x - xd, y - yd
             det = xd_a * yd_b - xd_b * xd_b
@@ -154,34 +148,14 @@ def _undistorted(x: Array, y: Array, a: Array, b: Array, camera: Camera, iterati
                 break
         # both slopes are positive up to the fold; beyond it are roots that no ray goes to
         good = (px2 < NEWTON_PX**2) & (det > 0) & (xd_a + yd_b > 0)
-    return np.where(good, a, np.nan), np.where(good, b, np.nan)
-
-
-_NODES = 24  # of Chebyshev's polynomials along each side of an image: ordinary lenses come out to 1e-12
+    return np.where(good[..., None], np.stack([a, b], axis=-1), np.nan)
 
 
 def normalised_maps(camera: Camera) -> tuple[Array, Array]:
-    """Undistorted normalised coordinates x, y of every pixel, each (height, width): `normalise`, three times as fast.
-
-    It starts from polynomials through the coordinates of a few pixels, and is at its end after a step.
-    """
+    """Undistorted normalised coordinates x, y of every pixel, each (height, width); NaN where it has no ray."""
     width, height = camera.image_size
-    x, y = (np.arange(width) - camera.cx) / camera.fx, (np.arange(height) - camera.cy) / camera.fy
-    nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    few = np.stack(np.meshgrid(*(0.5 * (size - 1) * (1 + nodes) for size in (width, height))), axis=-1)
-    at_nodes = np.moveaxis(normalise(few, camera), -1, 0)
-    inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))
-    along_x, along_y = (chebvander(np.linspace(-1, 1, size), _NODES - 1) @ inverse for size in (width, height))
-    smooth = bool(np.isfinite(at_nodes).all())
-    maps = np.empty((2, height, width))
-    rows = max(1, _AT_ONCE // width)
-    for first in range(0, height, rows):
-        part = slice(first, first + rows)
-        x_part, y_part = np.broadcast_arrays(x, y[part, None])
-        near = along_y[part] @ at_nodes @ along_x.T if smooth else (x_part, y_part)
-        # pixels beyond the fold of a distortion polynomial have no ray; the kernels skip windows that touch them
-        maps[0, part], maps[1, part] = _undistorted(x_part, y_part, near[0], near[1], camera)
-    return maps[0], maps[1]
+    maps = normalise(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1), camera)
+    return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,16 +168,9 @@ def inverse_covariance(covariance: Array, extra: float) -> Array:
     return result
 
 
-def minimise(
-    problem: Problem,
-    start: StereoModel,
-    iterations: int = 60,
-    tolerance: float = 1e-10,
-    damping: float = 1e-3,
-    rough: bool = False,
-) -> Minimum[StereoModel]:
-    """Levenberg-Marquardt from a start that shows every board before its camera; see `least_squares.minimise`."""
-    found = least_squares.minimise(problem.linearise, problem.stepped, start, iterations, tolerance, damping, rough)
+def minimise(problem: Problem, start: StereoModel, **how: Any) -> Minimum[StereoModel]:
+    """`least_squares.minimise` from a start that shows every board before its camera."""
+    found = least_squares.minimise(problem.linearise, problem.stepped, start, **how)
     if not found.iterations:
         raise CalibrationError(
             "the start of the refinement puts the board behind a camera: check the order of the views"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import (
+    INTRINSIC_PARAMETERS,
     N_INTRINSIC,
     OF_CAMERAS,
     PAIR_SHIFT,
@@ -101,20 +102,17 @@ class Terms:
 
     def stereo_basis(self) -> Array:
         """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
-        names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-        free = () if self.fixed_intrinsics else ("fx", "fy", "cx", "cy", *DISTORTION_MODELS[self.distortion])
-        columns = []
-        for camera in range(2):
-            for i, name in enumerate(names):
-                if name not in free or (self.equal_aspect and name == "fy"):
-                    continue
-                column = np.zeros(N_STEREO)
-                column[camera * N_INTRINSIC + i] = 1.0
-                if self.equal_aspect and name == "fx":
-                    column[camera * N_INTRINSIC + 1] = 1.0
-                columns.append(column)
-        columns.extend(np.eye(N_STEREO)[2 * N_INTRINSIC :])
-        return np.array(columns).T
+        held = {"fy"} if self.equal_aspect else set()
+        free = (
+            set() if self.fixed_intrinsics else {*INTRINSIC_PARAMETERS[:4], *DISTORTION_MODELS[self.distortion]} - held
+        )
+        unit, columns = np.eye(N_STEREO), []
+        for of_camera in OF_CAMERAS:
+            own = dict(zip(INTRINSIC_PARAMETERS, unit[of_camera], strict=True))
+            if self.equal_aspect:
+                own["fx"] = own["fx"] + own["fy"]
+            columns += [column for name, column in own.items() if name in free]
+        return np.array([*columns, *unit[PAIR_TURN], *unit[PAIR_SHIFT]]).T
 
 
 def board_basis(nominal: Array, board: str) -> Array:
@@ -214,14 +212,11 @@ def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
         model = replace(model, points=nominal + (basis @ coefficients).reshape(nominal.shape))
     if terms.fixed_intrinsics:
         return model
-    free = DISTORTION_MODELS[terms.distortion]
-    names = ("k1", "k2", "p1", "p2", "k3")
-    cameras = []
+    cameras, free = [], DISTORTION_MODELS[terms.distortion]
+    held = np.array([name in free for name in INTRINSIC_PARAMETERS[4:]])
     for camera in model.cameras:
-        k1, k2, p1, p2, k3 = (
-            value if name in free else 0.0 for name, value in zip(names, camera.distortion, strict=True)
-        )
-        mean = 0.5 * (camera.fx + camera.fy)
-        fx, fy = (mean, mean) if terms.equal_aspect else (camera.fx, camera.fy)
-        cameras.append(replace(camera, fx=fx, fy=fy, distortion=(k1, k2, p1, p2, k3)))
+        parameters = camera.parameters * np.concatenate([np.ones(4), held])
+        if terms.equal_aspect:
+            parameters[:2] = parameters[:2].mean()
+        cameras.append(Camera.from_parameters(parameters, camera.image_size))
     return replace(model, cameras=(cameras[0], cameras[1]))

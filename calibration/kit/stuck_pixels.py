@@ -4,7 +4,7 @@ A dot or a corner is fitted to a thousand pixels; one that is off by half the ra
 pulls it by more than the noise of all others. Cameras replace such pixels by their neighbours; many do not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -22,20 +22,7 @@ OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
 
 def stuck_pixels(images: Sequence[Image] | NDArray) -> Mask | None:
     """(height, width) True where a pixel is stuck in all grey images (n, height, width); None where none is."""
-    if len(images) < MIN_IMAGES:
-        return None
-    low, high = np.array(images[0]), np.array(images[0])
-    scale = float(np.ptp(low))
-    off = np.ones(low.shape, bool)
-    for image in images:
-        level = cv2.medianBlur(np.ascontiguousarray(image), 3)
-        off &= np.abs(image.astype(np.int32) - level) > OFF * scale
-        if not off.any():
-            return None
-        np.minimum(low, image, out=low)
-        np.maximum(high, image, out=high)
-    off &= high.astype(np.int32) - low <= STEADY * scale
-    return off if 0 < off.sum() <= MOST * off.size else None
+    return _steady(images, lambda off, around, scale: off == len(images))
 
 
 def blind_pixels(views: Sequence[Image] | NDArray) -> Mask | None:
@@ -45,22 +32,34 @@ def blind_pixels(views: Sequence[Image] | NDArray) -> Mask | None:
     that none differs from its neighbours in every view. It does OFTEN; a pixel of what rests behind the board may be
     left as it is by an edge that comes near.
     """
-    if len(views) < MIN_IMAGES:
+    return _steady(views, lambda off, around, scale: (around > PASSED * scale) & (off > OFTEN * len(views)))
+
+
+def _steady(
+    images: Sequence[Image] | NDArray, does_not_see: Callable[[NDArray, NDArray, float], NDArray]
+) -> Mask | None:
+    """Pixels that keep their value and do not see; None without any, or where so many are that they are the scene.
+
+    does_not_see : by the number of images in which a pixel is off its neighbours, by how much the light around it
+        changes, and by the range of all grey values
+    """
+    if len(images) < MIN_IMAGES:
         return None
-    low, high = np.array(views[0]), np.array(views[0])
+    low, high = np.array(images[0]), np.array(images[0])
     around = [cv2.medianBlur(low, 3) for _ in range(2)]
-    scale = float(max(int(view.max()) for view in views) - min(int(view.min()) for view in views))
-    differs = np.zeros(low.shape, np.int32)
-    for view in views:
-        np.minimum(low, view, out=low)
-        np.maximum(high, view, out=high)
-        level = cv2.medianBlur(np.ascontiguousarray(view), 3)
+    scale = float(max(int(image.max()) for image in images) - min(int(image.min()) for image in images))
+    off = np.zeros(low.shape, np.int32)
+    for image in images:
+        np.minimum(low, image, out=low)
+        np.maximum(high, image, out=high)
+        level = cv2.medianBlur(np.ascontiguousarray(image), 3)
         np.minimum(around[0], level, out=around[0])
         np.maximum(around[1], level, out=around[1])
-        differs += np.abs(view.astype(np.int32) - level) > OFF * scale
-    blind = (high.astype(np.int32) - low <= STEADY * scale) & (around[1].astype(np.int32) - around[0] > PASSED * scale)
-    blind &= differs > OFTEN * len(views)
-    return blind if 0 < blind.sum() <= MOST * blind.size else None
+        off += np.abs(image.astype(np.int32) - level) > OFF * scale
+    found = (high.astype(np.int32) - low <= STEADY * scale) & does_not_see(
+        off, around[1].astype(np.int32) - around[0], scale
+    )
+    return found if 0 < found.sum() <= MOST * found.size else None
 
 
 def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:

@@ -76,7 +76,6 @@ def test_maps_of_whole_images_are_the_pixels_own_coordinates(size):
     grid = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1)
     for camera in (replace(CAMERA, image_size=size), wide):
         maps = np.stack(normalised_maps(camera), axis=-1)
-        assert_allclose(maps, normalise(grid, camera), atol=1e-12)
         assert_allclose(project(np.dstack([maps, np.ones(size[::-1])]), camera), grid, atol=1e-9)
 
 
