@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, CornerView
@@ -312,9 +313,5 @@ def _both(turn: Array, shift: Array) -> Array:
 
 def rotation_vectors(R: Array) -> Array:
     """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); of half turns, some vector as long as pi."""
-    v = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
-    sine = np.linalg.norm(v, axis=-1)
-    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
-    along = np.where((sine > 1e-9)[..., None], v / np.maximum(sine, 1e-9)[..., None], [1.0, 0.0, 0.0])
-    small: Array = along * np.where((sine < 1e-9) & (angle < 1.0), 0.0, angle)[..., None]
-    return small
+    turns = scipy.spatial.transform.Rotation.from_matrix(R.reshape(-1, 3, 3))
+    return np.asarray(turns.as_rotvec(), np.float64).reshape(R.shape[:-1])

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration import Board, Camera, Observations, StereoModel
+from calibration import Board, Camera, CornerView, Observations, StereoModel
 from calibration.cameras.camera import project, rotation_from_vector
 from calibration.kit.arrays import Array
 
@@ -61,6 +61,14 @@ def make_scene(n_views=12, inner_corners=(9, 6), square=8e-3, distortion=True, d
         t_board[v] = target + rng.uniform(-0.015, 0.015, 3) - R_board[v] @ centre
     points = board.points + (0 if deviation is None else deviation)
     return Scene(StereoModel(cameras, R_pair, t_pair, R_board, t_board, points), board)
+
+
+def corner_view(points, sigma=0.1, image_size=(640, 480)) -> CornerView:
+    """What `find_corners` would return of points (n, 2) [px], all of them found and as uncertain."""
+    n = len(points)
+    covariance = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
+    plain = {"chi_square": np.ones(n), "contrast": np.full(n, 100.0), "blur": np.ones(n), "spacing": 30.0}
+    return CornerView(image_size, points, covariance, np.ones(n, bool), ("",) * n, noise=(1.0, 0.0), **plain)
 
 
 @pytest.fixture(scope="session")

@@ -7,30 +7,22 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, CalibrationSettings, CornerView, Terms, calibrate_from_corners, refine_stereo
+from calibration import Board, CalibrationSettings, Terms, calibrate_from_corners, refine_stereo
 from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.stereo_model import board_basis, moved, predict_pixels
-from calibration.judge.assessment import stereo_covariance
+from calibration.judge.assessment import Grade, stereo_covariance
 from calibration.judge.pairs import likely_motion, motion_between_exposures
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
+from tests.calibration.conftest import corner_view
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import moved_boards, point_laboratory
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
 SETTINGS = CalibrationSettings(distortion="k1 k2 p1 p2", board="flat", tolerances=EXACT)
-
-
-def corner_view(points, sigma=0.1):
-    n = len(points)
-    covariance = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
-    plain = {"chi_square": np.ones(n), "contrast": np.full(n, 100.0), "blur": np.ones(n), "spacing": 30.0}
-    return CornerView(
-        moved_boards.IMAGE_SIZE, points, covariance, np.ones(n, bool), ("",) * n, noise=(1.0, 0.0), **plain
-    )
 
 
 def calibrated(rig, n, seed, **motion):
@@ -45,17 +37,8 @@ def errors(found, rig):
         for c, K in zip((found.rig.left, found.rig.right), rig.matrices, strict=True)
     ]
     turn = cv2.Rodrigues(found.rig.R_right_left @ rig.R.T)[0].ravel()
-    return np.concatenate([*intrinsics, turn, found.rig.t_right_left - rig.t]), [
-        0,
-        1,
-        2,
-        3,
-        9,
-        10,
-        11,
-        12,
-        *range(18, 24),
-    ]
+    places = [*range(4), *range(9, 13), *range(18, 24)]
+    return np.concatenate([*intrinsics, turn, found.rig.t_right_left - rig.t]), places
 
 
 def squared(error, covariance):
@@ -110,6 +93,9 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
         sizes.append(found.refinement.problem.motion)
         assert any("not synchronised" in text for text in found.warnings)
         assert not found.apart
+        # each axis moves by 0.5 mm rms; the two poses share what moves along the common line of sight
+        assert 0.4e-3 < found.assessment.motion.distance < 1.8e-3
+        assert found.assessment.grade in (Grade.USABLE, Grade.POOR)
         # one place of the board for both images, as of cameras that are triggered together
         o, model = found.refinement.observations, replace(found.refinement.model, boards_right=None)
         together = refine_stereo(o, model, BOARD.points, found.refinement.terms)
@@ -146,6 +132,7 @@ def test_pairs_that_were_synchronised_have_no_motion():
         for correlation in (0.4, 0.0):
             found = calibrated(rig, 10, seed, correlation=correlation)
             assert found.refinement.problem.motion is None
+            assert not found.assessment.motion.is_seen
             assert not any("synchronised" in text for text in found.warnings)
         # and where one is asked for, it is found to be next to nothing: 0.1 px are 0.07 mm here
         r = found.refinement

@@ -19,13 +19,15 @@ from calibration import (
     calibrate_stereo,
     refine_stereo,
 )
-from calibration.board.chessboard import find_corners
+from calibration.board.chessboard import board_orders, find_corners
 from calibration.cameras.camera import rotation_from_vector, triangulate
 from calibration.fit.start import start_stereo
+from calibration.judge.assessment import point_uncertainty
 from calibration.judge.pairs import judge_pairs, own_places
 from calibration.judge.table_frame import table_pose
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
+from tests.calibration.conftest import corner_view
 
 BOARD = Board((7, 4), 9e-3)
 THICKNESS = 2e-3
@@ -69,20 +71,10 @@ def calibrated(drawn):
 
 def corner_views(scene, rng, sigma=0.02, board=BOARD):
     """What `find_corners` would return, without images."""
-    n = len(board.points)
-    views = []
-    for camera in (0, 1):
-        pixels = scene.pixels(camera)
-        views.append(
-            [
-                CornerView(
-                    (240, 192), p + rng.normal(size=p.shape) * sigma, np.tile(np.eye(2) * sigma**2, (n, 1, 1)),
-                    np.ones(n, bool), ("",) * n, np.ones(n), np.full(n, 180.0), np.ones(n), 15.0, (1.0, 0.0),
-                )
-                for p in pixels
-            ]
-        )  # fmt: skip
-    return views
+    return [
+        [corner_view(p + rng.normal(size=p.shape) * sigma, sigma, (240, 192)) for p in scene.pixels(camera)]
+        for camera in (0, 1)
+    ]
 
 
 def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
@@ -95,8 +87,6 @@ def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
         R_left_world=R, t_left_world=t,
     )  # fmt: skip
     error = triangulate(true_rig.project(points), found.rig) - points
-    from calibration.judge.assessment import point_uncertainty
-
     sigma = point_uncertainty(found.rig, points)
     assert np.abs(error / sigma).max() < 4.5
     assert np.abs(error).max() < 20e-6  # cameras of 240 x 192 px, 0.55 mm per px, 8 views
@@ -218,40 +208,6 @@ def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng)
     assert found.rig.covariance[0, 0] < without.rig.covariance[0, 0]
 
 
-def unsynchronised(scene, rng, step):
-    """The right views of boards that moved by `step` [m, rms of each axis] after the left exposure."""
-    m = scene.model
-    moved = replace(m, t_left_board=m.t_left_board + rng.normal(size=m.t_left_board.shape) * step)
-    return corner_views(scene, rng)[0], corner_views(replace(scene, model=moved), rng)[1]
-
-
-@pytest.mark.statistical
-def test_pairs_that_were_not_synchronised_are_named_and_others_are_not(scene_maker, rng):
-    scene = small_scene(scene_maker, n_views=14)
-    found = calibrate_from_corners(*unsynchronised(scene, rng, 0.2e-3), BOARD, FLAT)
-    assert not found.rejected_views
-    assert any("not synchronised" in w for w in found.warnings)
-    # each axis moves by 0.2 mm rms; the two poses share what moves along the common line of sight
-    assert 0.15e-3 < found.assessment.motion.distance < 0.7e-3
-    assert found.assessment.verdict.startswith(("Usable", "Poor"))
-    together = calibrate_from_corners(*corner_views(scene, rng), BOARD, FLAT)
-    assert not together.assessment.motion.is_seen
-    assert not any("synchronised" in w for w in together.warnings)
-
-
-@pytest.mark.slow
-def test_the_sigma_of_the_baseline_is_honest_where_pairs_were_not_synchronised(scene_maker):
-    z = []
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        scene = small_scene(scene_maker, n_views=16, seed=seed)
-        rig = calibrate_from_corners(*unsynchronised(scene, rng, 0.15e-3), BOARD, FLAT).rig
-        t = scene.model.t_right_left
-        axis = rig.t_right_left / rig.baseline
-        z.append((rig.baseline - np.linalg.norm(t)) / np.sqrt(axis @ rig.covariance[21:24, 21:24] @ axis))
-    assert 0.3 < np.mean(np.square(z)) < 2.2  # chi-square of 16 at two sigma, and what 16 views know of their scatter
-
-
 def test_pairs_that_a_rough_pose_puts_elsewhere_are_used_after_all(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=10)
     observations, m = scene.observations(0.02, rng), scene.model
@@ -308,8 +264,6 @@ def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_mak
     scene = scene_maker(n_views=8, inner_corners=counts, square=9e-3)
     scene = replace(scene, board=board)
     left, right = corner_views(scene, rng, 0.01, board)
-    from calibration.board.chessboard import board_orders
-
     orders = board_orders(counts)
     orders = orders if board.symmetry == len(orders) else orders[::2]
     turned = [view.reordered(orders[v % len(orders)]) for v, view in enumerate(right)]
