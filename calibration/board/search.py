@@ -21,11 +21,10 @@ from calibration.board.target import Board, CharucoBoard, Target
 
 TargetView = CornerView | BoardNotFound
 Progress = Callable[[str, int, int], None]
-SAMPLE = 10  # images over the whole set: without a board in any, the slow search, half a second each, waits
 LEAST_VIEWS = 2  # that must show the whole board
 SIZES_TRIED = 3  # of those that several images seem to show
 COMMON_SIZE = (9, 6)  # asked for where no size is seen: OpenCV's own board
-VIEWS_TRIED = 8  # of each camera; the size that most of them show is the board's
+VIEWS_TRIED = 8  # over a whole set: what most of them show is the board; without one, the slow search waits
 REFUSED_TRIED = 4  # images without the declared board in which another is looked for, a quarter of a second each
 
 
@@ -60,7 +59,7 @@ def located(
     def missing(among: Iterable[int]) -> list[int]:
         return [index for index in among if not isinstance(views.get(index), CornerView)]
 
-    sample = evenly(len(images), SAMPLE)
+    sample = evenly(len(images), VIEWS_TRIED)
     others = sorted(set(range(len(images))) - set(sample))
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(locate, sample, [False] * len(sample)))

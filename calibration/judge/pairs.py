@@ -32,7 +32,6 @@ MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times t
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
 FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
-START = ((1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5))  # [rad], and of the distance
 
 
 def own_places(
@@ -131,7 +130,8 @@ class PairMotions:
 
         # an attribute of `scipy` is imported when it is asked for: a measurement with a rig does not wait for it
         rough = {"method": "Nelder-Mead", "options": {"xatol": 0.02, "fatol": 0.02}}  # of logarithms
-        tried = [scipy.optimize.minimize(unlikely, np.log(start), **rough) for start in START]
+        begun = np.log([(1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5)])
+        tried = [scipy.optimize.minimize(unlikely, start, **rough) for start in begun]
         S = variances(min(tried, key=lambda one: float(one.fun)).x)
         into = np.zeros((self.problem.n_views, self.by_shared.shape[-1], self.by_shared.shape[-1]))
         known = np.linalg.solve(self.covariance, self.by_shared)

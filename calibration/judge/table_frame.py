@@ -48,20 +48,10 @@ def rig_with_covariance(
         t = t if origin is None else t + R @ origin
         R_left_world, t_left_world = table_pose(R, t, board_thickness)
         # t_world = t - h R k: turning R by v shifts it by -v x (h R k) = (h R k) x v
-        arm = board_thickness * R[:, 2]
         M = np.eye(6)
-        M[3:, :3] = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+        M[3:, :3] = np.cross(board_thickness * R[:, 2], np.eye(3)).T
         covariance[N_STEREO:, N_STEREO:] = M @ poses[table_view] @ M.T
         covariance[:N_STEREO, N_STEREO:] = basis @ cross[table_view] @ M.T
         covariance[N_STEREO:, :N_STEREO] = covariance[:N_STEREO, N_STEREO:].T
-    covariance = 0.5 * (covariance + covariance.T)
-    return StereoRig(
-        left=model.cameras[0],
-        right=model.cameras[1],
-        R_right_left=model.R_right_left,
-        t_right_left=model.t_right_left,
-        R_left_world=R_left_world,
-        t_left_world=t_left_world,
-        covariance=covariance,
-        world_is_table=table_view is not None,
-    )
+    place = (model.R_right_left, model.t_right_left, R_left_world, t_left_world)
+    return StereoRig(*model.cameras, *place, 0.5 * (covariance + covariance.T), table_view is not None)

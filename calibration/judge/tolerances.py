@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import N_RIG, Allowance, StereoRig
+from calibration.cameras.camera import N_RIG, PAIR_SHIFT, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import board_basis
 from calibration.kit.arrays import Array
@@ -123,14 +123,9 @@ def as_made(refinement: Refinement, nominal: Array, shape: BoardShape) -> Refine
     """
     scale = 1.0 + _growth(nominal, shape)
     m = refinement.model
-    model = replace(
-        m,
-        t_right_left=scale * m.t_right_left,
-        t_left_board=scale * m.t_left_board,
-        points=scale * m.points,
-        boards_right=m.boards_right and (m.boards_right[0], scale * m.boards_right[1]),
-    )
-    return replace(refinement, model=model)
+    larger = {name: scale * getattr(m, name) for name in ("t_right_left", "t_left_board", "points")}
+    boards_right = m.boards_right and (m.boards_right[0], scale * m.boards_right[1])
+    return replace(refinement, model=replace(m, boards_right=boards_right, **larger))
 
 
 def _growth(nominal: Array, shape: BoardShape) -> float:
@@ -183,7 +178,7 @@ def with_tolerances(
 
     def allow(cause: str, declared: float | None, **shift: Array) -> None:
         parameters = np.zeros(N_RIG)
-        places = {"pair": slice(21, 24), "turn": slice(24, 27), "place": slice(27, 30)}
+        places = {"pair": PAIR_SHIFT, "turn": WORLD_TURN, "place": WORLD_SHIFT}
         for name, value in shift.items():
             parameters[places[name]] = value
         if parameters.any():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from calibration import CalibrationError, Terms, refine_stereo
 from calibration.cameras.camera import N_RIG
@@ -37,36 +38,19 @@ def parameters(model):
 def rig_error(found, truth):
     """(30,) difference of two rigs in RIG_PARAMETERS, rotation vectors from the left."""
 
-    def turn(A, B):
-        D = A @ B.T
-        return 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
-
-    return np.concatenate(
-        [
-            found.left.parameters - truth.left.parameters,
-            found.right.parameters - truth.right.parameters,
-            turn(found.R_right_left, truth.R_right_left),
-            found.t_right_left - truth.t_right_left,
-            turn(found.R_left_world, truth.R_left_world),
-            found.t_left_world - truth.t_left_world,
-        ]
-    )
+    names = ("R_right_left", "t_right_left", "R_left_world", "t_left_world")
+    pairs = [(getattr(found, name), getattr(truth, name)) for name in names]
+    intrinsics = [a.parameters - b.parameters for a, b in zip(found.cameras, truth.cameras, strict=True)]
+    places = [Rotation.from_matrix(a @ b.T).as_rotvec() if a.ndim == 2 else a - b for a, b in pairs]
+    return np.concatenate([*intrinsics, *places])
 
 
 def true_rig(scene, view, thickness):
     m = scene.model
     R, t = table_pose(m.R_left_board[view], m.t_left_board[view], thickness)
     found = refine_stereo(scene.observations(1e-3), m, scene.board.points, FULL)
-    rig = rig_with_covariance(found, view, thickness, 1.0)
-    return replace(
-        rig,
-        left=m.cameras[0],
-        right=m.cameras[1],
-        R_right_left=m.R_right_left,
-        t_right_left=m.t_right_left,
-        R_left_world=R,
-        t_left_world=t,
-    )
+    place = {"R_right_left": m.R_right_left, "t_right_left": m.t_right_left, "R_left_world": R, "t_left_world": t}
+    return replace(rig_with_covariance(found, view, thickness, 1.0), left=m.cameras[0], right=m.cameras[1], **place)
 
 
 def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(scene_maker, rng):
