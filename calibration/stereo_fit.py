@@ -109,18 +109,17 @@ def _without_images(
     observations: Observations, pairs: PairsJudged, names: Names, wide: bool
 ) -> tuple[Observations, PairsJudged, dict[int, str], list[str]]:
     """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
-    model, apart, rejected, warnings = pairs.model, dict(pairs.apart), {}, []
-    R, t = model.R_left_board.copy(), model.t_left_board.copy()
+    by_right, rejected, warnings = {}, {}, []
     or_else = ", or the board lies too far out for the model of this lens" if wide else ""
     for (view, camera), reason in pairs.bad_images.items():
         text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly{or_else}"
         observations = observations[(observations.view != view) | (observations.camera != camera)]
-        apart.pop(view, None)
         if camera == 0 and view in pairs.right_poses:
-            R[view], t[view] = pairs.right_poses[view]
+            by_right[view] = pairs.right_poses[view]
         if np.any(observations.view == view):
             warnings.append(f"{text}: left out, the other image of the pair is used for its own camera")
         else:
             rejected[view] = text
-    pairs = replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart, bad_images={})
+    apart = {view: why for view, why in pairs.apart.items() if not {(view, 0), (view, 1)} & set(pairs.bad_images)}
+    pairs = replace(pairs, model=pairs.model.placed(by_right), apart=apart, bad_images={})
     return observations, pairs, rejected, warnings

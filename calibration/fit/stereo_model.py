@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,6 +82,13 @@ class StereoModel:
     def boards_in_right(self) -> tuple[Array, Array]:
         """The same, where they did not move as well."""
         return self.boards_right or (self.R_left_board, self.t_left_board)
+
+    def placed(self, poses: Mapping[int, tuple[Array, Array]]) -> StereoModel:
+        """With the boards of some views elsewhere: R (3, 3) and t (3,) [m] in the left camera's axes."""
+        R, t = self.R_left_board.copy(), self.t_left_board.copy()
+        for view, pose in poses.items():
+            R[view], t[view] = pose
+        return replace(self, R_left_board=R, t_left_board=t)
 
 
 @dataclass(frozen=True)

@@ -54,12 +54,8 @@ class CameraMoved:
 
     def set_apart(self, pairs: PairsJudged) -> PairsJudged:
         """The pairs of the other stretches apart, each at the place that its left image alone gives the board."""
-        model = pairs.model
-        R, t = model.R_left_board.copy(), model.t_left_board.copy()
-        for v in self.others:
-            R[v], t[v] = pairs.left_poses[v]
         apart = pairs.apart | dict.fromkeys(self.others, "a camera was moved")
-        return replace(pairs, model=replace(model, R_left_board=R, t_left_board=t), apart=apart)
+        return replace(pairs, model=pairs.model.placed({v: pairs.left_poses[v] for v in self.others}), apart=apart)
 
     def told(self, names: Sequence[tuple[str, str]], table_view: int | None) -> str:
         """In words, for whoever took the views."""

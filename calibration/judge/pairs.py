@@ -270,8 +270,5 @@ def judge_pairs(
             found[int(pairs.views[k])] = f"{pairs.pixels[k]:.2g} px apart, where corners scatter by {typical:.2g} px"
     boards = (alone.R_left_board, alone.t_left_board), alone.boards_in_right
     left, right = ({int(v): (one[0][v], one[1][v]) for v in pairs.views} for one in boards)
-    R, t = R[:n].copy(), t[:n].copy()
-    for v in {*found, *apart} & set(left):
-        R[v], t[v] = left[v]
-    model = replace(begun, R_left_board=R, t_left_board=t, boards_right=None)
+    model = replace(begun, boards_right=None).placed({v: left[v] for v in {*found, *apart} & set(left)})
     return PairsJudged(model, right, found, bad, left)
