@@ -6,11 +6,11 @@ from calibration.kit.brief import Brief
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import Errors
 from disctrack.diagnosis.form_misfit import LawCourse
-from disctrack.diagnosis.learned_law import LearnedLaw
 from disctrack.diagnosis.plan import Plan, Separation
 from disctrack.diagnosis.regimes import Regimes
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.laws import LearnedLaw
 from disctrack.discrepancy.search import Diagnosis
 
 

@@ -13,8 +13,10 @@ from scipy.interpolate import CubicHermiteSpline
 
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import triangle
+from disctrack.diagnosis.missing_force import DiscScan, law_of, scanned
 from disctrack.diagnosis.motion import (
     SLIP,
+    THETA_END,
     candidate_of_fault,
     measurement_candidates,
     model_quantities,
@@ -27,12 +29,13 @@ from disctrack.diagnosis.motion_start import STRETCHES, start_values
 from disctrack.diagnosis.sought import sought
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp, Values
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
 from disctrack.faults.catalogue import faults_of, setup_of
 from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
-from disctrack.rolling.effects import Effect
 from disctrack.rolling.simulate import MAX_SLIP_STEPS
 from disctrack.track.pose import whitening
 from disctrack.track.refine.table_contact import ASSUMED_THICKNESS as MICROMETER
@@ -40,7 +43,6 @@ from disctrack.track.refine.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
-THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 TRIAL_SLIP_STEPS = 1_000  # of them in a fit that is one trial among many; where slip is true, a fit takes hundreds
@@ -99,7 +101,7 @@ class StaticView:
     whiten: Array  # (k, 2, m, 2, 2)
 
 
-class DiscSystem(System):
+class DiscSystem(LawSystem):
     """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
 
     def __init__(
@@ -314,10 +316,18 @@ class DiscSystem(System):
         one.patience = Patience(int(share * TRIAL_SLIP_STEPS * len(self.time)), self.patience)
         return one
 
-    def knowing(self, law: type[Effect]) -> DiscSystem:
-        """The same system, in whose values parameters of this law may be named."""
+    def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
+        """See LawSystem; None where the disc slips."""
+        return scanned(self, fitted, beside)
+
+    def law(self, families: Sequence[Family], values: Array) -> LearnedLaw:
+        """See LawSystem."""
+        return law_of(self.model, families, values)
+
+    def knowing(self, law: LearnedLaw) -> DiscSystem:
+        """See LawSystem."""
         known = copy(self)
-        known.model = self.model.knowing(law)
+        known.model = self.model.knowing(law.effect)
         return known
 
     def model_with(self, values: Values) -> Model:

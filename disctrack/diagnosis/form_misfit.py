@@ -20,11 +20,11 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import triangle
-from disctrack.diagnosis.disc_system import THETA_END, DiscSystem
-from disctrack.diagnosis.learned_law import WIDTH, LearnedLaw, _Blocks, probe
-from disctrack.diagnosis.motion import state_of
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.missing_force import WIDTH, Probed, probe
+from disctrack.diagnosis.motion import THETA_END, state_of
 from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.laws import LearnedLaw, evidence
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_wrench, kinematics
@@ -104,7 +104,7 @@ def with_form(
     if blocks is None:
         return WithForm(fitted, fitted, None)
     n, k = blocks.n_fitted, len(blocks.time)
-    R = triangle(np.vstack([*(part / np.sqrt(noise) for part in blocks.triangles), blocks.prior]))
+    R = np.vstack([blocks.data / np.sqrt(noise), blocks.prior])
     course, own, by_number = _courses(system, fitted, {law.candidate.effect, *beside}, blocks.time)
     parts = _parts(system, fitted, blocks, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
     wrong = 1.0 if remembers else form_is_another(law, beside)
@@ -167,12 +167,12 @@ def _among_rivals(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Arra
     """Variance (k, 3) of the course over the laws that describe the data too, each with its odds."""
     motion, total, spread = _motion(system, fitted.values, time), 1.0, np.zeros_like(course)
     for rival, odds in law.rivals:
-        moment = moment_about_contact(system.knowing(rival.effect), rival.values, motion)[1:]
+        moment = moment_about_contact(system.knowing(rival), rival.values, motion)[1:]
         total, spread = total + odds, spread + odds * (moment - course) ** 2
     return np.asarray(spread / total, float)
 
 
-def _within_probes(system: DiscSystem, fitted: Fit, blocks: _Blocks, course: Array) -> Array:
+def _within_probes(system: DiscSystem, fitted: Fit, blocks: Probed, course: Array) -> Array:
     """Mean square (k, 3), over the time of each probe, by which the laws differ from a smooth course through them all.
 
     What is shorter than a probe (an edge, a blow) moves the disc by its sum alone: another form has it elsewhere there.
@@ -199,7 +199,7 @@ def _solver(A: Array) -> tuple[Array, Array]:
     return U[:, seen], (V[seen] / singular[seen, None]).T / length[:, None]
 
 
-def _parts(system: DiscSystem, fitted: Fit, blocks: _Blocks, size: float) -> list[Array]:
+def _parts(system: DiscSystem, fitted: Fit, blocks: Probed, size: float) -> list[Array]:
     """Roots (3 k, m) of the covariances of the misfit's parts, axis by axis; their rms is that of the law, `size`."""
     time, k = blocks.time, len(blocks.time)
     distance = time[:, None] - time
@@ -233,8 +233,7 @@ def _second_moment(B: Array, right: Array, parts: Sequence[int]) -> tuple[Array,
             L = np.linalg.cholesky(others)
             left, shown, _ = np.linalg.svd(solve_triangular(L, B[:, columns], lower=True), full_matrices=False)
             projected = left.T @ solve_triangular(L, right, lower=True)
-            power = (SIZES[:, None] * shown) ** 2
-            density = -0.5 * np.sum(np.log1p(power) - projected**2 * power / (1 + power), axis=1)
+            density = -0.5 * evidence(shown, projected, SIZES)
             weight = np.exp(density - density.max())
             f2[i] = float(weight @ SIZES**2 / weight.sum())
     size = np.repeat(np.sqrt(f2), parts)

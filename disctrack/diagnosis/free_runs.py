@@ -13,7 +13,7 @@ from disctrack.analyse.propagation import RATES, MotionState, propagate, rates
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import HALF_WINDOW, HORIZONS, Ahead, energy_balance, free_run, simulated
-from disctrack.diagnosis.learned_law import MissingMoment, missing_moment, probe
+from disctrack.diagnosis.missing_force import MissingMoment, missing_moment, probe
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.errors import AnalysisError

@@ -5,15 +5,13 @@ records.KINEMATICS and gets a coefficient of its own. Numbers in braces are the 
 fast something hums): a grid of them is looked over, and the best is fitted along with the coefficients.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
-
-Parts = Mapping[str, str]  # component of the wrench -> formula
+from disctrack.discrepancy.laws import Family, LearnedLaw, Parts
 
 HIGHEST_HARMONIC = 4  # of the angles
 DRIFT_DEGREE = 4  # of the polynomials in time
@@ -46,26 +44,32 @@ _X, _Y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"  # the
 # the contact's place on the table: O minus (r cos theta - h sin theta) m0
 _ARM = "(radius * cos_theta - half_thickness * sin_theta)"
 _CONTACT_X, _CONTACT_Y = f"(x + {_ARM} * sin(psi))", f"(y - {_ARM} * cos(psi))"
+_ALONG = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
 
 
-@dataclass(frozen=True)
-class Family:
-    """Terms that belong together."""
+# smallest and largest value of each number of a shape, and a sensible step
+SHAPES = {
+    "rate": (0.0, np.inf, 0.1),
+    "edge": (-np.inf, np.inf, 1e-4),
+    "softness": (5e-4, 0.1, 1e-4),
+    "instant": (-np.inf, np.inf, 1e-3),
+    "lasting": (5e-4, 0.1, 1e-4),
+    "angle": (-np.inf, np.inf, 0.01),
+    "direction": (-np.inf, np.inf, 0.01),
+    "width": (0.04, 2.0, 0.01),
+    "length": (1e-3, 0.05, 1e-4),
+    "x0": (-np.inf, np.inf, 1e-4),
+    "y0": (-np.inf, np.inf, 1e-4),
+}
+# where the contact is, angles tell
+_OF_PLACE = ("place", "part of the table", "ridge", "step", "hill", "drag on a part")
+_LOCKED = ("psi)", "phi)", "psi +", "psi -", "phi -")
 
-    title: str
-    terms: tuple[Parts, ...]
-    shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces
-    kind: str = "moment"  # families of one kind are variations of one idea
 
-    @property
-    def n_numbers(self) -> int:
-        """Numbers that a fit would move."""
-        return len(self.terms) + len(self.shape)
-
-    def formulas(self) -> tuple[Parts, ...]:
-        """The terms with the shape's numbers in place."""
-        numbers = {k: f"({v!r})" for k, v in self.shape.items()}
-        return tuple({c: f.format(**numbers) for c, f in parts.items()} for parts in self.terms)
+def locked(law: LearnedLaw) -> bool:
+    """Is it locked to an angle of the body or of the table?"""
+    parts = [f for family in law.families if family.kind not in _OF_PLACE for p in family.terms for f in p.items()]
+    return any(c[0] in "Ml" and mark in f for c, f in parts for mark in _LOCKED)
 
 
 def along_x(formula: str = "1.0") -> Parts:
@@ -78,6 +82,26 @@ def along_y(formula: str = "1.0") -> Parts:
     return {"X_n": f"({formula}) * sin(psi)", "X_m": f"({formula}) * cos(psi)"}
 
 
+def _sum(*parts: Parts) -> Parts:
+    """Forces that act together, by one number."""
+    return {c: " + ".join(p[c] for p in parts) for c in parts[0]}
+
+
+def _push(formula: str) -> tuple[Parts, ...]:
+    """A force in any direction."""
+    return along_x(formula), along_y(formula), {"X_z": formula}
+
+
+def _moment(formula: str) -> tuple[Parts, ...]:
+    """A moment about any axis."""
+    return tuple({f"M_{axis}": formula} for axis in MOMENTS)
+
+
+def _of_velocity(factor: str) -> Parts:
+    """A force against the velocity of the centre."""
+    return {c: f"-v_{c[-1]}{factor}" for c in ("X_n", "X_m")}
+
+
 def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[Family]:
     """The library for a motion q (N, 6) of a disc at the instants (N,) [s]."""
     path = _path_of_contact(q, disc)
@@ -85,14 +109,17 @@ def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[F
         for words, formula in SCALARS:
             yield Family(f"a moment M_{axis} by {words}", ({f"M_{axis}": formula},))
         yield from _angular(axis)
-    yield from _places()
-    yield from _magnets()
     for words, formula in SCALARS[:FOR_FORCES]:
-        yield Family(f"a force X_z by {words}", ({"X_z": formula},), kind="lift")
+        for c, kind in (("X_z", "lift"), ("X_n", "force"), ("X_m", "force")):
+            yield Family(f"a force {c} by {words}", ({c: formula},), kind=kind)
+    for title, kind, terms in (*_places(), *_drags(), *_magnets()):
+        yield Family(title, terms, kind=kind)
     yield from _drifts(time)
-    yield from _gates(q, time, path)
+    yield from _below_a_nutation(q)
+    yield from _instants(time)
+    yield from _parts_of_the_table(q, path)
+    yield from _uneven(path)
     yield from _bumps()
-    yield from _uneven(q, path)
     yield from _hums(time, frame_rate)
 
 
@@ -104,56 +131,66 @@ def _path_of_contact(q: Array, disc: Disc) -> Array:
 
 
 def _angular(axis: str) -> Iterator[Family]:
-    for angle in ("psi", "phi", "(psi + phi)"):
-        for n in range(1, HIGHEST_HARMONIC + 1 if angle != "(psi + phi)" else 2):
-            pair = tuple({f"M_{axis}": f"{f}({n}.0 * {angle})"} for f in ("cos", "sin"))
-            title = f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}"
-            yield Family(title, pair, kind="angle")
-            for words, factor in (("sin theta", "sin_theta"), ("1 / sin theta", "1.0 / sin_theta"), ("time", "time")):
-                grown = tuple({c: f"{f} * {factor}" for c, f in parts.items()} for parts in pair)
-                yield Family(f"{title}, times {words}", grown, kind="angle")
+    grown = (("", ""), (", times sin theta", " * sin_theta"), (", times 1 / sin theta", " * 1.0 / sin_theta"))
+    for angle, highest in (("psi", HIGHEST_HARMONIC), ("phi", HIGHEST_HARMONIC), ("(psi + phi)", 1)):
+        for n in range(1, highest + 1):
+            for words, factor in (*grown, (", times time", " * time")):
+                pair = tuple({f"M_{axis}": f"{f}({n}.0 * {angle}){factor}"} for f in ("cos", "sin"))
+                title = f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}{words}"
+                yield Family(title, pair, kind="angle")
 
 
-def _places() -> Iterator[Family]:
-    """Forces by the place and the velocity of the centre. A constant one is a tilt, and moves the point of rest."""
-    towards = {"X_n": f"-{_X}", "X_m": f"-{_Y}"}
-    constant = (along_x(), along_y())
-    yield Family("a force towards a point, in proportion to the distance", (towards, *constant), kind="place")
-    cubic = {c: f"{f} * (x * x + y * y)" for c, f in towards.items()}
-    yield Family("a force towards a point that grows as the distance cubed", (cubic, *constant), kind="place")
-    stiffness = (along_x("-x"), along_y("-y"), {c: f"{along_x('-y')[c]} + {along_y('-x')[c]}" for c in ("X_n", "X_m")})
-    yield Family("a force by a stiffness that differs with the direction", (*stiffness, *constant), kind="place")
-    distance = "sqrt(x * x + y * y + 1e-6)"
-    square = {c: f"{f} * {distance}" for c, f in towards.items()}
-    yield Family("a force towards a point that grows as the distance squared", (square, *constant), kind="place")
-    thread = {c: f"{f} / {distance}" for c, f in towards.items()}
-    yield Family("a force of constant size towards the origin", (thread, *constant), kind="place")
-    yield Family("a drag that grows as the speed squared", ({c: f"-v_{c[-1]} * {_SPEED}" for c in ("X_n", "X_m")},))
-    yield Family("a drag of constant size", ({c: f"-v_{c[-1]} / {_SPEED}" for c in ("X_n", "X_m")},), kind="drag")
-    yield Family("a drag that differs with the direction", (*_by_velocity(),), kind="drag")
-    round_it = (along_x("-y"), along_y("x"))
-    turning_air = {c: f"{round_it[0][c]} + {round_it[1][c]}" for c in ("X_n", "X_m")}
-    drag = {c: f"-v_{c[-1]}" for c in ("X_n", "X_m")}
-    yield Family("a drag in air that turns about a point", (drag, turning_air, *constant), kind="drag")
-    lateral = {"X_n": "-v_m * omega_z", "X_m": "v_n * omega_z"}
-    yield Family("a force across the velocity, by omega_z", (lateral,), kind="drag")
-    across = {"X_n": "-v_m", "X_m": "v_n"}
-    yield Family("a force across the velocity", (across,), kind="drag")
-    for n in ("X_n", "X_m"):
-        for words, formula in SCALARS[:FOR_FORCES]:
-            yield Family(f"a force {n} by {words}", ({n: formula},), kind="force")
-    body = ("cos(psi + phi)", "sin(psi + phi)")
-    turning = tuple(f(g) for f in (along_x, along_y) for g in body)
-    yield Family("a force that turns with the face", turning, kind="force")
+Row = tuple[str, str, tuple[Parts, ...]]  # title, kind, terms
 
 
-def _by_velocity() -> Iterator[Parts]:
-    """Forces by a symmetric matrix times the velocity, in axes of the world."""
+def _places() -> Iterator[Row]:
+    """Forces by the place of the centre. A constant one is a tilt, and moves the point of rest."""
+
+    def towards(factor: str = "") -> Parts:
+        return {"X_n": f"-{_X}{factor}", "X_m": f"-{_Y}{factor}"}
+
+    constant, distance = (along_x(), along_y()), "sqrt(x * x + y * y + 1e-6)"
+    stiffness = (along_x("-x"), along_y("-y"), _sum(along_x("-y"), along_y("-x")))
+    to_a_point = "a force towards a point"
+    yield f"{to_a_point}, in proportion to the distance", "place", (towards(), *constant)
+    yield f"{to_a_point} that grows as the distance cubed", "place", (towards(" * (x * x + y * y)"), *constant)
+    yield f"{to_a_point} that grows as the distance squared", "place", (towards(f" * {distance}"), *constant)
+    yield "a force of constant size towards the origin", "place", (towards(f" / {distance}"), *constant)
+    yield "a force by a stiffness that differs with the direction", "place", (*stiffness, *constant)
+    turning = tuple(along(g) for along in (along_x, along_y) for g in ("cos(psi + phi)", "sin(psi + phi)"))
+    yield "a force that turns with the face", "force", turning
+
+
+def _drags() -> Iterator[Row]:
+    """Forces by the velocity of the centre."""
     v_x, v_y = "(v_n * cos(psi) - v_m * sin(psi))", "(v_n * sin(psi) + v_m * cos(psi))"
-    yield along_x(f"-{v_x}")
-    yield along_y(f"-{v_y}")
-    across = along_x(f"-{v_y}"), along_y(f"-{v_x}")
-    yield {c: f"{across[0][c]} + {across[1][c]}" for c in ("X_n", "X_m")}
+    along = (along_x(f"-{v_x}"), along_y(f"-{v_y}"), _sum(along_x(f"-{v_y}"), along_y(f"-{v_x}")))
+    round_a_point = (_of_velocity(""), _sum(along_x("-y"), along_y("x")), along_x(), along_y())
+    yield "a drag that grows as the speed squared", "moment", (_of_velocity(f" * {_SPEED}"),)
+    yield "a drag of constant size", "drag", (_of_velocity(f" / {_SPEED}"),)
+    yield "a drag that differs with the direction", "drag", along
+    yield "a drag in air that turns about a point", "drag", round_a_point
+    yield "a force across the velocity, by omega_z", "drag", ({"X_n": "-v_m * omega_z", "X_m": "v_n * omega_z"},)
+    yield "a force across the velocity", "drag", ({"X_n": "-v_m", "X_m": "v_n"},)
+
+
+def _magnets() -> Iterator[Row]:
+    """A magnetic moment of the disc in a field of the room: m x B, with m in body axes and B in world axes."""
+    first = ("cos(phi)", "sin(phi) * cos_theta", "sin(phi) * sin_theta")  # body axis 1 along n0, m0, k
+    second = ("-sin(phi)", "cos(phi) * cos_theta", "cos(phi) * sin_theta")
+    third = ("0.0", "-sin_theta", "cos_theta")
+    level = ("cos(psi)", "-sin(psi)", "0.0"), ("sin(psi)", "cos(psi)", "0.0")
+    upright = (("0.0", "0.0", "1.0"),)
+
+    def cross(a: Sequence[str], b: Sequence[str]) -> Parts:
+        pairs = ((1, 2), (2, 0), (0, 1))
+        product = [f"({a[i]}) * ({b[j]}) - ({a[j]}) * ({b[i]})" for i, j in pairs]
+        return {f"M_{axis}": p for axis, p in zip(MOMENTS, product, strict=True)}
+
+    for where, axes in (("in the face", (first, second)), ("along the axis", (third,))):
+        for direction, fields in (("horizontal", level), ("vertical", upright)):
+            terms = tuple(cross(a, b) for a in axes for b in fields)
+            yield f"a magnet {where}, in a {direction} field", "magnet", terms
 
 
 def _drifts(time: Array) -> Iterator[Family]:
@@ -174,77 +211,65 @@ def _drifts(time: Array) -> Iterator[Family]:
             yield Family(f"a moment M_{axis} by the load that changes with time, degree {n}", friction, kind="drift M")
 
 
-def _magnets() -> Iterator[Family]:
-    """A magnetic moment of the disc in a field of the room: m x B, with m in body axes and B in world axes."""
-    first = ("cos(phi)", "sin(phi) * cos_theta", "sin(phi) * sin_theta")  # body axis 1 along n0, m0, k
-    second = ("-sin(phi)", "cos(phi) * cos_theta", "cos(phi) * sin_theta")
-    third = ("0.0", "-sin_theta", "cos_theta")
-    along_i, along_j, along_k = ("cos(psi)", "-sin(psi)", "0.0"), ("sin(psi)", "cos(psi)", "0.0"), ("0.0", "0.0", "1.0")
-
-    def cross(a: Sequence[str], b: Sequence[str]) -> Parts:
-        pairs = ((1, 2), (2, 0), (0, 1))
-        product = [f"({a[i]}) * ({b[j]}) - ({a[j]}) * ({b[i]})" for i, j in pairs]
-        return {f"M_{axis}": p for axis, p in zip(MOMENTS, product, strict=True)}
-
-    in_plane = tuple(cross(a, b) for a in (first, second) for b in (along_i, along_j))
-    yield Family("a magnet in the face, in a horizontal field", in_plane, kind="magnet")
-    yield Family("a magnet in the face, in a vertical field", (cross(first, along_k), cross(second, along_k)),
-                 kind="magnet")  # fmt: skip
-    yield Family("a magnet along the axis, in a horizontal field", (cross(third, along_i), cross(third, along_j)),
-                 kind="magnet")  # fmt: skip
-    yield Family("a magnet along the axis, in a vertical field", (cross(third, along_k),), kind="magnet")
-
-
-def _gates(q: Array, time: Array, path: Array) -> Iterator[Family]:
-    """What begins at a nutation, at an instant or at a place."""
-    s = np.sin(q[:, 4])
-    for share in np.linspace(0.05, 0.95, 13):
-        edge = float(np.quantile(s, share))
+def _below_a_nutation(q: Array) -> Iterator[Family]:
+    # its tails end within some widths: one that falls as a power acts everywhere, and moves the edge
+    step = "1.0 / (1.0 + exp((sin_theta - {edge}) / {softness}))"
+    for edge in np.quantile(np.sin(q[:, 4]), np.linspace(0.05, 0.95, 13)).tolist():
         shape = {"edge": edge, "softness": max(0.03 * edge, 1e-3)}
-        # its tails end within some widths: one that falls as a power acts everywhere, and moves the edge
-        step = "1.0 / (1.0 + exp((sin_theta - {edge}) / {softness}))"
         for axis in MOMENTS:
             for words, law in (("", "1.0"), (" over sin theta", "1.0 / sin_theta")):
                 title = f"a moment M_{axis} by the load{words} that acts below a nutation"
                 yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "below a nutation")
-    span = float(time[-1] - time[0])
-    for share in np.linspace(0.03, 0.97, 32):
-        at = float(time[0] + share * span)
-        after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
-        pulse = "exp(-0.5 * ((time - {instant}) / 0.01) ** 2)"
+
+
+def _instants(time: Array) -> Iterator[Family]:
+    """What begins at an instant, and blows; a blow's numbers are its impulse."""
+    after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
+    blow = "exp(-0.5 * ((time - {instant}) / {lasting}) ** 2) / (2.5066283 * {lasting})"
+    first, span = float(time[0]), float(time[-1] - time[0])
+    for share in np.linspace(0.03, 0.97, 32).tolist():
+        shape = {"instant": first + share * span}
+        yield Family("a force from an instant on", _push(after), shape, "from then on")
         for axis in MOMENTS:
-            yield Family(
-                f"a moment M_{axis} from an instant on", ({f"M_{axis}": after},), {"instant": at}, "from then on"
-            )
-        for words, law, kind in (("from an instant on", after, "from then on"), ("during 20 ms", pulse, "pulse")):
-            push = (along_x(law), along_y(law), {"X_z": law})
-            yield Family(f"a force {words}", push, {"instant": at}, kind)
-        yield Family("a moment during 20 ms", tuple({f"M_{a}": pulse} for a in MOMENTS), {"instant": at}, "pulse")
-    for angle in np.arange(0, 2 * np.pi, np.pi / 6):
-        along = path @ np.array([np.cos(angle), np.sin(angle)])
-        place = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
-        for share in (0.2, 0.4, 0.6, 0.8):
-            edge = float(np.quantile(along, share))
-            step = f"(0.5 + 0.5 * sign({place} - {{edge}}, 1e-3))"
-            shape = {"direction": float(angle), "edge": edge}
-            for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
-                title = f"a moment M_{axis} by the load on a part of the table"
-                yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "part of the table")
+            yield Family(f"a moment M_{axis} from an instant on", ({f"M_{axis}": after},), shape, "from then on")
+    for share in np.linspace(0.03, 0.97, 64).tolist():
+        shape = {"instant": first + share * span, "lasting": 0.008}
+        yield Family("a blow: a force during milliseconds", _push(blow), shape, "blow")
+        yield Family("a blow: a moment during milliseconds", _moment(blow), shape, "blow M")
 
 
-def _uneven(q: Array, path: Array) -> Iterator[Family]:
-    """A table that is not flat: ridges, grooves and steps, hills and dips, and a drag over a part of it, by where.
+def _edges(places: Array, angles: Array, shares: Array) -> Iterator[dict[str, float]]:
+    """Straight edges: directions, and shares of the places (N, 2) that lie before them."""
+    for angle in angles:
+        along = places @ np.array([np.cos(angle), np.sin(angle)])
+        for share in shares:
+            yield {"direction": float(angle), "edge": float(np.quantile(along, share))}
+
+
+def _parts_of_the_table(q: Array, path: Array) -> Iterator[Family]:
+    """What acts beyond a straight edge, of the contact or of the centre."""
+    angles = np.arange(0, 2 * np.pi, np.pi / 6)
+    step = f"(0.5 + 0.5 * sign({_ALONG} - {{edge}}, 1e-3))"
+    for shape in _edges(path, angles, np.array([0.2, 0.4, 0.6, 0.8])):
+        for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
+            title = f"a moment M_{axis} by the load on a part of the table"
+            yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "part of the table")
+    beyond = "(0.5 + 0.5 * sign(x * cos({direction}) + y * sin({direction}) - {edge}, 3e-4))"
+    for shape in _edges(q[:, :2], angles, np.linspace(0.1, 0.9, 9)):
+        yield Family("a drag on a part of the table", (_of_velocity(f" * {beyond}"),), shape, "drag on a part")
+
+
+def _uneven(path: Array) -> Iterator[Family]:
+    """A table that is not flat: ridges, grooves and steps, hills and dips.
 
     The place of touch moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin
     theta, H' its slope along n0. The number is the profile's area or volume, or the step's height: it hardly depends
     on the width.
     """
-    along = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
-    off = f"(({along} - {{edge}}) / {{length}})"
-    ridge = (
-        f"2.0 * radius / sin_theta * cos(psi - {{direction}}) * {off} * exp(-{off} * {off}) / ({{length}} * {{length}})"
-    )
-    step = f"-radius / sin_theta * cos(psi - {{direction}}) * exp(-{off} * {off}) / (1.7724539 * {{length}})"
+    off = f"(({_ALONG} - {{edge}}) / {{length}})"
+    slope = "radius / sin_theta * cos(psi - {direction})"
+    ridge = f"2.0 * {slope} * {off} * exp(-{off} * {off}) / ({{length}} * {{length}})"
+    step = f"-{slope} * exp(-{off} * {off}) / (1.7724539 * {{length}})"
     for direction in np.arange(0, np.pi, np.pi / 12):
         across = path @ np.array([np.cos(direction), np.sin(direction)])
         for edge in np.arange(across.min(), across.max(), 0.004):
@@ -255,51 +280,36 @@ def _uneven(q: Array, path: Array) -> Iterator[Family]:
     from_x, from_y = f"({_CONTACT_X} - {{x0}})", f"({_CONTACT_Y} - {{y0}})"
     away2 = f"({from_x} * {from_x} + {from_y} * {from_y}) / ({{length}} * {{length}})"
     along_n0 = f"({_X} - {{x0}} * cos(psi) - {{y0}} * sin(psi))"
-    hill = (
-        f"2.0 * radius / sin_theta * {along_n0} * exp(-{away2}) / ({{length}} * {{length}} * {{length}} * {{length}})"
-    )
+    over = "({length} * {length} * {length} * {length})"
+    hill = f"2.0 * radius / sin_theta * {along_n0} * exp(-{away2}) / {over}"
     for x0, y0 in np.unique(np.round(path / 0.006), axis=0) * 0.006:
         for length in (0.005, 0.012):
             shape = {"x0": float(x0), "y0": float(y0), "length": length}
             yield Family("a hill or dip of the table", ({"load_m": hill},), shape, "hill")
-    beyond = "(0.5 + 0.5 * sign(x * cos({direction}) + y * sin({direction}) - {edge}, 3e-4))"
-    drag = {c: f"-v_{c[-1]} * {beyond}" for c in ("X_n", "X_m")}
-    for direction in np.arange(0, 2 * np.pi, np.pi / 6):
-        across = q[:, :2] @ np.array([np.cos(direction), np.sin(direction)])
-        for share in np.linspace(0.1, 0.9, 9):
-            shape = {"direction": float(direction), "edge": float(np.quantile(across, share))}
-            yield Family("a drag on a part of the table", (drag,), shape, "drag on a part")
 
 
 def _bumps() -> Iterator[Family]:
     """Dents of the rim, once a turn of the disc, and of the table, once a precession: braking, or up and down again."""
-    for angle, words in (("phi", "a spot of the rim"), ("psi", "a direction of the table")):
+    for angle, where in (("phi", "a spot of the rim"), ("psi", "a direction of the table")):
+        # over its width: what a dent does in all hardly depends on how wide it is
+        bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}})) / {{width}}"
+        slope = f"sin({angle} - {{angle}}) / ({{width}} * {{width}}) * {bell}"
         for width in (0.08, 0.2, 0.5):
             for at in np.arange(0, 2 * np.pi, max(width, 0.15)):
-                # over its width: what a dent does in all hardly depends on how wide it is
-                bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}})) / {{width}}"
-                shape = {"angle": float(at), "width": width}
-                for axis in ("m", "n"):
-                    title = f"a moment M_{axis} by the load when {words} touches"
-                    yield Family(title, ({f"load_{axis}": bell},), shape, f"bump {angle}")
-                slope = f"sin({angle} - {{angle}}) / ({{width}} * {{width}}) * {bell}"
-                yield Family(
-                    f"a moment M_m by the load, up and down, when {words} touches",
-                    ({"load_m": slope},),
-                    shape,
-                    f"bump {angle}",
-                )
+                for axis, words, law in (("m", "", bell), ("n", "", bell), ("m", ", up and down,", slope)):
+                    title = f"a moment M_{axis} by the load{words} when {where} touches"
+                    shape = {"angle": float(at), "width": width}
+                    yield Family(title, ({f"load_{axis}": law},), shape, f"bump {angle}")
 
 
 def _hums(time: Array, frame_rate: float) -> Iterator[Family]:
     """What swings with a frequency of its own: a table that vibrates, a field that alternates."""
-    span = float(time[-1] - time[0])
-    fastest = min(FASTEST_HUM, 0.45 * frame_rate)
-    for f in np.arange(2.0 / span, fastest, 0.6 / span):
-        waves, shape = ("cos({rate} * time)", "sin({rate} * time)"), {"rate": float(2 * np.pi * f)}
+    span, waves = float(time[-1] - time[0]), ("cos({rate} * time)", "sin({rate} * time)")
+    level = tuple(along(w) for along in (along_x, along_y) for w in waves)
+    upright = tuple({"X_z": w} for w in waves)
+    for f in np.arange(2.0 / span, min(FASTEST_HUM, 0.45 * frame_rate), 0.6 / span):
+        shape = {"rate": float(2 * np.pi * f)}
         for axis in MOMENTS:
             yield Family(f"a moment M_{axis} that swings", tuple({f"M_{axis}": w} for w in waves), shape, "hum M")
-        level = tuple(along(w) for along in (along_x, along_y) for w in waves)
-        upright = tuple({"X_z": w} for w in waves)
         yield Family("a vertical force that swings, as of a table that vibrates", upright, shape, "hum Z")
         yield Family("a force that swings, as of a table that vibrates", (*level, *upright), shape, "hum X")

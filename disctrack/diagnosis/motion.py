@@ -16,6 +16,7 @@ _PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "rim": {"rim_oval": ("oval_c", "oval_s"), "rim_lobes": ("lobes_c", "lobes_s")},
 }
 SLIP = "slip.inverse_mu"
+THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 ROUGHEST = 100.0  # coefficient of friction of a disc that is known to slip; without an end to it none does
 STATE_SCALES = {
     "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,

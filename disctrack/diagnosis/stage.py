@@ -13,30 +13,22 @@ from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import energy_balance, errors
 from disctrack.diagnosis.form_misfit import with_form
-from disctrack.diagnosis.learned_law import (
-    ALIKE,
-    UNLIKELY,
-    LearnedLaw,
-    in_two_steps,
-    learn,
-    shortest_to_first_order,
-    with_law,
-    without_idle_terms,
-)
 from disctrack.diagnosis.left_over import LeftOver, left_over
+from disctrack.diagnosis.missing_force import what_is_missing
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
-from disctrack.diagnosis.pages.words import law_text, sentence
+from disctrack.diagnosis.pages.words import sentence
 from disctrack.diagnosis.plan import open_questions, plan, separations
 from disctrack.diagnosis.regimes import regimes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
-from disctrack.discrepancy.noise import inflation, with_memory
+from disctrack.discrepancy.laws import explained_by_law, judged_as
+from disctrack.discrepancy.noise import with_memory
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, length, threshold
 from disctrack.discrepancy.shape import refine_shapes
-from disctrack.discrepancy.significance import price_of_a_number, wald
+from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import System
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
@@ -89,10 +81,12 @@ def diagnose(
     learned, kept, also = _beyond_the_catalogue(system, diagnosis, left)
     parts = None
     if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
-        parts = regimes(system, _judged(diagnosis, system), diagnosis.before, diagnosis.noise)
+        parts = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
         also = (*also, parts.text)
+        if learned is None:
+            also = (*also, what_is_missing(system, diagnosis.after))
     if learned is not None:
-        system = system.knowing(learned.law.effect)
+        system = system.knowing(learned.law)
         reason = (
             f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
         )
@@ -104,7 +98,7 @@ def diagnose(
     assert held_before is not None
     assert held_after is not None
     if learned is not None:
-        remembering = with_memory(_judged(diagnosis, system), learned.fit)
+        remembering = with_memory(judged_as(diagnosis, system), learned.fit)
         left = left_over(system, learned.fit, diagnosis.noise)
         not_noise = left is not None and not left.white
         as_found = (system, remembering, learned.law, diagnosis.noise, not_noise)
@@ -115,7 +109,7 @@ def diagnose(
         learned = replace(learned, fit=formed.fit, course=formed.course)
         also = (*also, *doubted)
     else:
-        diagnosis = replace(diagnosis, after=with_memory(_judged(diagnosis, system), diagnosis.after))
+        diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
     fit_ = learned.fit if learned else diagnosis.after
     before = errors(system, diagnosis.before, held_before)
     after = errors(system, fit_, learned.held_out if learned else held_after)
@@ -126,7 +120,7 @@ def diagnose(
         for f in diagnosis.found
         if f.cannot_be_told_from and separate
     }
-    notes = (*answer.notes, *remarks, *also)
+    notes = tuple(note for note in (*answer.notes, *remarks, *also) if note)
     return DiscDiagnosis(
         system, diagnosis, declared.name, text, before, after, energy, learned, apart, notes=notes, regimes=parts
     )
@@ -160,22 +154,6 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
     return diagnosis
 
 
-def _judged(diagnosis: Diagnosis, system: DiscSystem) -> System:
-    """The system with its noise as the diagnosis found it."""
-    return (diagnosis.judged or system).over(system)
-
-
-@dataclass(frozen=True)
-class _Beside:
-    """A law outside the catalogue with the known effects that stay beside it."""
-
-    law: LearnedLaw
-    system: DiscSystem  # knows the law
-    fit: Fit
-    kept: tuple[Found, ...]  # of the effects found
-    length: float  # chi-square with the price of its numbers, and of having been looked for
-
-
 def _doubtful(left: LeftOver | None, system: DiscSystem) -> tuple[str, ...]:
     """Of what kind an effect may be missing, although chi-square is that of noise.
 
@@ -199,7 +177,7 @@ def _with_another_known(system: DiscSystem, diagnosis: Diagnosis, kinds: Collect
     settings, noise = diagnosis.settings, diagnosis.noise
     if len(diagnosis.found) >= settings.max_effects or diagnosis.held_out_after is None:
         return diagnosis
-    judged, fitted = _judged(diagnosis, system), diagnosis.after
+    judged, fitted = judged_as(diagnosis, system), diagnosis.after
     taken = {q.name for f in diagnosis.found for q in f.candidate.quantities}
     others = [c for c in system.candidates if c.kind in kinds and not (c.sought or c.threshold or taken & set(c.names))]
     rows = training_rows(system, settings.train_fraction)
@@ -218,154 +196,40 @@ def _with_another_known(system: DiscSystem, diagnosis: Diagnosis, kinds: Collect
         held_gain = 2 * (held.log_density - diagnosis.held_out_after.log_density) / noise
         found = (*diagnosis.found, Found(candidate, float(gain), float(held_gain), enough, ()))
         answer = replace(diagnosis, found=found, after=enlarged, held_out_after=held)
-        shorter = _length(system, answer, enlarged, found) < _length(system, best, best.after, best.found)
+        shorter = _length(system, answer) < _length(system, best)
         best = answer if held_gain > 0 and shorter else best
     return best
+
+
+def _length(system: DiscSystem, answer: Diagnosis) -> float:
+    return length(system, answer.settings, answer.noise, answer.after, [f.candidate for f in answer.found])
 
 
 def _beyond_the_catalogue(
     system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
 ) -> tuple[Learned | None, tuple[Found, ...], tuple[str, ...]]:
-    """A law outside the catalogue if that describes the data better, for its length, than the catalogue does.
+    """A law if that makes the shortest explanation, the known effects that stay beside it, and remarks."""
+    noise = diagnosis.noise
+    limit = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
 
-    Beside it the known effects that stay, and remarks on what describes the data as well. A single known effect has to
-    compete where what it leaves of the motion is less like noise than that of one recording in twenty: it may stand in
-    for a law that is not known. So may each of several, or all: the law is looked for in the place of all of them, and
-    beside each.
-    Faults of the measurement stay beside it, unless the law makes them idle: no force displaces a dot on the face.
-    """
-    doubtful = "motion" in _doubtful(left, system)
-    explained = diagnosis.verdict == "found"
-    of_motion, faults = (
-        tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
-    )
-    looked_for = any(f.candidate.sought for f in of_motion)
-    sets: list[tuple[Found, ...]] = [faults]
-    if diagnosis.verdict == "nothing missing":
-        return None, (), ()
-    if diagnosis.held_out_before is None or (explained and not of_motion and not doubtful):
-        return None, (), ()
-    base = diagnosis.before
-    known = _length(system, diagnosis, diagnosis.after, diagnosis.found)
-    if explained and len(of_motion) == 1 and not (doubtful or looked_for):
-        beside = _beside_them(base, faults)
-        if not shortest_to_first_order(system, beside, diagnosis.after, diagnosis.noise) < known:
-            return None, (), ()
-    if explained and (doubtful or len(of_motion) > 1):
-        sets += [(*faults, f) for f in of_motion]
-    elif of_motion and not explained:  # they describe most of it, and the law may be what is left
-        sets.append(diagnosis.found)
-    answers = [_law_beside(system, diagnosis, kept) for kept in sets]
-    best = _with_fewest_claims([a for a in answers if a is not None])
-    if best is None:
-        return None, (), ()
-    plain, law, system, fitted = system, best.law, best.system, best.fit
-    law = replace(law, rivals=_rivals(best, [a for a in answers if a is not best], diagnosis, explained))
-    judged = _judged(diagnosis, system)
-    saved = known - best.length
-    # of two that are as good, what is known; a sum of known effects, or one that was looked for, has no such credit
-    enough = ALIKE if explained and of_motion and len(diagnosis.found) == 1 and not looked_for else 0.0
-    if not (fitted.converged and saved > enough) or _one_alone_does(plain, diagnosis, of_motion, best):
-        return None, (), _also(diagnosis, law, fitted)
-    rows = training_rows(system, diagnosis.settings.train_fraction)
-    held = held_out(judged, fitted.quantities, fitted.values, rows)
-    held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / diagnosis.noise
-    gain = (base.cost - fitted.cost) / diagnosis.noise
-    work = energy_balance(system, fitted.values)[f"by {law.candidate.name}"]
-    power = -work / float(system.time[-1] - system.time[0])
-    alike = [*law.alike, *(_words(a) for a in answers if a is not None and a is not best and _as_good(a, best))]
-    notes = [f"{other} describes what is missing as well" for other in alike]
-    if diagnosis.found and diagnosis.after.reduced_chi_square <= diagnosis.settings.at_noise * diagnosis.noise:
-        known_ones = ", ".join(f.candidate.name for f in diagnosis.found)
-        notes.append(
-            f"known effects together ({known_ones}) leave {diagnosis.after.reduced_chi_square:.4g} of the expected "
-            f"variance where the law leaves {fitted.reduced_chi_square:.4g}: with their prices the law is ahead by "
-            f"{saved:.4g}"
-        )
-    return Learned(law, fitted, held, gain, float(held_gain), power), best.kept, tuple(notes)
+    def is_noise(known: System, fitted: Fit) -> bool:
+        assert isinstance(known, DiscSystem)
+        if fitted.reduced_chi_square > limit:
+            return False
+        remains = left_over(known, fitted, noise)
+        return remains is None or not remains.of_the_motion
 
-
-def _with_fewest_claims(answers: Sequence[_Beside]) -> _Beside | None:
-    """Of the laws that describe the data as well as the shortest, the one beside the fewest known effects.
-
-    An effect is claimed beside a law where without it all laws are longer.
-    """
-    if not answers:
-        return None
-    shortest = min(answers, key=lambda a: (not a.fit.converged, a.length))
-    as_good = [a for a in answers if _as_good(a, shortest)]
-    return min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length), default=shortest)
-
-
-def _as_good(answer: _Beside, best: _Beside) -> bool:
-    return answer.fit.converged and answer.length - best.length < ALIKE
-
-
-def _words(answer: _Beside) -> str:
-    known = ", ".join(f.candidate.name for f in answer.kept)
-    return f"{answer.law.title}, beside {known}," if known else answer.law.title
-
-
-def _one_alone_does(system: DiscSystem, diagnosis: Diagnosis, of_motion: Sequence[Found], best: _Beside) -> bool:
-    """True where a known effect alone describes what the law does, to the price of a number: it is that effect."""
-    if len(diagnosis.found) < 2:
-        return False  # which has competed by itself
-    judged = _judged(diagnosis, system)
-    most = best.fit.cost + diagnosis.noise * price_of_a_number(system.weights)
-    faults = tuple(f for f in best.kept if f.candidate.kind != "motion")
-    others = {q.name for f in diagnosis.found for q in f.candidate.quantities}
-    for found in of_motion:
-        if found in best.kept:
-            continue
-        beside = _beside_them(diagnosis.before, (*faults, found))
-        own = {q.name for q in beside.quantities}
-        start = {name: value for name, value in diagnosis.after.values.items() if name in own or name not in others}
-        alone = fit(judged, beside.quantities, start)
-        if alone.converged and alone.cost <= most:
-            return True
-    return False
-
-
-def _length(system: DiscSystem, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
-    return length(system, diagnosis.settings, diagnosis.noise, fitted, [f.candidate for f in found])
-
-
-def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> _Beside | None:
-    """The law that takes the place of what was found but for `kept`; None if there is none."""
-    explained = diagnosis.verdict == "found"
-    base = _beside_them(diagnosis.before, kept)
-    along = diagnosis.after if diagnosis.found else diagnosis.nearest
-    rival = along.cost / diagnosis.noise if explained and along else np.inf
-    law = learn(system, base, diagnosis.noise, along, rival, competes=bool(diagnosis.found))
-    if law is None:
-        return None
-    known = system.knowing(law.effect)
-    judged = _judged(diagnosis, known)
-    fitted = with_law(judged, base, law)
-    shorter = without_idle_terms(law, fitted)
-    if fitted.converged and shorter is not law:
-        law, known = shorter, system.knowing(shorter.effect)
-        judged = _judged(diagnosis, known)
-        fitted = with_law(judged, base, law)
-    again = list(kept)
-    for found in kept:  # in what the law leaves, is it still an effect?
-        rest = [f for f in again if f is not found]
-        enough = found.threshold * _as_noise_with_memory(judged, fitted, found.candidate.names, diagnosis.noise)
-        held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
-        without = in_two_steps(judged, _beside_them(diagnosis.before, rest), replace(law, values=held))
-        gain = (without.cost - fitted.cost) / diagnosis.noise
-        if without.converged and gain < enough:
-            again, fitted = rest, without
-        else:
-            again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
-    length = _length(system, diagnosis, fitted, again) + law.looked * len(law.families)
-    return _Beside(law, known, fitted, tuple(again), length)
-
-
-def _as_noise_with_memory(system: System, fitted: Fit, names: Sequence[str], noise: float) -> float:
-    """By how much more than white noise what is left, with its memory, lets these numbers gain."""
-    factors = dict(zip(fitted.names, inflation(system, fitted), strict=True))
-    return float(max(1.0, fitted.reduced_chi_square / noise) * max(factors[name] for name in names) ** 2)
+    best, notes = explained_by_law(system, diagnosis, "motion" in _doubtful(left, system), is_noise)
+    if best is None or diagnosis.held_out_before is None:
+        return None, (), notes
+    known, fitted = system.knowing(best.law), best.fit
+    rows = training_rows(known, diagnosis.settings.train_fraction)
+    held = held_out(judged_as(diagnosis, known), fitted.quantities, fitted.values, rows)
+    held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / noise
+    gain = (diagnosis.before.cost - fitted.cost) / noise
+    work = energy_balance(known, fitted.values)[f"by {best.law.candidate.name}"]
+    power = -work / float(known.time[-1] - known.time[0])
+    return Learned(best.law, fitted, held, gain, float(held_gain), power), best.kept, notes
 
 
 def _beside_any_form(
@@ -399,40 +263,6 @@ def _beside_any_form(
 
 def _of_motion(found: Iterable[Found]) -> set[str]:
     return {f.candidate.effect for f in found if f.candidate.kind == "motion"}
-
-
-def _rivals(
-    best: _Beside, others: Sequence[_Beside | None], diagnosis: Diagnosis, explained: bool
-) -> tuple[tuple[LearnedLaw, float], ...]:
-    """Whatever describes the data as well, with its odds: other laws, beside other effects, and known effects alone."""
-
-    def odds(fitted: Fit) -> float:
-        return float(np.exp(-0.5 * max(fitted.cost - best.fit.cost, 0.0) / diagnosis.noise))
-
-    rivals = list(best.law.rivals)
-    for other in others:
-        if other is not None and other.fit.converged:
-            share = odds(other.fit)
-            rivals.append((replace(other.law, values=other.fit.values), share))
-            rivals += [(law, share * its) for law, its in other.law.rivals]
-    if explained:
-        nothing = replace(best.law, families=(), values=diagnosis.after.values)  # beside known effects
-        rivals.append((nothing, odds(diagnosis.after)))
-    return tuple((law, share) for law, share in rivals if share > UNLIKELY)
-
-
-def _beside_them(base: Fit, kept: Sequence[Found]) -> Fit:
-    """The base fit, with the quantities of these effects to be fitted along."""
-    quantities = {q.name: q for q in base.quantities} | {q.name: q for f in kept for q in f.candidate.quantities}
-    return replace(base, quantities=tuple(quantities.values()))
-
-
-def _also(diagnosis: Diagnosis, law: LearnedLaw, fitted: Fit) -> tuple[str, ...]:
-    """A law that describes the data too, though not in fewer numbers than the known effects."""
-    if not fitted.converged or fitted.reduced_chi_square > diagnosis.settings.at_noise * diagnosis.noise:
-        return ()
-    text = law_text(law, fitted)
-    return (f"a single law beside the catalogue describes the data too ({fitted.reduced_chi_square:.4g}): {text}",)
 
 
 def run_diagnose(

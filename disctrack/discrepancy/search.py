@@ -122,6 +122,7 @@ class Diagnosis(Outline):
     nearest: Fit | None = None  # with them
     # sets of effects whose length does not tell them from the answer, the shortest first, and how much longer they are
     explanations: tuple[tuple[tuple[str, ...], float], ...] = ()
+    ranked: tuple[Explanation, ...] = ()  # all that can be believed, the shortest first
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
@@ -553,10 +554,11 @@ class _Search:
             )
         tried = tuple(self._tried(s, found) for s in scores)
         shortest = self.length(after)
-        listed = tuple((tuple(sorted(e.names)), self.length(e) - shortest) for e in self._ranked())
+        ranked = tuple(self._ranked())
+        listed = tuple((tuple(sorted(e.names)), self.length(e) - shortest) for e in ranked)
         return Diagnosis(
             verdict, reason, found, before.fit, after.fit, *held, self.noise, tried, self.settings, partial,
-            explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN),
+            explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN), ranked=ranked,
         )  # fmt: skip
 
     def _tried(self, score: Score, found: tuple[Found, ...]) -> Tried:

@@ -12,9 +12,9 @@ from scipy.stats import chi2
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.errors import frequencies, simulated
-from disctrack.diagnosis.form_misfit import LawCourse
+from disctrack.diagnosis.form_misfit import LawCourse, moment_about_contact
 from disctrack.diagnosis.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
-from disctrack.diagnosis.learned_law import MissingMoment, learned_moment
+from disctrack.diagnosis.missing_force import MissingMoment
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
 from disctrack.report.figures import NO_TITLE, Drawn, dress, panels, plain_powers
@@ -169,7 +169,9 @@ def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment 
     figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
     law = None if of_law is None or not result.diagnosis.found else (of_law.time, of_law.moment)
     if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
-        law = result.system.time, learned_moment(result.system, result.learned.fit, result.learned.law)
+        system, values = result.system, result.learned.fit.values
+        own = {result.learned.law.candidate.effect}
+        law = system.time, moment_about_contact(system, values, simulated(system, values), own)
     for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
         value, sigma = 1e6 * missing.moment[:, i], 1e6 * missing.sigma[:, i]
         axes.fill_between(missing.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)

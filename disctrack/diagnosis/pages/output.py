@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from disctrack.diagnosis.errors import Ahead, Errors
+from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.words import UNFOLLOWED
 from disctrack.diagnosis.plan import Separation
@@ -90,8 +91,7 @@ def _learned(learned: Learned) -> dict[str, Any]:
         "formulas": law.formulas,
         "meaning": law.title,
         "alike": list(law.alike),
-        "share_of_resamples": list(law.share),
-        "phase_locked": law.locked,
+        "phase_locked": locked(law),
         "mean_power_W": learned.power,
         "moment_about_contact": _course(learned.course),
         "parameters": parameters_json(law.candidate.quantities, learned.fit),

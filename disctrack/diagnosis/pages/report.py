@@ -71,8 +71,8 @@ def _effects(result: DiscDiagnosis) -> str:
     if result.learned is not None:
         learned = result.learned
         items.append(
-            f"{law_text(learned.law, learned.fit)}; mean power {1e3 * learned.power:.3g} mW, chosen in "
-            f"{100 * min(learned.law.share):.0f} % of the resamples; chi-square falls by {learned.gain:.5g}."
+            f"{law_text(learned.law, learned.fit)}; mean power {1e3 * learned.power:.3g} mW; "
+            f"chi-square falls by {learned.gain:.5g}."
         )
     return bullets(items)
 

@@ -1,10 +1,11 @@
 """The diagnosis of a disc in plain words."""
 
 from disctrack.diagnosis.errors import Errors
-from disctrack.diagnosis.learned_law import LearnedLaw
+from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.left_over import LEVEL, LeftOver
 from disctrack.diagnosis.systematic import Systematic
 from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.laws import LearnedLaw
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.words import effect_text
 
@@ -17,7 +18,7 @@ def law_text(law: LearnedLaw, fit: Fit) -> str:
         f"{q.part} = {fit.values[q.name]:.4g} +- {fit.sigma(q.name):.2g}" for q in law.candidate.quantities
     )
     formulas = "; ".join(f"{component} = {formula}" for component, formula in law.formulas.items())
-    return f"{law.title}: {formulas} with {numbers} (SI)" + (", locked to the disc's angles" if law.locked else "")
+    return f"{law.title}: {formulas} with {numbers} (SI)" + (", locked to the disc's angles" if locked(law) else "")
 
 
 def systematic_text(systematic: Systematic) -> str:

@@ -25,6 +25,7 @@ from disctrack.discrepancy.equations.start import guessed, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, compress, fit, prior_rows
 from disctrack.discrepancy.held_out import HeldOut, held_out
+from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.noise import THIRD
 from disctrack.discrepancy.search import CLASS_GAIN, OBVIOUS, Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import price_of_a_number
@@ -298,9 +299,8 @@ class _Competition:
             falls = _falls(own, smooth, fall)
             # the faster driver gives up where columns are alike
             U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
-            power = (U.T @ right) ** 2 / self.noise
-            gain = (SIZES[:, None] * size * singular) ** 2 / self.noise
-            found = np.sum(np.log1p(gain) - power * gain / (1 + gain), axis=1)
+            root = np.sqrt(self.noise)
+            found = evidence(size * singular / root, U.T @ right / root, SIZES)
             if not np.isfinite(found).all():  # columns of nothing: no size can be told from them
                 return np.inf, own
             best = int(np.argmin(found))

@@ -11,9 +11,9 @@ components that a law may set (records.WRENCH): M_n, M_m, M_z [N m]; load_n, loa
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -69,8 +69,6 @@ def _effect(
     unused = set(given) - set(free)
     if unused or not lines:
         raise ModelError(f"{name}: no formula uses {', '.join(sorted(unused)) or 'anything: there is none'}")
-    namespace: dict[str, Any] = {"np": np, "magnitude": magnitude, "sign": sign}
-    exec("def law(p, s, w):\n" + "\n".join(lines), namespace)  # checked node by node in _translate
     members = {
         "__doc__": title or f"Law by formula: {formulas}",
         "__module__": __name__,
@@ -80,9 +78,16 @@ def _effect(
         "parameters": tuple(given.get(n, EffectParameter(n, "SI", 1.0, "number of the formula")) for n in free),
         "passive": passive,
         "formulas": formulas,
-        "law": staticmethod(namespace["law"]),
+        "law": staticmethod(_function("\n".join(lines))),
     }
     return type(f"Formula_{name}", (Effect,), members)
+
+
+@lru_cache(maxsize=64)  # the same formulas with other numbers are compiled once
+def _function(lines: str) -> Callable[..., None]:
+    namespace: dict[str, Any] = {"np": np, "magnitude": magnitude, "sign": sign}
+    exec(f"def law(p, s, w):\n{lines}", namespace)  # checked node by node in _translate
+    return cast("Callable[..., None]", namespace["law"])
 
 
 def _translate(name: str, formula: str) -> tuple[str, list[str]]:

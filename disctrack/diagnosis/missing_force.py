@@ -1,0 +1,281 @@
+"""How the disc answers to small moments and forces: the missing moment over time, and what each law would do.
+
+The motion's first-order response to any moment and force (rolling.responses) turns every law of a library into a
+predicted residual, and the residual into the moment that the model fails to supply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
+from disctrack.diagnosis.law_library import SHAPES, families
+from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
+from disctrack.discrepancy.fit import Fit, prior_rows
+from disctrack.discrepancy.laws import Family, Gain, LearnedLaw, evidence, proposal
+from disctrack.discrepancy.nuisances import is_linear, projection
+from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.rolling import Model, simulate
+from disctrack.rolling.effects import EffectParameter, effect_from_formulas
+from disctrack.rolling.evaluate import kinematics
+from disctrack.rolling.responses import COMPONENTS, Responses, responses
+
+if TYPE_CHECKING:
+    from disctrack.diagnosis.disc_system import DiscSystem
+
+AXES = ("n", "m", "z")
+PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
+MAX_PROBES = 90
+WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
+TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
+INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
+CHUNK = 240  # columns of the library that are held at a time
+
+
+@dataclass(frozen=True)
+class MissingMoment:
+    """Moment that the model fails to supply, smoothed over the distance of the probes."""
+
+    time: Array  # (k,) middles of the probes [s]
+    moment: Array  # (k, 3) M_n, M_m, M_z [N m]
+    sigma: Array  # (k, 3)
+    scale: float  # [N m] that its second differences were taken to have before the data
+
+
+@dataclass(frozen=True)
+class Probed:
+    """Compressed least-squares problem; columns: fitted quantities, probes (axis by axis), residual."""
+
+    data: Array  # rows of the data
+    prior: Array  # and of the priors
+    n_fitted: int
+    time: Array  # (k,) of the probes
+    spacing: float
+
+
+def missing_moment(blocks: Probed, scale: float | None = None) -> MissingMoment:
+    """Moment over time with the size and smoothness that make the data most probable (empirical Bayes).
+
+    scale : [N m] of its second differences, in place of the most probable one
+    """
+    R, k = np.vstack([blocks.data, blocks.prior]), len(blocks.time)
+    right, fitted, probes = R[:, -1], R[:, : blocks.n_fitted], R[:, blocks.n_fitted : -1]
+    Q = np.linalg.qr(_unit(fitted))[0]
+    right, probes = right - Q @ (Q.T @ right), probes - Q @ (Q.T @ probes)
+    smooth = np.eye(k) * 1e-4 + np.diff(np.eye(k), 2, axis=0).T @ np.diff(np.eye(k), 2, axis=0)
+    root = np.linalg.cholesky(np.linalg.inv(np.kron(np.eye(3), smooth)))
+    U, shown, V = np.linalg.svd(probes @ root, full_matrices=False)
+    sizes = np.logspace(-9, -1, 65)  # [N m] prior standard deviation of the second difference
+    a = float(sizes[int(np.argmin(evidence(shown, U.T @ right, sizes)))]) if scale is None else scale
+    known = (a * shown) ** 2 / (1 + (a * shown) ** 2)  # share of each combination that the data tell
+    along = root @ V.T
+    moment = along @ (known * (U.T @ right) / np.where(shown > 0, shown, 1.0))
+    variance = a**2 * (np.sum(root**2, axis=1) - np.sum(along**2 * known, axis=1))
+    factor = WIDTH * np.sqrt(2 * np.pi)  # neighbouring probes add up to this
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    return MissingMoment(blocks.time, factor * moment.reshape(3, k).T, factor * sigma.reshape(3, k).T, a)
+
+
+def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
+    """The missing moment in words, and the angle or rate that it goes with; empty where the disc slips."""
+    blocks, scan = probe(system, fit_), scanned(system, fit_)
+    if blocks is None or scan is None:
+        return ""
+    missing = missing_moment(blocks)
+    rms, largest = np.sqrt(np.mean(missing.moment**2, axis=0)), int(np.argmax(np.sum(missing.moment**2, axis=1)))
+    gains = scan.gains(family for family in scan.library() if not family.shape and family.n_numbers <= 2)
+    best = max(gains, key=lambda g: g.gain)
+    text = (
+        f"what the model lacks is a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or "
+        f"a force that does the same; it is largest at {missing.time[largest]:.3f} s"
+    )
+    share = best.gain / scan.chi_square
+    return f"{text}; {100 * share:.0f} % of it would be {best.family.title}" if share > TELLING else text
+
+
+def _unit(columns: Array) -> Array:
+    length = np.linalg.norm(columns, axis=0)
+    return columns / np.where(length > 0, length, 1.0)
+
+
+def responding(system: DiscSystem, fit_: Fit) -> tuple[Responses, NDArray[np.intp]] | None:
+    """Responses along the fitted motion, and which of their instants are the frames'; None where it does not roll."""
+    instants = system.instants(fit_.values)
+    per_frame = int(np.ceil(INSTANTS_PER_SECOND * float(np.median(np.diff(instants)))))
+    n = len(instants)
+    fine = np.interp(np.arange(per_frame * (n - 1) + 1) / per_frame, np.arange(n), instants)
+    found = responses(system.model_with(fit_.values), state_of(fit_.values), fine, THETA_END)
+    return None if found is None else (found, np.arange(n) * per_frame)
+
+
+def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed | None:
+    """Responses of the dots to short moments along n0, m0, k, compressed part by part; None where the disc slips.
+
+    other : values whose prediction takes the place of the data, so that its moment is read in the same way
+    """
+    along = responding(system, fit_)
+    if along is None:
+        return None
+    motion, frames = along
+    span = float(motion.time[-1] - motion.time[0])
+    turns = max(float(np.abs(motion.q[-1, i] - motion.q[0, i])) / (2 * np.pi) for i in (3, 5))
+    k = int(np.clip(np.ceil(PROBES_PER_TURN * turns), 20, MAX_PROBES))
+    middles = motion.time[0] + span * (np.arange(k) + 0.5) / k
+    residual, derivative = system.linearise(fit_.values, fit_.names)
+    right, matrix = prior_rows(fit_.quantities, fit_.values)
+    if other is not None:
+        residual = residual - system.linearise(other, [])[0]
+        right = right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]  # numbers strained before may relax
+    bells = np.exp(-0.5 * ((motion.time[:, None] - middles) / (WIDTH * span / k)) ** 2)
+    courses = np.zeros((len(bells), len(COMPONENTS), len(AXES), k))
+    for i in range(len(AXES)):
+        courses[:, i, i] = bells
+    moved = motion.of(courses.reshape(len(bells), len(COMPONENTS), -1))[frames]
+    by_start = derivative[..., [fit_.names.index(f"state.{name}") for name in STATE_SCALES]]
+    everything = np.concatenate([derivative, by_start @ moved, residual[..., None]], axis=-1)
+    data = triangle(everything.reshape(-1, everything.shape[-1]))
+    prior = np.concatenate([matrix, np.zeros((len(matrix), 3 * k)), right[:, None]], axis=1)
+    return Probed(data, prior, len(fit_.names), middles, span / k)
+
+
+Along = tuple[Responses, NDArray[np.intp]]  # a motion, and which of its instants are the frames'
+
+
+class DiscScan:
+    """Gains of families at one fit. All that is asked of a frame's dots is compressed to the eight numbers of a state.
+
+    A column of the least-squares problem is D g: D (n, w, 8) by the initial state, g (n, 8) the response. Inner
+    products of columns, cleared of what the fitted quantities W absorb, are sums over g' (D' D) g less those of W' D g.
+
+    beside : as of `LawSystem.scan`
+    """
+
+    def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None, along: Along) -> None:
+        self.motion, self._frames = along
+        self._rate, self._disc = float(1.0 / np.median(np.diff(system.time))), system.disc
+        fitted = fit_.quantities if beside is None else tuple(beside)
+        moved = [q for q in fitted if not is_linear(q)]
+        common = projection(system, fitted, fit_.values)
+        values = fit_.values | dict(zip(common.names, common.null.tolist(), strict=True))
+        names = {q.name for q in fitted}
+        replaced = [q for q in fit_.quantities if q.name not in names]
+        residual, derivative = system.linearise(values, [q.name for q in (*moved, *replaced)])
+        residual = residual + derivative[..., len(moved) :] @ np.array([values[q.name] - q.null for q in replaced])
+        derivative = derivative[..., : len(moved)]
+        right, matrix = prior_rows(moved, fit_.values)
+        stacked = common.cleared(np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)]))
+        stacked = np.vstack([stacked, np.column_stack([matrix, right])])
+        Q = np.linalg.qr(_unit(stacked[:, :-1]))[0]
+        left = stacked[:, -1] - Q @ (Q.T @ stacked[:, -1])
+        basis = Q[: residual.size]
+        if common.names:
+            basis = np.column_stack([common.rows, basis])
+        n, w = residual.shape
+        D = derivative[..., [[q.name for q in moved].index(f"state.{name}") for name in STATE_SCALES]]
+        self._normal = np.swapaxes(D, 1, 2) @ D
+        self._absorbed = np.swapaxes(basis.reshape(n, w, -1), 1, 2) @ D
+        self._right = np.einsum("nw,nwk->nk", left[: residual.size].reshape(n, w), D)
+        self.chi_square = float(left @ left)
+        model, m = system.model, self.motion
+        k = kinematics(m.q, m.qdot, system.disc, model.gravity, m.time, model.air_density)
+        space: dict[str, Any] = {name: np.asarray(k[name]) for name in k.dtype.names or ()}
+        space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
+        space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
+        self._space, self._courses = space, dict[str, Array]()
+        # what a law adds to the load changes its own moment in second order
+        followed = simulate(system.model_with(fit_.values), state_of(fit_.values), times=self.motion.time)
+        self._load = followed.contact_force[:, 2]
+
+    def _course(self, formula: str) -> Array:
+        if formula not in self._courses:
+            values = eval(formula, {"__builtins__": {}}, self._space)  # formulas of the library only
+            self._courses[formula] = np.broadcast_to(np.asarray(values, float), self.motion.time.shape)
+        return self._courses[formula]
+
+    def library(self) -> list[Family]:
+        """See `laws.Scan`."""
+        return list(families(self.motion.q, self.motion.time, self._rate, self._disc))
+
+    def gains(self, chosen: Iterable[Family]) -> list[Gain]:
+        """See `laws.Scan`."""
+        found: list[Gain] = []
+        waiting = iter(chosen)
+        while True:
+            chunk, n = list[Family](), 0
+            while n < CHUNK and (more := list(islice(waiting, 1))):
+                chunk += more
+                n += len(more[0].terms)
+            if not chunk:
+                return found
+            found += self._gains(chunk, n)
+
+    def _gains(self, chunk: Sequence[Family], n: int) -> list[Gain]:
+        courses = np.zeros((len(self.motion.time), len(COMPONENTS), n))
+        self._courses.clear()
+        terms = [parts for family in chunk for parts in family.formulas()]
+        for column, parts in enumerate(terms):
+            for component, formula in parts.items():
+                kind, _, axis = component.partition("_")
+                factor = self._load if kind == "load" else 1.0
+                course = factor * self._course(formula)
+                courses[:, COMPONENTS.index(f"M_{axis}" if kind == "load" else component), column] += course
+        g = self.motion.of(courses)[self._frames]
+        seen = self._normal @ g
+        taken = np.tensordot(self._absorbed, g, axes=([0, 2], [0, 1]))
+        right = np.tensordot(self._right, g, axes=([0, 1], [0, 1]))
+        found, first = [], 0
+        for family in chunk:
+            own = slice(first, first + len(family.terms))
+            first = own.stop
+            before = np.einsum("nkp,nkq->pq", g[..., own], seen[..., own])
+            gram = before - taken[:, own].T @ taken[:, own]
+            found.append(proposal(family, gram, np.diag(before), right[own]))
+        return found
+
+
+def scanned(system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
+    """See `LawSystem.scan`; None where the disc slips."""
+    along = responding(system, fit_)
+    return None if along is None else DiscScan(system, fit_, beside, along)
+
+
+def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:
+    """The effect by formula of these families; values (k,): family by family, coefficients and then shapes.
+
+    It is called "learned", or "learned_2" and so on where the model has learned laws already.
+    """
+    names = ("learned", *(f"learned_{i}" for i in range(2, len(model.effects) + 2)))
+    name = next(name for name in names if model.effect(name) is None)
+    formulas, coefficients, shapes = dict[str, str](), list[tuple[str, ...]](), list[tuple[str, ...]]()
+    quantities, parameters = list[Quantity](), list[EffectParameter]()
+    start = iter(np.asarray(values, float).tolist())
+    for i, family in enumerate(chosen):
+        inside = {shape: f"{shape}_{i}" for shape in family.shape}
+        many = len(family.terms) > 1
+        coefficients.append(tuple(f"{name}.c_{i}_{j}" if many else f"{name}.c_{i}" for j in range(len(family.terms))))
+        shapes.append(tuple(f"{name}.{own}" for own in inside.values()))
+        for j, (parts, full) in enumerate(zip(family.terms, coefficients[-1], strict=True)):
+            value, number = next(start), full.partition(".")[2]
+            meaning = f"{family.title}, term {j + 1}"
+            quantities.append(Quantity(full, "SI", 0.01 * abs(value) or 1e-9, meaning=meaning))
+            parameters.append(EffectParameter(number, "SI", value, family.title))
+            for component, formula in parts.items():
+                piece = f"{number} * ({formula.format(**inside)})"
+                formulas[component] = f"{formulas[component]} + {piece}" if component in formulas else piece
+        for shape, own in inside.items():
+            lower, upper, step = SHAPES[shape]
+            value, text = float(np.clip(next(start), lower, upper)), f"{shape} of {family.title}"
+            quantities.append(Quantity(f"{name}.{own}", "SI", step, value, lower, upper, meaning=text))
+            parameters.append(EffectParameter(own, "SI", value, text, value, lower, upper, is_shape=True))
+    title, source = "; ".join(f"{k} = {v}" for k, v in formulas.items()), "regression on the residual of this recording"
+    effect = effect_from_formulas(name, formulas, tuple(parameters), title=title, source=source)
+    begin = tuple(np.asarray(values, float).tolist())
+    candidate = Candidate(name, name, "motion", effect.title, effect.source, tuple(quantities), begin)
+    return LearnedLaw(candidate, effect, tuple(chosen), tuple(coefficients), tuple(shapes))

@@ -1,0 +1,519 @@
+"""Laws that no catalogue names: proposed by what they would gain to first order, and ranked by length as all else is.
+
+A system says how it answers to small forces along a fitted motion, and makes an effect of a law. The law that gains
+most is fitted in full beside its nearest rivals, and the next is looked for in what it leaves, while each pays for its
+numbers and for having been looked for among so many. With the known effects that stay beside it, a law is an
+explanation; the answer is the shortest one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from calibration.kit.arrays import Array
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.noise import inflation
+from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, length
+from disctrack.discrepancy.shape import profiled
+from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wald
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
+
+MAX_TERMS = 3
+REFITTED = 5  # families that are fitted in full in each round ...
+OF_ONE_KIND = 2  # ... of them of one kind
+LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
+MAX_ITERATIONS = 15  # of a law that describes the data; others wander
+COMES_NEAR = 1.5  # chi-square per degree of freedom, from which on a fit that did not arrive is worth another start
+MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
+EXACT = 0.02  # of chi-square: what a first-order gain may err by where the motion is far from the data
+UNLIKELY = 1e-3  # odds below which a law does not count
+NEARLY = 20.0  # chi-square by which a refit may be better than the first order ...
+COARSE = 0.1  # ... and share of what is missing, by which one may be that moves a shape off the library's grid
+TELLS = 10.0  # variances of the noise: what leaves more describes nothing
+WIDTHS = ("width", "softness", "length", "lasting")  # shapes that go with the amount
+INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
+
+Parts = Mapping[str, str]  # component of the force -> formula
+
+
+@dataclass(frozen=True)
+class Family:
+    """Terms that belong together, each with a coefficient of its own."""
+
+    title: str
+    terms: tuple[Parts, ...]
+    shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces, fitted along with the coefficients
+    kind: str = "moment"  # families of one kind are variations of one idea
+
+    @property
+    def n_numbers(self) -> int:
+        """Numbers that a fit would move."""
+        return len(self.terms) + len(self.shape)
+
+    def formulas(self) -> tuple[Parts, ...]:
+        """The terms with the shape's numbers in place."""
+        numbers = {k: f"({v!r})" for k, v in self.shape.items()}
+        return tuple({c: f.format(**numbers) for c, f in parts.items()} for parts in self.terms)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a family gains to first order."""
+
+    family: Family
+    gain: float  # decrease of chi-square
+    values: Array  # coefficients of its terms
+
+
+@dataclass(frozen=True)
+class LearnedLaw:
+    """Families of terms that describe what is missing."""
+
+    candidate: Candidate
+    effect: Any  # what the system has to know to predict with it
+    families: tuple[Family, ...]
+    amounts: tuple[tuple[str, ...], ...] = ()  # names of each family's coefficients ...
+    shapes: tuple[tuple[str, ...], ...] = ()  # ... and of the numbers of its shape
+    values: Values = field(default_factory=dict)  # of everything, where its fit ended
+    alike: tuple[str, ...] = ()  # other laws that describe the data as well
+    rivals: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their likelihood
+    looked: float = 0.0  # chi-square that each family pays for having been looked for among so many
+
+    @property
+    def title(self) -> str:
+        """What the law means, in words."""
+        return "; and ".join(family.title for family in self.families)
+
+    @property
+    def widths(self) -> set[str]:
+        """Numbers of the shapes that go with an amount: along their profiles only are they found."""
+        pairs = zip(self.families, self.shapes, strict=True)
+        return {name for family, names in pairs for key, name in zip(family.shape, names, strict=True) if key in WIDTHS}
+
+    @property
+    def formulas(self) -> dict[str, str]:
+        """Component of the force -> formula."""
+        return dict(self.effect.formulas or {})
+
+
+class Scan(Protocol):
+    """How the data answer to laws along one fitted motion."""
+
+    chi_square: float  # that the fitted quantities leave
+
+    def library(self) -> Sequence[Family]:
+        """The laws that are looked for along this motion."""
+
+    def gains(self, families: Iterable[Family]) -> list[Gain]:
+        """What each would gain."""
+
+
+class LawSystem(System):
+    """A system in which laws can be learned."""
+
+    def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> Scan | None:
+        """Answers to laws along the fitted motion; None where it has no first order.
+
+        beside : quantities to be fitted beside a law, if not those of the fit. What the others do is given back to the
+        residual to first order: so a law is looked for in their place, along a motion that follows the data.
+        """
+        raise NotImplementedError
+
+    def law(self, families: Sequence[Family], values: Array) -> LearnedLaw:
+        """The effect that these make; values (k,): family by family, coefficients and then shapes."""
+        raise NotImplementedError
+
+    def knowing(self, law: LearnedLaw) -> LawSystem:
+        """The same system, in whose values numbers of this law may be named."""
+        raise NotImplementedError
+
+
+IsNoise = Callable[[System, Fit], bool]
+
+
+def evidence(shown: Array, along: Array, sizes: Array) -> Array:
+    """-2 log evidence (s,), but for a constant, of a normal process of these prior sizes (MacKay 1992).
+
+    shown : (k,) singular values of what it adds to the whitened data, for size 1.   along : (k,) the residual there
+    """
+    power = (sizes[:, None] * shown) ** 2
+    return np.asarray(np.sum(np.log1p(power) - along**2 * power / (1 + power), axis=1), float)
+
+
+def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
+    """Gain and values from the normal equations of one family; directions that nothing shows count for nothing.
+
+    before : (k,) squares of its columns as they were before what is fitted was cleared out
+    """
+    size = np.sqrt(np.maximum(before, 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(size, size))
+    seen = eigenvalues > INVISIBLE
+    along = vectors[:, seen].T @ (right / size)
+    values = vectors[:, seen] @ (along / eigenvalues[seen]) / size
+    return Gain(family, float(np.sum(along**2 / eigenvalues[seen])), values)
+
+
+def learn(
+    system: LawSystem, base: Fit, noise: float, along: Fit | None = None, rival: float = np.inf,
+    is_noise: IsNoise | None = None,
+) -> LearnedLaw | None:  # fmt: skip
+    """The law of few terms that describes what is missing; None if none survives, or where there is no first order.
+
+    noise : variance of the residual's noise over that stated
+    along : fit of other effects that follows the data more closely than the base does: the law is looked for along its
+    motion, in the place of what it has beyond the base
+    rival : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
+    only one that may, to first order, come as near to the data
+    is_noise : ends the search for further terms, which else goes on as long as each gains more than its price
+    """
+    price, law, known = price_of_a_number(system.weights), None, system
+    current, shortest = base, base.cost / noise
+    alike, rivals, looked = tuple[str, ...](), tuple[tuple[LearnedLaw, float], ...](), 0.0
+    scan = system.scan(along, base.quantities) if along is not None else None
+    along = along if scan is not None else None
+    scan = scan or system.scan(base)
+    while scan is not None:
+        library = scan.library()
+        looked = 2.0 * float(np.log(len(library)))
+        worth = [g for g in scan.gains(library) if g.gain / noise > price * g.family.n_numbers + looked]
+        begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scan.chi_square)
+        chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, rival)
+        trials = [_refitted(system, base, law, begin, g) for g in chosen]
+        lengths = [t.cost / noise + price * _numbers(one) + looked * len(one.families) for one, t in trials]
+        if not trials or min(lengths) >= shortest:
+            break
+        best = int(np.argmin(lengths))
+        near = [
+            one.title for (one, _), other in zip(trials, lengths, strict=True) if other - lengths[best] < CLASS_GAIN
+        ]
+        alike = tuple(title for title in dict.fromkeys(near) if title != trials[best][0].title)
+        # how short a law is decides which is named; what the recording determines is what all that fit it agree in
+        rivals = tuple(
+            (one, odds)
+            for i, (one, t) in enumerate(trials)
+            if i != best and t.converged and (odds := _odds(t, trials[best][1], noise)) > UNLIKELY
+        )
+        (law, current), shortest, along = trials[best], lengths[best], None
+        known = system.knowing(law)
+        if len(law.families) == MAX_TERMS or np.isfinite(rival) or (is_noise and is_noise(known, current)):
+            break
+        scan = known.scan(current)
+    return (
+        None
+        if law is None
+        else without_idle_terms(system, replace(law, alike=alike, rivals=rivals, looked=looked), current)
+    )
+
+
+def base_alone(base: Fit, along: Fit) -> Fit:
+    """The base fit, to start where the other one ended, without the effects that it has beyond the base."""
+    beyond = {q.name: q.null for q in along.quantities if q.name not in base.names}
+    return replace(base, values=base.values | along.values | beyond)
+
+
+def shortest_to_first_order(system: LawSystem, base: Fit, along: Fit, noise: float) -> float:
+    """Chi-square with all prices of the law without a shape that comes nearest; infinite where there is no first order.
+
+    along : fit of known effects, in the place of which the law stands beside the base's
+    """
+    scan = system.scan(along, base.quantities)
+    if scan is None:
+        return np.inf
+    library, price = scan.library(), price_of_a_number(system.weights)
+    gains = scan.gains(family for family in library if not family.shape)
+    nearest = min((scan.chi_square - g.gain) / noise + price * g.family.n_numbers for g in gains)
+    free = sum(not np.isfinite(q.prior_sigma) for q in base.quantities)
+    return nearest + 2.0 * float(np.log(len(library))) + price * free
+
+
+def _odds(fitted: Fit, best: Fit, noise: float) -> float:
+    return float(np.exp(-0.5 * max(fitted.cost - best.cost, 0.0) / noise))
+
+
+def _numbers(law: LearnedLaw) -> int:
+    return sum(family.n_numbers for family in law.families)
+
+
+def _worth_a_refit(
+    worth: Sequence[Gain], chi_square: float, inexact: float, noise: float, price: float, rival: float
+) -> list[Gain]:
+    """The best ones, not more than some of a kind: to first order many of a kind are alike.
+
+    inexact : chi-square of the motion along which they were looked for
+    rival : as of `learn`
+    """
+    left = {id(g): (chi_square - g.gain) / noise for g in worth}
+    if np.isfinite(rival):
+        beyond = COARSE * max(chi_square / noise - rival, 0.0)
+        worth = [g for g in worth if left[id(g)] < rival + NEARLY + beyond * bool(g.family.shape)]
+
+    def rank(g: Gain) -> tuple[float, float]:
+        return price * g.family.n_numbers + max(left[id(g)], EXACT * inexact / noise), left[id(g)]
+
+    found, kinds = list[Gain](), list[str]()
+    for g in sorted(worth, key=rank):
+        if kinds.count(g.family.kind) < OF_ONE_KIND and len(found) < REFITTED:
+            found.append(g)
+            kinds.append(g.family.kind)
+    if np.isfinite(rival):
+        # what fits as well in more numbers is not named, but counts in what is known of the force
+        others = (g for g in worth if g.family.kind not in kinds)
+        found += sorted(others, key=lambda g: -g.gain)[:LONGER]
+    return found
+
+
+def _refitted(system: LawSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Gain) -> tuple[LearnedLaw, Fit]:
+    """The law enlarged by a family, fitted to the data."""
+    before = law.families if law else ()
+    values = [current.values[n] for n in law.candidate.names] if law else []
+    enlarged = system.law((*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]))
+    start = replace(enlarged, values=current.values)
+    known = system.knowing(enlarged)
+    fitted = with_law(known, base, start)
+    widths = [q for q in enlarged.candidate.quantities if q.name in enlarged.widths]
+    if not fitted.converged and widths:
+        fitted = min(fitted, _one_by_one(known, base, start, widths), key=lambda f: (not f.converged, f.cost))
+    return _arrived(enlarged, fitted), fitted
+
+
+def _arrived(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
+    start = tuple(fitted.values[n] for n in law.candidate.names)
+    return replace(law, candidate=replace(law.candidate, start=start), values=fitted.values)
+
+
+def _start(base: Fit, law: LearnedLaw) -> dict[str, float]:
+    return dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+
+
+def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] = ()) -> Fit:
+    """The base model's fit with the law's numbers fitted along, but for those held."""
+    moved = (q for q in law.candidate.quantities if q.name not in held)
+    return fit(system, (*base.quantities, *moved), _start(base, law), MAX_ITERATIONS, may_crawl=False)
+
+
+def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
+    """The law's fit with its widths found along their profiles: in a short time a blow's width hardly shows."""
+    fitted = with_law(system, base, law, law.widths)
+    for q in widths:
+        fitted = profiled(system, fitted, q, 0.3 * fitted.values[q.name])
+    return fitted
+
+
+def in_two_steps(system: System, base: Fit, law: LearnedLaw) -> Fit:
+    """The law's fit; where that comes near and does not arrive, from where its amounts alone lead.
+
+    Far from the law's motion, edges make kinks on the way to it.
+    """
+    fitted = with_law(system, base, law)
+    if fitted.converged or not fitted.reduced_chi_square < COMES_NEAR:
+        return fitted
+    held = with_law(system, base, law, {name for names in law.shapes for name in names})
+    again = with_law(system, base, _arrived(law, held))
+    return min(fitted, again, key=lambda f: (not f.converged, f.cost))
+
+
+def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:
+    """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same.
+
+    Terms that go together may each be open where their family is not: it is judged as a whole, and so are they.
+    """
+    kept, values = list[Family](), list[float]()
+    for family, amounts, shapes in zip(law.families, law.amounts, law.shapes, strict=True):
+        busy = busy_amounts(fitted, amounts)
+        if busy:
+            title = family.title if 0 in busy else f"{family.title}, without its first term"  # which it is named after
+            kept.append(replace(family, title=title, terms=tuple(family.terms[i] for i in busy)))
+            values += [*busy.values(), *(fitted.values[n] for n in shapes)]
+    if not kept or len(values) == len(law.candidate.quantities):
+        return law
+    shorter = system.law(kept, np.array(values))
+    return replace(shorter, values=fitted.values, alike=law.alike, rivals=law.rivals, looked=law.looked)
+
+
+def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
+    """Those of the amounts that the data need, with their values while the others are zero; none if all are idle.
+
+    One after the other goes, each judged with those before it out: of two that move together one may do for both.
+    """
+    index = [fitted.shared.index(n) for n in names]
+    amounts, covariance = np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(index, index)]
+    if as_sigmas(wald(amounts, covariance), len(names)) <= MIN_SIGMAS:
+        return {}
+    size = np.where(np.diag(covariance) > 0, np.sqrt(np.diag(covariance)), 1.0)
+    precision = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-12, hermitian=True)
+    right, there = precision @ (amounts / size), list(range(len(names)))
+    while True:
+        inverse = np.linalg.pinv(precision[np.ix_(there, there)], rcond=1e-12, hermitian=True)
+        left = inverse @ right[there]
+        sigmas = np.abs(left) / np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+        if len(there) == 1 or sigmas.min() > MIN_SIGMAS:
+            return {i: float(value * size[i]) for i, value in zip(there, left, strict=True)}
+        del there[int(np.argmin(sigmas))]
+
+
+@dataclass(frozen=True)
+class WithLaw:
+    """An explanation with a law: known effects that stay beside it, fitted together."""
+
+    law: LearnedLaw
+    system: LawSystem  # knows the law
+    fit: Fit
+    kept: tuple[Found, ...]
+    length: float  # as of any explanation
+
+    @property
+    def title(self) -> str:
+        """In words."""
+        known = ", ".join(f.candidate.name for f in self.kept)
+        return f"{self.law.title}, beside {known}," if known else self.law.title
+
+    @property
+    def of_motion(self) -> int:
+        """How many known effects of the motion it claims."""
+        return sum(f.candidate.kind == "motion" for f in self.kept)
+
+
+def explained_by_law(
+    system: LawSystem, diagnosis: Diagnosis, doubtful: bool, is_noise: IsNoise
+) -> tuple[WithLaw | None, tuple[str, ...]]:
+    """The explanation with a law if that is the shortest one, and remarks on what describes the data as well.
+
+    A single known effect has to compete where what it leaves is `doubtful`, or where a law comes as near to first
+    order: it may stand in for a law that is not known. So may each of several, or all: the law is looked for in the
+    place of all of them, and beside each. Faults of the measurement stay beside it, unless the law makes them idle: no
+    force displaces a dot on the face.
+    """
+    of_motion, faults = (
+        tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
+    )
+    explained, base = diagnosis.verdict == "found", diagnosis.before
+    if diagnosis.verdict == "nothing missing" or diagnosis.held_out_before is None:
+        return None, ()
+    if explained and not (of_motion or doubtful):
+        return None, ()
+    known = _of_found(system, diagnosis, diagnosis.after, diagnosis.found)
+    looked_for = any(f.candidate.sought for f in of_motion)
+    if explained and len(of_motion) == 1 and not (doubtful or looked_for):
+        beside = base_beside(base, faults)
+        if not shortest_to_first_order(system, beside, diagnosis.after, diagnosis.noise) < known:
+            return None, ()
+    sets: list[tuple[Found, ...]] = [faults]
+    if explained and (doubtful or len(of_motion) > 1):
+        sets += [(*faults, f) for f in of_motion]
+    elif of_motion and not explained:  # they describe most of it, and the law may be what is left
+        sets.append(diagnosis.found)
+    answers = [found for kept in sets if (found := _law_beside(system, diagnosis, kept, is_noise)) is not None]
+    if not answers:
+        return None, ()
+    # of those that describe the data as well as the shortest, the one that claims the fewest known effects
+    shortest = min(answers, key=lambda a: (not a.fit.converged, a.length))
+    as_good = [a for a in answers if a.fit.converged and a.length - shortest.length < CLASS_GAIN] or [shortest]
+    best = min(as_good, key=lambda a: (a.of_motion, a.length))
+    if not best.fit.converged or _known_does(system, diagnosis, known, best.length):
+        at_noise = diagnosis.settings.at_noise * diagnosis.noise
+        if not best.fit.converged or best.fit.reduced_chi_square > at_noise:
+            return None, ()
+        text = f"a single law beside the catalogue describes the data too ({best.fit.reduced_chi_square:.4g})"
+        return None, (f"{text}: {best.law.title}",)
+    if best.fit.reduced_chi_square > TELLS * diagnosis.noise:
+        return None, ()
+    best = replace(best, law=replace(best.law, rivals=_rivals(best, answers, diagnosis)))
+    notes = [
+        f"{other} describes what is missing as well"
+        for other in (*best.law.alike, *(a.title for a in as_good if a is not best))
+    ]
+    after = diagnosis.after.reduced_chi_square
+    if diagnosis.found and after <= diagnosis.settings.at_noise * diagnosis.noise:
+        names = ", ".join(f.candidate.name for f in diagnosis.found)
+        notes.append(
+            f"known effects together ({names}) leave {after:.4g} of the expected variance where the law leaves "
+            f"{best.fit.reduced_chi_square:.4g}: with their prices the law is ahead by {known - best.length:.4g}"
+        )
+    return best, tuple(notes)
+
+
+def _known_does(system: System, diagnosis: Diagnosis, known: float, of_law: float) -> bool:
+    """Is one of the explanations that are made of what was found shorter than the law?
+
+    Of two that are as good, what is known: a single effect of the motion has that credit, and neither has a sum nor
+    one that was looked for.
+    """
+    if diagnosis.verdict != "found":
+        return not of_law < known
+    names = {f.candidate.name for f in diagnosis.found}
+    listed = [(known, [f.candidate for f in diagnosis.found])]
+    listed += [
+        (length(system, diagnosis.settings, diagnosis.noise, e.fit, e.candidates), list(e.candidates))
+        for e in diagnosis.ranked
+        if e.candidates and e.names < names
+    ]
+    for its, candidates in listed:
+        of_motion = [c for c in candidates if c.kind == "motion"]
+        credit = len(of_motion) == 1 and not of_motion[0].sought
+        if its - CLASS_GAIN * credit <= of_law:
+            return True
+    return False
+
+
+def _of_found(system: System, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
+    return length(system, diagnosis.settings, diagnosis.noise, fitted, [f.candidate for f in found])
+
+
+def judged_as(diagnosis: Diagnosis, system: System) -> System:
+    """The system with its noise as the diagnosis found it."""
+    return (diagnosis.judged or system).over(system)
+
+
+def base_beside(base: Fit, kept: Sequence[Found]) -> Fit:
+    """The base fit, with the quantities of these effects to be fitted along."""
+    quantities = {q.name: q for q in base.quantities} | {q.name: q for f in kept for q in f.candidate.quantities}
+    return replace(base, quantities=tuple(quantities.values()))
+
+
+def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...], is_noise: IsNoise) -> WithLaw | None:
+    """The law that takes the place of what was found but for `kept`; None if there is none."""
+    noise, base = diagnosis.noise, base_beside(diagnosis.before, kept)
+    along = diagnosis.after if diagnosis.found else diagnosis.nearest
+    rival = along.cost / noise if diagnosis.verdict == "found" and along else np.inf
+    law = learn(system, base, noise, along, rival, None if diagnosis.found else is_noise)
+    if law is None:
+        return None
+    known = system.knowing(law)
+    fitted = with_law(judged_as(diagnosis, known), base, law)
+    shorter = without_idle_terms(system, law, fitted)
+    if fitted.converged and shorter is not law:
+        law, known = shorter, system.knowing(shorter)
+        fitted = with_law(judged_as(diagnosis, known), base, law)
+    judged, again = judged_as(diagnosis, known), list(kept)
+    for found in kept:  # in what the law leaves, is it still an effect?
+        rest = [f for f in again if f is not found]
+        factors = dict(zip(fitted.names, inflation(judged, fitted), strict=True))
+        most = max(factors[name] for name in found.candidate.names) ** 2
+        enough = found.threshold * max(1.0, fitted.reduced_chi_square / noise) * most
+        held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
+        without = in_two_steps(judged, base_beside(diagnosis.before, rest), replace(law, values=held))
+        gain = (without.cost - fitted.cost) / noise
+        if without.converged and gain < enough:
+            again, fitted = rest, without
+        else:
+            again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
+    of_all = _of_found(system, diagnosis, fitted, again) + law.looked * len(law.families)
+    return WithLaw(law, known, fitted, tuple(again), of_all)
+
+
+def _rivals(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:
+    """Whatever describes the data as well, with its odds: other laws, beside other effects, and known effects alone."""
+    noise, rivals = diagnosis.noise, list(best.law.rivals)
+    for other in answers:
+        if other is not best and other.fit.converged:
+            share = _odds(other.fit, best.fit, noise)
+            rivals.append((replace(other.law, values=other.fit.values), share))
+            rivals += [(law, share * its) for law, its in other.law.rivals]
+    if diagnosis.verdict == "found":
+        nothing = replace(best.law, families=(), values=diagnosis.after.values)  # beside known effects
+        rivals.append((nothing, _odds(diagnosis.after, best.fit, noise)))
+    return tuple((law, share) for law, share in rivals if share > UNLIKELY)
