@@ -26,6 +26,7 @@ from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, expl
 from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
+from disctrack.faults.clock_jump import clock_jumps, without_jumps
 from disctrack.rolling import CATALOGUE, Model, Regime
 from disctrack.trajectory import Trajectory, part
 
@@ -67,8 +68,19 @@ class SlipDiagnosis:
 def diagnose_motion(
     trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings | None = None
 ) -> SlipDiagnosis:
-    """Diagnose the motion, rolling or slipping at its start. Raises AnalysisError."""
-    settings = settings or Settings()
+    """Diagnose the motion, rolling or slipping at its start, with the times it has if pairs were lost.
+
+    Raises AnalysisError.
+    """
+    jumps = clock_jumps(trajectory)
+    answer = _with_these_times(without_jumps(trajectory, jumps), model, faults, settings or Settings())
+    lost = tuple(f"frame {trajectory.frame[jump.row]}: {jump.words}; counted with them" for jump in jumps)
+    return replace(answer, notes=(*lost, *answer.notes))
+
+
+def _with_these_times(
+    trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings
+) -> SlipDiagnosis:
     as_tracked = trajectory
     trajectory, noise = with_noise_of_frames(trajectory)
     stretch = free_stretch(trajectory)
