@@ -17,7 +17,7 @@ A finding names what was seen, what was expected, and the declared numbers that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.propagation import state_of
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
+from disctrack.faults.clock_jump import clock_jumps
 from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
@@ -118,6 +119,7 @@ def contradictions(
     """
     declared = declared or trajectory.disc
     found = [*density(declared), *scale_of_dots(trajectory, declared, square), *unseen_dots(trajectory, declared)]
+    found += lost_pairs(trajectory)
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, declared)
         # on another plane than the declared one neither heights nor the direction of gravity mean anything
@@ -143,6 +145,19 @@ def told(findings: Mapping[str, Any], found: Sequence[Contradiction]) -> dict[st
         "warnings": [*sentences, *findings.get("warnings", [])],
         "doubts": [*doubts, *findings.get("doubts", [])],
     }
+
+
+def lost_pairs(trajectory: Trajectory) -> Iterator[Contradiction]:
+    """Pairs that both cameras lost while the files were numbered on."""
+    for jump in clock_jumps(trajectory):
+        frame = int(trajectory.frame[jump.row])
+        yield Contradiction(
+            "clock",
+            f"frame {frame}: {jump.words}; all later times are wrong",
+            "frames that follow each other at the declared rate",
+            (Suspect("numbers of the files", f"{frame} and on", f"higher by {jump.frames}", 0.0),),
+            spoils=True,
+        )
 
 
 def motion_against_gravity(trajectory: Trajectory) -> tuple[Contradiction, ...]:
