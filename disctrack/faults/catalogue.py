@@ -196,7 +196,7 @@ OF_THE_PAPER = (
     Fault("pattern_offset", "the dots as a whole are off the disc's centre", "gluing of the paper", ("x", "y"), "m",
           1e-6, "body axes", "pattern_offset_mm", ("pattern_offset", slice(2)), 1e3, belongs_to=("disc",),
           seen="the centre circles about another point once a turn of the spin",
-          remedy="declare by how much the sheet can be off", declared="[markers] centre_tolerance_mm"),
+          remedy="centre the sheet, or measure by how much it is off", declared="[markers] centres_mm"),
     Fault("pattern_rotation", "the dots as a whole are turned on the face",
           "gluing; the same as another spin angle", ("angle",), "rad", 1e-5, "about e3", "pattern_turn_deg",
           ("pattern_turn",), _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),

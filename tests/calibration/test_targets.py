@@ -265,8 +265,8 @@ def test_images_of_another_board_are_not_searched_to_the_end(board_drawer, monke
     asked, find = [], search.find_target
     monkeypatch.setattr(search, "find_target", lambda *what: asked.append(what) or find(*what))
     views = located([image] * 16, Board((8, 5), 8e-3), 1)
-    assert len(asked) == search.SAMPLE
-    assert all("10 of 10 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)
+    assert len(asked) == search.VIEWS_TRIED
+    assert all("8 of 8 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)
 
 
 @pytest.mark.parametrize(

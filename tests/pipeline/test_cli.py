@@ -26,7 +26,7 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
     assert main(["run", str(short_recording), "-o", str(results), "--csv"]) == 0
     output, errors = capsys.readouterr()
     files = ("trajectory.h5", "overlay.mp4", "times.json")
-    for word in ("views", "rms", "baseline", "measured", "sigma", "pairs/s", *files):
+    for word in ("views", "stereo misfit", "baseline", "measured", "sigma", "pairs/s", *files):
         assert word in output
     # where stderr is no terminal: no bars, one line for each stage when it has ended
     stages = "".join(line for line in errors.splitlines(True) if "inner loops" not in line)  # if compiled only now
