@@ -392,40 +392,35 @@ class DiscSystem(LawSystem):
 
     def pose_residual(self, values: Values) -> Array:
         """(n, 6) part of the whitened residual that a free pose per frame would take: six numbers of variance 1."""
-        gradient, normal = self._pose_equations(values)
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(normal), gradient[..., None])[..., 0], float)
+        return self.parts_of_residual(values)[0]
 
     def pose_difference(self, values: Values) -> tuple[Array, Array]:
         """Measured minus predicted pose and its standard deviations, both (n, 6), POSE_COMPONENTS; NaN without dots.
 
         The difference that the dots show once everything else in `values` (cameras, pattern) is taken into account.
         """
-        gradient, normal = self._pose_equations(values)
+        r, J, normal = self._pose_equations(values)
         covariance = np.linalg.inv(normal)
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        delta = (covariance @ gradient[..., None])[..., 0]
+        delta = (covariance @ (np.swapaxes(J, 1, 2) @ r[..., None]))[..., 0]
         known = (self.weights >= 6)[:, None]
         return np.where(known, delta, np.nan), np.where(known, sigma, np.nan)
 
     def parts_of_residual(self, values: Values) -> tuple[Array, Array]:
         """The part (n, 6) of the whitened residual that a free pose per frame would take, and the rest (n, 4 m)."""
-        images = self._sight(self._path(values, ()), values).images
-        r = self._residual(images.pixels, values)
-        J = (self._whiten @ images.by_pose).reshape(len(r), -1, 6)
-        normal = np.swapaxes(J, 1, 2) @ J
-        normal[self.weights < 6] = np.eye(6)
-        gradient = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
-        pose = np.linalg.solve(np.linalg.cholesky(normal), gradient[..., None])[..., 0]
-        return pose, r - (J @ np.linalg.solve(normal, gradient[..., None]))[..., 0]
+        r, J, normal = self._pose_equations(values)
+        gradient = np.swapaxes(J, 1, 2) @ r[..., None]
+        pose = np.linalg.solve(np.linalg.cholesky(normal), gradient)[..., 0]
+        return pose, r - (J @ np.linalg.solve(normal, gradient))[..., 0]
 
-    def _pose_equations(self, values: Values) -> tuple[Array, Array]:
-        """Gradient (n, 6) and normal matrix (n, 6, 6) of a free pose per frame, at the predicted poses."""
+    def _pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
+        """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
         images = self._sight(self._path(values, ()), values).images
         r = self._residual(images.pixels, values)
         J = (self._whiten @ images.by_pose).reshape(len(r), -1, 6)
         normal = np.swapaxes(J, 1, 2) @ J
         normal[self.weights < 6] = np.eye(6)
-        return (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0], normal
+        return r, J, normal
 
     def _nuisance_values(self, values: Values) -> Array:
         return np.array([values.get(name, 0.0) for name in self._nuisance_column])

@@ -62,7 +62,7 @@ def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantit
         lower=parameter.lower,
         upper=parameter.upper,
         meaning=parameter.meaning,
-        typical=abs(parameter.nominal),
+        typical=abs(parameter.nominal) or np.inf,  # a place may be anywhere
         belongs_to=effect.belongs_to,
     )
 

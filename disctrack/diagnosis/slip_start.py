@@ -23,7 +23,6 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, explain, threshold
-from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
@@ -121,9 +120,9 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
     if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
         if _contact_lies_elsewhere(rolling, base):
             others = rolling.again(_without_slip(rolling))
-            diagnosis, remarks = refine_shapes(others, explain(others, base.values, settings))
+            diagnosis = explain(others, base.values, settings)
             if diagnosis.verdict == "found":
-                return SlipDiagnosis(others, diagnosis, notes=(*stretch.notes, *remarks))
+                return SlipDiagnosis(others, diagnosis, notes=stretch.notes)
         return _slipping(settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
         slipping = rolling.again(starts_in_slip=True)

@@ -1,6 +1,6 @@
 """The stage: trajectory file in; diagnosis.json, enlarged model and the group `diagnosis` out."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,13 +21,11 @@ from disctrack.diagnosis.pages.words import sentence
 from disctrack.diagnosis.plan import open_questions, plan, separations
 from disctrack.diagnosis.regimes import regimes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.laws import explained_by_law, judged_as
 from disctrack.discrepancy.noise import with_memory
-from disctrack.discrepancy.score import Linearisation, score_all
-from disctrack.discrepancy.search import Diagnosis, Found, Settings, length, threshold
-from disctrack.discrepancy.shape import refine_shapes
+from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import System
 from disctrack.errors import AnalysisError
@@ -38,7 +36,6 @@ from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory, trajectory_in
 from disctrack.trajectory.reuse import refuse_other
 
-TRIED_BESIDE = 3  # effects of the catalogue beside what was found, where what is left is not noise
 DOUBTFUL = 0.05  # probability of what a single known effect leaves, below which laws outside the catalogue compete
 
 
@@ -71,13 +68,8 @@ def diagnose(
     if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
         text = sentence(diagnosis, diagnosis.after, None, None)
         return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
-    diagnosis, remarks = refine_shapes(system, diagnosis)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    kinds = _doubtful(left, system) if diagnosis.verdict == "found" else ()
-    if kinds:
-        diagnosis = _with_another_known(system, diagnosis, kinds)
-        left = left_over(system, diagnosis.after, diagnosis.noise)
     learned, kept, also = _beyond_the_catalogue(system, diagnosis, left)
     parts = None
     if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
@@ -120,7 +112,7 @@ def diagnose(
         for f in diagnosis.found
         if f.cannot_be_told_from and separate
     }
-    notes = tuple(note for note in (*answer.notes, *remarks, *also) if note)
+    notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *also) if note)
     return DiscDiagnosis(
         system, diagnosis, declared.name, text, before, after, energy, learned, apart, notes=notes, regimes=parts
     )
@@ -154,55 +146,15 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
     return diagnosis
 
 
-def _doubtful(left: LeftOver | None, system: DiscSystem) -> tuple[str, ...]:
-    """Of what kind an effect may be missing, although chi-square is that of noise.
+def _doubtful(left: LeftOver | None) -> bool:
+    """May an effect of the motion be missing, although chi-square is that of noise?
 
-    One of the motion, where the poses' part is less like noise than that of one recording in twenty, and the numbers
-    that no pose takes do not show as much of it: what those show is the measurement's, and is in the poses as well. One
-    of the measurement also where those are, unless lenses or dots are seen to err in ways that no effect names.
+    The poses' part is less like noise than that of one recording in twenty, and the numbers that no pose takes do not
+    show as much of it: what those show is the measurement's, and is in the poses as well.
     """
-    if left is None:
-        return ()
-    of_all = left.other_p_value < DOUBTFUL
-    if left.pose_p_value < DOUBTFUL and not (of_all and left.as_in_all):
-        return ("motion", "measurement")
-    return ("measurement",) if of_all and not system.systematic.present else ()
-
-
-def _with_another_known(system: DiscSystem, diagnosis: Diagnosis, kinds: Collection[str]) -> Diagnosis:
-    """With one more effect of these kinds, where chi-square is that of noise and what is left is not.
-
-    A law whose frequency or place was looked for took the place of all others, and none was tried beside it.
-    """
-    settings, noise = diagnosis.settings, diagnosis.noise
-    if len(diagnosis.found) >= settings.max_effects or diagnosis.held_out_after is None:
-        return diagnosis
-    judged, fitted = judged_as(diagnosis, system), diagnosis.after
-    taken = {q.name for f in diagnosis.found for q in f.candidate.quantities}
-    others = [c for c in system.candidates if c.kind in kinds and not (c.sought or c.threshold or taken & set(c.names))]
-    rows = training_rows(system, settings.train_fraction)
-    best = diagnosis
-    for s in score_all(Linearisation(judged, fitted, others), others)[:TRIED_BESIDE]:
-        candidate = s.candidate
-        enough = threshold(system, settings, len(candidate.names))
-        if s.gain / noise < enough:
-            break
-        quantities = {q.name: q for q in (*fitted.quantities, *candidate.quantities)}
-        enlarged = fit(judged, tuple(quantities.values()), fitted.values)
-        gain = (fitted.cost - enlarged.cost) / noise
-        if not (enlarged.converged and gain > enough):
-            continue
-        held = held_out(judged, enlarged.quantities, enlarged.values, rows)
-        held_gain = 2 * (held.log_density - diagnosis.held_out_after.log_density) / noise
-        found = (*diagnosis.found, Found(candidate, float(gain), float(held_gain), enough, ()))
-        answer = replace(diagnosis, found=found, after=enlarged, held_out_after=held)
-        shorter = _length(system, answer) < _length(system, best)
-        best = answer if held_gain > 0 and shorter else best
-    return best
-
-
-def _length(system: DiscSystem, answer: Diagnosis) -> float:
-    return length(system, answer.settings, answer.noise, answer.after, [f.candidate for f in answer.found])
+    if left is None or left.pose_p_value >= DOUBTFUL:
+        return False
+    return not (left.other_p_value < DOUBTFUL and left.as_in_all)
 
 
 def _beyond_the_catalogue(
@@ -219,7 +171,7 @@ def _beyond_the_catalogue(
         remains = left_over(known, fitted, noise)
         return remains is None or not remains.of_the_motion
 
-    best, notes = explained_by_law(system, diagnosis, "motion" in _doubtful(left, system), is_noise)
+    best, notes = explained_by_law(system, diagnosis, _doubtful(left), is_noise)
     if best is None or diagnosis.held_out_before is None:
         return None, (), notes
     known, fitted = system.knowing(best.law), best.fit

@@ -115,80 +115,114 @@ def fit(
     A step that leads where there is no prediction, or uphill, is halved. `converged` is False where that does not help
     or the iterations run out; or where it has to be done again and again to gain next to nothing, unless it may crawl.
     """
-    quantities = tuple(quantities)
-    values = {q.name: q.null for q in quantities} | dict(start)
-    for q in quantities:
-        values[q.name] = q.null if is_linear(q) else float(np.clip(values[q.name], q.lower, q.upper))
-    common = projection(system, quantities, values)
-    own = Own(system, quantities)
-    local = [q for block in own.blocks for q in block.quantities]
-    moved = [q for q in quantities if not (is_linear(q) or q.slot)]
-    names = [q.name for q in moved]
-    asked = [*own.slots, *names]
-    lower, upper = np.array([q.lower for q in moved]), np.array([q.upper for q in moved])
-    residual, derivative = system.linearise(values, asked)
-    n_data = int(np.sum(system.weights))
-    prior, prior_matrix = prior_rows(moved, values)
-    strain = prior_residual([*moved, *local], values)
-    cost = _cost(residual, strain, derivative, common)
+    problem = _Problem(system, quantities, start)
     converged, iteration, crawled = False, 0, 0
-    expected = float("inf")
-    matrix, right = np.zeros((0, len(names))), np.zeros(0)
-    heads: tuple[OwnNumbers, ...] = ()
-    while np.isfinite(cost) and iteration < max_iterations:
+    while np.isfinite(problem.cost) and iteration < max_iterations and not (crawled == CRAWLED and not may_crawl):
         iteration += 1
-        if local:
-            right, matrix, heads = own.reduced(residual, derivative, values)
-        else:
-            right, matrix = compress(residual, derivative, common)
-        right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
-        x = np.array([values[n] for n in names])
-        step = solve_bounded(right, matrix, lower - x, upper - x)
-        expected = float(right @ right - np.sum((right - matrix @ step) ** 2)) + sum(h.gain for h in heads)
-        local_step = own.moved(heads, step)
-        if expected < TOLERANCE * max(1.0, cost / n_data):
+        step = problem.solve()
+        if problem.expected < TOLERANCE * max(1.0, problem.cost / problem.n_data):
             converged = True
             break
+        before = problem.cost
+        halvings = problem.go(step)
+        if halvings is None:
+            # rounding of the prediction: no step lowers chi-square although the next one promises next to nothing
+            converged = bool(problem.expected < max(0.1, 1e-7 * problem.cost))
+            break
+        crawled = crawled + 1 if halvings and before - problem.cost < CRAWLING * before else 0
+    return problem.fit(converged, iteration)
+
+
+class _Problem:
+    """Residual, derivative and priors at some values, and the way to better ones."""
+
+    def __init__(self, system: System, quantities: Sequence[Quantity], start: Values) -> None:
+        self.system, self.quantities = system, tuple(quantities)
+        self.values = {q.name: q.null for q in self.quantities} | dict(start)
+        for q in self.quantities:
+            inside = float(np.clip(self.values[q.name], q.lower, q.upper))
+            self.values[q.name] = q.null if is_linear(q) else inside
+        self.common = projection(system, self.quantities, self.values)
+        self.own = Own(system, self.quantities)
+        self.moved = [q for q in self.quantities if not (is_linear(q) or q.slot)]
+        self.names = [q.name for q in self.moved]
+        self.lower, self.upper = np.array([q.lower for q in self.moved]), np.array([q.upper for q in self.moved])
+        self.residual, self.derivative = system.linearise(self.values, [*self.own.slots, *self.names])
+        self.n_data = int(np.sum(system.weights))
+        self.cost = self._cost(self.values, self.residual, self.derivative)
+        self.expected = float("inf")  # gain of a full step, were the prediction linear
+        self.matrix, self.right = np.zeros((0, len(self.names))), np.zeros(0)
+        self.heads: tuple[OwnNumbers, ...] = ()
+
+    @property
+    def x(self) -> Array:
+        """(k,) of the shared quantities that are stepped."""
+        return np.array([self.values[n] for n in self.names])
+
+    def solve(self) -> Array:
+        """The full step (k,)."""
+        if self.own.blocks:
+            right, matrix, self.heads = self.own.reduced(self.residual, self.derivative, self.values)
+        else:
+            right, matrix = compress(self.residual, self.derivative, self.common)
+        prior, prior_matrix = prior_rows(self.moved, self.values)
+        self.right, self.matrix = right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
+        step = solve_bounded(right, matrix, self.lower - self.x, self.upper - self.x)
+        gain = float(right @ right - np.sum((right - matrix @ step) ** 2))
+        self.expected = gain + sum(h.gain for h in self.heads)
+        return step
+
+    def go(self, step: Array) -> int | None:
+        """Take the step, or a part of it: how often it was halved; None where none lowers chi-square."""
+        x, values, own = self.x, self.values, self.own.moved(self.heads, step)
         for halving in range(_HALVINGS):
             factor = 0.5**halving
-            trial = values | dict(zip(names, np.clip(x + factor * step, lower, upper).tolist(), strict=True))
-            trial |= {name: values[name] + factor * change for name, change in local_step.items()}
-            new_strain = prior_residual([*moved, *local], trial)
-            if halving and not _cost(system.linearise(trial, ())[0], new_strain, NO_DERIVATIVE, common) < cost:
+            inside = np.clip(x + factor * step, self.lower, self.upper)
+            trial = values | dict(zip(self.names, inside.tolist(), strict=True))
+            trial |= {name: values[name] + factor * change for name, change in own.items()}
+            if halving and not self._cost(trial, self.system.linearise(trial, ())[0], NO_DERIVATIVE) < self.cost:
                 continue  # derivatives cost many times more, and a step that failed once may well fail again
-            new_residual, new_derivative = system.linearise(trial, asked)
-            new_cost = _cost(new_residual, new_strain, new_derivative, common)
-            if np.isfinite(new_cost) and new_cost < cost:
-                break
-        else:
-            # rounding of the prediction: no step lowers chi-square although the next one promises next to nothing
-            converged = bool(expected < max(0.1, 1e-7 * cost))
-            break
-        crawled = crawled + 1 if halving and cost - new_cost < CRAWLING * cost else 0
-        values, residual, derivative, strain, cost = trial, new_residual, new_derivative, new_strain, new_cost
-        prior, _ = prior_rows(moved, values)
-        if crawled == CRAWLED and not may_crawl:
-            break
-    covariance = covariance_within(matrix, right, np.array([values[n] for n in names]), lower, upper)
-    chi_square, penalty = float(cost), 0.0
-    if np.isfinite(cost):
-        penalty = float(strain @ strain)
-        chi_square = cost - penalty
-    if np.isfinite(cost) and common.names:
-        flat = residual.reshape(-1, 1)
-        penalty += float(np.sum((common.prior_rows @ (common.rows.T @ flat)) ** 2))
-        chi_square = cost - penalty
-        found = common.null + common.absorbed(flat)[:, 0]
-        values |= dict(zip(common.names, found.tolist(), strict=True))
-        covariance = _joint(covariance, common, derivative.reshape(-1, len(names)))
-        order = [[*names, *common.names].index(q.name) for q in quantities]
-        covariance = covariance[np.ix_(order, order)]
-    elif common.names:
-        covariance = np.zeros((len(quantities), len(quantities)))
-    return Fit(
-        quantities, values, covariance, float(chi_square), penalty, n_data, converged, iteration, expected, heads,
-        own.known(heads),
-    )  # fmt: skip
+            residual, derivative = self.system.linearise(trial, [*self.own.slots, *self.names])
+            cost = self._cost(trial, residual, derivative)
+            if np.isfinite(cost) and cost < self.cost:
+                self.values, self.residual, self.derivative, self.cost = trial, residual, derivative, cost
+                return halving
+        return None
+
+    def _strain(self, values: Values) -> float:
+        local = [q for block in self.own.blocks for q in block.quantities]
+        return float(np.sum(prior_residual([*self.moved, *local], values) ** 2))
+
+    def _cost(self, values: Values, residual: Array, derivative: Array) -> float:
+        """Chi-square with priors, at the best values of the linear quantities; infinite where there is no prediction.
+
+        Nor is there one where it has no derivative.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            cost = float(np.sum(self.common.cleared(residual.reshape(-1, 1)) ** 2) + self._strain(values))
+            usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
+        return cost if usable else np.inf
+
+    def fit(self, converged: bool, iterations: int) -> Fit:
+        """As it stands, with the linear quantities at their best."""
+        common, names, values = self.common, self.names, dict(self.values)
+        covariance = covariance_within(self.matrix, self.right, self.x, self.lower, self.upper)
+        penalty = 0.0
+        if np.isfinite(self.cost):
+            penalty = self._strain(values)
+            if common.names:
+                flat = self.residual.reshape(-1, 1)
+                penalty += float(np.sum((common.prior_rows @ (common.rows.T @ flat)) ** 2))
+                values |= dict(zip(common.names, (common.null + common.absorbed(flat)[:, 0]).tolist(), strict=True))
+                covariance = _joint(covariance, common, self.derivative.reshape(-1, len(names)))
+                order = [[*names, *common.names].index(q.name) for q in self.quantities]
+                covariance = covariance[np.ix_(order, order)]
+        elif common.names:
+            covariance = np.zeros((len(self.quantities), len(self.quantities)))
+        return Fit(
+            self.quantities, values, covariance, float(self.cost - penalty), penalty, self.n_data, converged,
+            iterations, self.expected, self.heads, self.own.known(self.heads),
+        )  # fmt: skip
 
 
 def no_fit(quantities: Sequence[Quantity], values: Values) -> Fit:
@@ -203,14 +237,3 @@ def _joint(covariance: Array, common: Projection, derivative: Array) -> Array:
     across = by_moved @ covariance
     own = common.covariance + across @ by_moved.T
     return np.block([[covariance, across.T], [across, own]])
-
-
-def _cost(residual: Array, prior: Array, derivative: Array, common: Projection) -> float:
-    """Chi-square with priors, at the best values of the linear quantities; infinite where there is no prediction.
-
-    Nor is there one where it has no derivative.
-    """
-    with np.errstate(over="ignore", invalid="ignore"):
-        cost = float(np.sum(common.cleared(residual.reshape(-1, 1)) ** 2) + prior @ prior)
-        usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
-    return cost if usable else np.inf

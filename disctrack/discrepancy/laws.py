@@ -115,6 +115,8 @@ class Scan(Protocol):
 class LawSystem(System):
     """A system in which laws can be learned."""
 
+    frees_shapes = True
+
     def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> Scan | None:
         """Answers to laws along the fitted motion; None where it has no first order.
 

@@ -21,6 +21,7 @@ from disctrack.discrepancy.fit import Fit, fit, no_fit, prior_residual
 from disctrack.discrepancy.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, RowWhitened, common_modes, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all, score_pairs
+from disctrack.discrepancy.shape import with_free_shape, with_shape
 from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
 from disctrack.discrepancy.system import (
     Candidate,
@@ -41,6 +42,8 @@ CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keep
 SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
+WORTH_A_SHAPE = 0.5  # share of what exceeds the noise that a law may leave for its shape to be sought
+FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
@@ -68,8 +71,8 @@ class Explanation:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of its effects."""
-        return frozenset(c.name for c in self.candidates)
+        """Names of its effects, and of what is free of their shapes."""
+        return _names(self.candidates)
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,7 @@ class Diagnosis(Outline):
     explanations: tuple[tuple[tuple[str, ...], float], ...] = ()
     ranked: tuple[Explanation, ...] = ()  # all that can be believed, the shortest first
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
+    remarks: tuple[str, ...] = ()  # on shapes of laws that the data leave open
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
 
@@ -142,14 +146,32 @@ def explain(
     if not (base.converged or _near_enough(system, base)):
         return _refusal(base, settings)
     answer = _Search(system, settings, rows, former).run(base)
-    if settings.noise is not None or answer.verdict == "unexplained":
-        return answer
-    # looked for only here: what a large effect does from frame to frame would pass for scatter
-    modes = common_modes(system, answer.after)
-    if modes is None:
-        return answer
-    judged = whitened(system, modes)
-    return replace(_Search(judged, settings, rows, former).run(base), judged=judged)
+    if settings.noise is None and answer.verdict != "unexplained":
+        # looked for only here: what a large effect does from frame to frame would pass for scatter
+        modes = common_modes(system, answer.after)
+        if modes is not None:
+            judged = whitened(system, modes)
+            answer = replace(_Search(judged, settings, rows, former).run(base), judged=judged)
+    return with_shapes(system, answer) if system.frees_shapes else answer
+
+
+def with_shapes(system: System, diagnosis: Diagnosis) -> Diagnosis:
+    """The diagnosis with the shapes of the laws that were found fitted along, where the data determine them."""
+    system, before = diagnosis.judged or system, diagnosis.after
+    for i, found in enumerate(diagnosis.found):
+        candidate, after = found.candidate, diagnosis.after
+        if not candidate.shape or {q.name for q in candidate.shape} & set(after.names):
+            continue
+        fitted, known, notes = with_shape(system, after, candidate)
+        larger = replace(candidate, quantities=(*candidate.quantities, *known))
+        better = replace(found, candidate=larger, gain=found.gain + (after.cost - fitted.cost) / diagnosis.noise)
+        everything = (*diagnosis.found[:i], better, *diagnosis.found[i + 1 :])
+        diagnosis = replace(diagnosis, found=everything, after=fitted, remarks=(*diagnosis.remarks, *notes))
+    if diagnosis.after is before:
+        return diagnosis
+    rows = training_rows(system, diagnosis.settings.train_fraction)
+    held = held_out(system, diagnosis.after.quantities, diagnosis.after.values, rows)
+    return replace(diagnosis, held_out_after=held)
 
 
 def threshold(system: System, settings: Settings, k: int) -> float:
@@ -161,11 +183,12 @@ def length(system: System, settings: Settings, noise: float, fitted: Fit, picked
     """Of an explanation, in units of -2 log evidence, but for a constant of the system.
 
     Chi-square of data and priors at this noise; Schwarz's price of every number without a prior; for every effect
-    picked from the catalogue, what the best of so many gains by noise beyond that; and how surprising its values are.
+    picked from the catalogue, what the best of so many gains by noise beyond that, and more where its place had to be
+    looked for; and how surprising its values are.
     """
     number = price_of_a_number(system.weights)
     free = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
-    picks = len(picked) * (threshold(system, settings, 1) - number)
+    picks = len(picked) * (threshold(system, settings, 1) - number) + CLASS_GAIN * sum(c.sought for c in picked)
     return fitted.cost / noise + free * number + picks + sum(_surprise(c, fitted) for c in picked)
 
 
@@ -202,12 +225,22 @@ class _Search:
         self.noise = self._noise(base)
         linear, scores = self._scored(nothing)
         by_chance = chance(linear, scores, self.noise) if scores else None
+        best, rivals = self._settled()
+        if self.system.frees_shapes and self._shapes_freed(best):
+            best, rivals = self._settled()
+        if rivals is None:
+            answer = self._answer(nothing, nothing, (), scores, best.candidates)
+            return replace(answer, chance=by_chance, nearest=best.fit)
+        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals, strict=True))
+        return replace(self._answer(nothing, best, found, scores), chance=by_chance)
+
+    def _settled(self) -> tuple[Explanation, list[list[Rival]] | None]:
+        """The explanation that stands, and rivals of each of its effects; no such list where it explains too little."""
         self._explore()
         rivals: list[list[Rival]] = []
         while (best := self._shortest_that_stands()).candidates:
-            if not self._at_noise(best.fit) and not self._worth_naming(nothing, best):
-                answer = self._answer(nothing, nothing, (), scores, best.candidates)
-                return replace(answer, chance=by_chance, nearest=best.fit)
+            if not self._at_noise(best.fit) and not self._worth_naming(self.pool[frozenset()], best):
+                return best, None
             if (smaller := self._without_idle(best)) is not None:
                 self.refused.add(best.names)
                 self.pool.setdefault(smaller.names, smaller)
@@ -217,8 +250,36 @@ class _Search:
             self._explore()
             if self._shortest_that_stands() is best:
                 break
-        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals, strict=True))
-        return replace(self._answer(nothing, best, found, scores), chance=by_chance)
+        return best, rivals
+
+    def _shapes_freed(self, best: Explanation) -> bool:
+        """Do laws with a free shape join the explanations: in the place of all effects, or of a faint one of several?
+
+        At its null an effect whose place has to be looked for has no derivative, so that no score proposes it; beside
+        another effect, a faint one that a flat of the rim makes is an inertia's or a pattern's off centre.
+        """
+        at_noise, nothing, before = self._at_noise(best.fit), self.pool[frozenset()], len(self.pool)
+        if at_noise and len(best.candidates) < 2:
+            return False
+        excess = nothing.fit.chi_square - self.noise * nothing.fit.degrees_of_freedom
+        for c in self.system.candidates:
+            if c.shape:
+                self._with_free_shape(nothing, c, 0.0, nothing.fit.cost - (1.0 - WORTH_A_SHAPE) * excess)
+        faint = [c for c in best.candidates if c.kind == "motion" and at_noise]
+        for rest in (self._refit_without(best, c) for c in faint):
+            gain = rest.fit.cost - best.fit.cost
+            for c in self.system.candidates:
+                if c.sought and c.name not in best.names and gain <= FAINT * self.noise:
+                    self._with_free_shape(rest, c, FIRST_ORDER * max(gain, 0.0), best.fit.cost)
+        return len(self.pool) > before
+
+    def _with_free_shape(self, e: Explanation, candidate: Candidate, least: float, below: float) -> None:
+        """An explanation that leaves noise with one law more, its shape free."""
+        goal = self.settings.at_noise * self.noise * e.fit.degrees_of_freedom + e.fit.penalty
+        answer = with_free_shape(self.system, e.fit, candidate, least, below, goal)
+        if answer is not None and self._at_noise(answer[1]):
+            new = Explanation((*e.candidates, answer[0]), answer[1])
+            self.pool.setdefault(new.names, new)
 
     def _noise(self, fit_: Fit) -> float:
         stated = self.settings.noise
@@ -263,7 +324,7 @@ class _Search:
 
     def _refit(self, e: Explanation, extra: tuple[Candidate, ...]) -> None:
         together = (*e.candidates, *extra)
-        names = frozenset(c.name for c in together)
+        names = _names(together)
         if names in self.pool and not self.rough:
             return
         # beyond thresholds the prediction has kinks and a refit is long: only where no other will do
@@ -284,7 +345,7 @@ class _Search:
 
     def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
         rest = tuple(other for other in e.candidates if other is not c)
-        names = frozenset(other.name for other in rest)
+        names = _names(rest)
         if names not in self.pool:
             fitted = self._fit(rest, _without(e.fit.values, c, rest))
             self.pool[names] = Explanation(rest, fitted, fitted.converged)
@@ -373,7 +434,7 @@ class _Search:
 
     def _fit(self, candidates: Sequence[Candidate], start: Values, patient: bool = False) -> Fit:
         """With these effects.   patient : however long it takes; else a fit that is given up has not converged"""
-        key = frozenset(c.name for c in candidates)
+        key = _names(candidates)
         if key in self.fits and not self._better(start, self.fits[key]):
             return self.fits[key]
         values = dict(start)
@@ -505,8 +566,9 @@ class _Search:
         """Effects that predict nearly the same residual, refitted in place of one; they join the explanations."""
         rest = tuple(c for c in e.candidates if c is not effect)
         reduced = _restricted(e.fit, self._quantities(rest))
-        linear = Linearisation(self.system, reduced, self.candidates)
-        amount = np.array([e.fit.values[q.name] - q.null for q in effect.quantities])
+        linear = Linearisation(self.system, reduced, [*self.candidates, effect])
+        shape = {q.name for q in effect.shape}  # of which no amount is a part of the effect
+        amount = np.array([(e.fit.values[q.name] - q.null) * (q.name not in shape) for q in effect.quantities])
         signal = linear.columns(effect.names) @ amount
         strength = float(np.sum(linear.cleared(signal[:, None]) ** 2)) / self.noise
         others = [c for c in self.candidates if c.name not in e.names]
@@ -517,7 +579,7 @@ class _Search:
         found = []
         for candidate in near:
             together = (*rest, candidate)
-            names = frozenset(c.name for c in together)
+            names = _names(together)
             if names not in self.pool:
                 fitted = self._fit(together, _without(e.fit.values, effect, rest))
                 new = Explanation(together, fitted)
@@ -555,7 +617,7 @@ class _Search:
         tried = tuple(self._tried(s, found) for s in scores)
         shortest = self.length(after)
         ranked = tuple(self._ranked())
-        listed = tuple((tuple(sorted(e.names)), self.length(e) - shortest) for e in ranked)
+        listed = tuple((tuple(sorted(c.name for c in e.candidates)), self.length(e) - shortest) for e in ranked)
         return Diagnosis(
             verdict, reason, found, before.fit, after.fit, *held, self.noise, tried, self.settings, partial,
             explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN), ranked=ranked,
@@ -594,6 +656,11 @@ class _Search:
             return "the free run over held-out data does not improve"
         than_chosen = "less than what was chosen" if found else "too little of what is missing"
         return f"gains {gain:.4g}, {than_chosen}"
+
+
+def _names(candidates: Sequence[Candidate]) -> frozenset[str]:
+    free = {q.name for c in candidates for q in c.shape} & {q.name for c in candidates for q in c.quantities}
+    return frozenset(free | {c.name for c in candidates})
 
 
 def _near_enough(system: System, base: Fit) -> bool:

@@ -87,6 +87,7 @@ class System:
     base: tuple[Quantity, ...]  # that every fit moves: initial conditions, declared laws, nuisances with priors
     candidates: tuple[Candidate, ...]  # effects that the model may lack
     several_minima: bool = False  # may fits of the same quantities end in different minima?
+    frees_shapes: bool = False  # are numbers of laws' shapes tried free where no law as it is written down will do?
     blocks: Sequence[slice] = ()  # rows that may have quantities of their own (`discrepancy.own`)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
@@ -150,7 +151,8 @@ class Wrapped(System):
             system.base,
             system.candidates,
         )
-        self.several_minima, self.blocks = system.several_minima, system.blocks
+        self.several_minima, self.frees_shapes = system.several_minima, system.frees_shapes
+        self.blocks = system.blocks
 
     def over(self, system: System) -> Wrapped:
         """The same view of another system."""

@@ -39,8 +39,8 @@ from disctrack.discrepancy.search import (
     Settings,
     Tried,
     explain,
+    with_shapes,
 )
-from disctrack.discrepancy.shape import refine_shapes
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import Quantity, System
 from disctrack.errors import AnalysisError
@@ -185,8 +185,8 @@ def _asked(
         if law.at_noise:
             notes = [n for n in notes if not n.startswith(ERROR_THAT_LASTS)]
     elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
-        diagnosis, shapes = refine_shapes(judged, diagnosis)
-        notes += list(shapes)
+        diagnosis = with_shapes(judged, diagnosis)
+        notes += diagnosis.remarks
     return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory, law)
 
 
