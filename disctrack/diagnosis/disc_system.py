@@ -31,7 +31,7 @@ from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, TrialGivenUp, Values
+from disctrack.discrepancy.system import Budget, Candidate, Quantity, Values
 from disctrack.faults.catalogue import faults_of, setup_of
 from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
@@ -46,6 +46,7 @@ RTOL = 1e-10  # of the integration: a millionth of the noise
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 TRIAL_SLIP_STEPS = 1_000  # of them in a fit that is one trial among many; where slip is true, a fit takes hundreds
+# slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 MOST_SLIP_STEPS = 17_000  # of the integrator for every frame, 8 us each: longer recordings need more in proportion
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
@@ -59,31 +60,6 @@ class _Path:
     qdot: Array  # (2, n, 6)
     names: tuple[str, ...]
     by_motion: Array  # (n, 6, k) pose components (rotation vector) by `names`
-
-
-class Patience:
-    """Steps of the integrator that slip may still take while an answer is sought; shared by all parts of a system.
-
-    Slip that hardly exceeds friction creeps: its direction follows within v / (3 mu g), and an explicit method has to
-    take as short a step. A count of steps, and not of seconds, so that an answer does not depend on the machine.
-    """
-
-    def __init__(self, steps: int = MAX_SLIP_STEPS, of: Patience | None = None) -> None:
-        """Of : what is taken is taken from this, too; then it is the patience with one trial among many."""
-        self.left: int = steps if of is None else min(steps, of.left)
-        self._of = of
-
-    def take(self, steps: int) -> None:
-        """Count. Raises GivenUp when the last is taken, TrialGivenUp where that is a trial's last only."""
-        if self._of is not None:
-            self._of.take(steps)
-        self.left = max(self.left - steps, 0)
-        if self.left == 0:
-            raise GivenUp if self._of is None else TrialGivenUp
-
-    def without_end(self) -> None:
-        """An answer has been found: what is still asked of it is asked to the end."""
-        self.left = MAX_SLIP_STEPS
 
 
 @dataclass(frozen=True)
@@ -127,7 +103,7 @@ class DiscSystem(LawSystem):
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
-        self.patience = Patience()
+        self.budget = Budget()  # of steps of slip
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
         self.stretch = stretch or free_stretch(trajectory)
@@ -148,6 +124,7 @@ class DiscSystem(LawSystem):
         safe = np.where(self.used[..., None, None], trajectory.markers_covariance_px2[rows], np.eye(2))
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
+        self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
         of_slip = slipping_start_quantities(model) if starts_in_slip else ()
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
@@ -284,8 +261,8 @@ class DiscSystem(LawSystem):
         freed: tuple[Candidate, ...] = (),
         known: Values | None = None,
     ) -> DiscSystem:
-        """Another question to the same recording and model, with the same systematic errors."""
-        return DiscSystem(
+        """Another question to the same recording and model, with the same systematic errors and budget."""
+        system = DiscSystem(
             self.trajectory,
             self.model,
             candidates,
@@ -295,6 +272,8 @@ class DiscSystem(LawSystem):
             freed=freed,
             known=self.known if known is None else known,
         )
+        system.budget = self.budget
+        return system
 
     def first_part(self, duration: float) -> DiscSystem:
         """The same system with the frames of the first `duration` [s] only."""
@@ -309,12 +288,6 @@ class DiscSystem(LawSystem):
         """Parts over which a motion is followed that a fit of the whole would not find."""
         span = float(self.time[-1] - self.time[0])
         return tuple(self.first_part(stretch) for stretch in STRETCHES if stretch < span)
-
-    def hurried(self, share: float = 1.0) -> DiscSystem:
-        """The same system, that gives up with TrialGivenUp after this share of the steps of slip that a trial has."""
-        one = copy(self)
-        one.patience = Patience(int(share * TRIAL_SLIP_STEPS * len(self.time)), self.patience)
-        return one
 
     def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
         """See LawSystem; None where the disc slips."""
@@ -453,9 +426,9 @@ class DiscSystem(LawSystem):
         if self.starts_in_slip and model.effect("slip") is None:  # 1/mu = 0: nothing slips, and no velocity is free
             return _nowhere(len(times))
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
-        left = self.patience.left
+        left = int(min(self.budget.left, MAX_SLIP_STEPS))
         found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit, left)
-        self.patience.take(found.slip_steps)
+        self.budget.take(found.slip_steps)
         axes = euler_rate_axes_world(found.q[:, 3], found.q[:, 4])
         by_motion = found.dq.copy()
         by_motion[:, 3:] = axes @ found.dq[:, 3:]

@@ -16,7 +16,7 @@ from disctrack.diagnosis.motion import candidate_of_fault
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.search import Diagnosis, Found, Tried
+from disctrack.discrepancy.search import Diagnosis, Found, beside
 from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.catalogue import faults_of, setup_of
@@ -188,13 +188,8 @@ def precession_over_steady(system: DiscSystem) -> float:
 
 def with_large(diagnosis: Diagnosis, assumed: Assumed) -> Diagnosis:
     """The diagnosis with the large faults among what was found."""
-    found, tried = [], []
-    for candidate in assumed.candidates:
-        gain = assumed.gain
-        found.append(Found(candidate, gain, gain, 0.0, ()))
-        tried.append(Tried(candidate, gain, gain, gain, "chosen, from the dots about free poses"))
-    verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
-    return replace(diagnosis, verdict=verdict, found=(*found, *diagnosis.found), tried=(*tried, *diagnosis.tried))
+    found = [Found(c, assumed.gain, assumed.gain, 0.0, ()) for c in assumed.candidates]
+    return beside(diagnosis, found, ", from the dots about free poses")
 
 
 def in_words(assumed: Assumed) -> str:

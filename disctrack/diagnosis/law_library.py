@@ -61,15 +61,12 @@ SHAPES = {
     "x0": (-np.inf, np.inf, 1e-4),
     "y0": (-np.inf, np.inf, 1e-4),
 }
-# where the contact is, angles tell
-_OF_PLACE = ("place", "part of the table", "ridge", "step", "hill", "drag on a part")
-_LOCKED = ("psi)", "phi)", "psi +", "psi -", "phi -")
+LOCKED = {"angle", "magnet", "bump phi", "bump psi"}  # kinds of families
 
 
 def locked(law: LearnedLaw) -> bool:
     """Is it locked to an angle of the body or of the table?"""
-    parts = [f for family in law.families if family.kind not in _OF_PLACE for p in family.terms for f in p.items()]
-    return any(c[0] in "Ml" and mark in f for c, f in parts for mark in _LOCKED)
+    return any(family.kind in LOCKED for family in law.families)
 
 
 def along_x(formula: str = "1.0") -> Parts:

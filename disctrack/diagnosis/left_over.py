@@ -13,6 +13,7 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import ljung_box, no_memory, whiteness
 
 LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
+DOUBTFUL = 0.05  # probability of what is left of the poses, below which laws outside the catalogue compete
 MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks
 LIKE = 2.0  # times the excess of the numbers that no pose takes, up to which that of the poses is no motion's
 
@@ -36,6 +37,15 @@ class LeftOver:
     def of_the_motion(self) -> bool:
         """Do the poses hold more than noise, and more than what the measurement is seen to do to all numbers?"""
         return self.pose_p_value < LEVEL and not self.as_in_all
+
+    @property
+    def doubtful(self) -> bool:
+        """May an effect of the motion be missing, although chi-square is that of noise?
+
+        The poses' part is less like noise than that of one recording in twenty, and the numbers that no pose takes do
+        not show as much of it: what those show is the measurement's, and is in the poses as well.
+        """
+        return self.pose_p_value < DOUBTFUL and not (self.other_p_value < DOUBTFUL and self.as_in_all)
 
     @property
     def as_in_all(self) -> bool:

@@ -4,7 +4,7 @@ The fitted model is started anew, filmed by the same cameras with the same noise
 the shared quantities (laws, cameras, dots) is put beside what this recording says; initial states are each one's own.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,30 +72,10 @@ def starts() -> Iterator[Proposal]:
                 yield Proposal(theta_deg, omega3, duration)
 
 
-CHANGES: tuple[dict[str, float], ...] = (
+CHANGES: tuple[Mapping[str, float], ...] = (
     {}, {"mass": 0.35}, {"mass": 2.0}, {"radius": 0.6}, {"radius": 1.6}, {"pressure": 0.1}, {"rate": 2.0},
     {"numbers": 1.5}, {"numbers": 2.0},
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Separation:
-    """How well a recording would tell an effect from its rival, together with this one."""
-
-    rival: str
-    theta_deg: float  # at the start
-    omega3: float  # [rad/s]
-    duration: float  # [s]; shorter than asked for where the disc comes to rest
-    angle: float  # [rad] between the predicted residuals, cleared of what other quantities absorb
-    sigmas: float  # root of the chi-square that the wrong one of the two would leave
-
-    @property
-    def text(self) -> str:
-        """The recording in words."""
-        return (
-            f"start at {self.theta_deg:g} deg with omega_3 = {self.omega3:g} rad/s and film {self.duration:.2g} s: "
-            f"{self.sigmas:.3g} sigmas apart"
-        )
 
 
 @dataclass(frozen=True)
@@ -161,7 +141,7 @@ class Planner:
         self._priors = np.diag(1.0 / np.array(sigmas))
         names = [f"rig.common_{j}" for j in range(n_rig)] + [q.name for q in (*laws, *self.tested)]
         self.column = {name: j for j, name in enumerate(names)}
-        self.candidates = tuple(candidates)
+        self._base = [j for j, name in enumerate(names) if name not in new]
         self.now = self._said(system, fit.values, Proposal()) if said is None else said(names)
 
     def amounts(self, candidate: Candidate) -> Array:
@@ -177,24 +157,18 @@ class Planner:
             return None
         return np.concatenate([self.now, said]), float(planned.time[-1] - planned.time[0])
 
-    def separation(self, rows: Array, effect: Candidate, rival: Candidate) -> tuple[float, float]:
-        """Sigmas by which the rival fails where the effect is true at its fitted size, and the angle between them."""
+    def sigmas(self, rows: Array, effect: Candidate, rival: Candidate) -> float:
+        """Root of the chi-square that the rival leaves where the effect is true at its fitted size."""
         matrix = self._with_priors(rows)
         signal = matrix[:, self._columns(effect)] @ self.amounts(effect)
-        base = [j for n, j in self.column.items() if n not in {q.name for q in self.tested}]
-        alone = cleared(signal, span(matrix[:, base]))
-        beside = cleared(signal, span(matrix[:, [*base, *self._columns(rival)]]))
-        length = float(np.linalg.norm(alone))
-        sigmas = float(np.linalg.norm(beside))
-        return sigmas, float(np.arcsin(min(sigmas / length, 1.0))) if length > 0 else 0.0
+        return float(np.linalg.norm(cleared(signal, span(matrix[:, [*self._base, *self._columns(rival)]]))))
 
     def sigma(self, rows: Array, candidate: Candidate) -> float:
         """Standard deviation of its first number; infinite where nothing is seen of it."""
         matrix = self._with_priors(rows)
         mine, *rest = self._columns(candidate)
-        base = [j for n, j in self.column.items() if n not in {q.name for q in self.tested}]
         column = matrix[:, mine]
-        left = float(np.linalg.norm(cleared(column, span(matrix[:, [*base, *rest]]))))
+        left = float(np.linalg.norm(cleared(column, span(matrix[:, [*self._base, *rest]]))))
         return 1.0 / left if left > SEEN * float(np.linalg.norm(column)) else float("inf")
 
     def _columns(self, candidate: Candidate) -> list[int]:
@@ -318,27 +292,18 @@ def _changed(disc: Disc, proposal: Proposal) -> Disc:
 
 
 def separations(
-    system: DiscSystem, fit: Fit, effect: Candidate, rivals: Sequence[Candidate], noise: float = 1.0
-) -> dict[str, Separation | None]:
+    system: DiscSystem, fit: Fit, effect: Candidate, rivals: Sequence[Candidate]
+) -> dict[str, Proposed | None]:
     """For each rival, of the starts looked at, the one that would tell it best from the effect at its fitted size.
 
     None where no such recording can be simulated.
     """
-    best: dict[str, Separation | None] = {r.name: None for r in rivals}
-    planner = Planner(system, fit, [effect, *rivals], noise)
-    for proposal in starts():
-        made = planner.with_(proposal)
-        if made is None or proposal.theta_deg is None or proposal.omega3 is None:
-            continue
-        rows, duration = made
-        for rival in rivals:
-            sigmas, between = planner.separation(rows, effect, rival)
-            previous = best[rival.name]
-            if previous is None or sigmas > previous.sigmas:
-                best[rival.name] = Separation(
-                    rival.name, proposal.theta_deg, proposal.omega3, duration, between, sigmas
-                )
-    return best
+    found = plan(system, fit, [Question(effect, r) for r in rivals], changes=())
+    best = {r.name: found.best(i) for i, r in enumerate(rivals)}
+    return {
+        name: None if b is None else replace(b, answers=b.answers[i : i + 1])
+        for i, (name, b) in enumerate(best.items())
+    }
 
 
 def plan(
@@ -347,6 +312,7 @@ def plan(
     questions: Sequence[Question],
     noise: float = 1.0,
     said: Callable[[Sequence[str]], Array] | None = None,
+    changes: Sequence[Mapping[str, float]] = CHANGES,
 ) -> Plan:
     """What each of many recordings would bring to the questions: starts first, then changes of the best of them.
 
@@ -357,26 +323,21 @@ def plan(
 
     def answers(rows: Array) -> tuple[float, ...]:
         return tuple(
-            planner.sigma(rows, q.effect) if q.rival is None else planner.separation(rows, q.effect, q.rival)[0]
+            planner.sigma(rows, q.effect) if q.rival is None else planner.sigmas(rows, q.effect, q.rival)
             for q in questions
         )
 
     now = answers(planner.now)
-    rows = []
-    for proposal in starts():
-        made = planner.with_(proposal)
-        if made is not None:
-            rows.append(Proposed(proposal, made[1], answers(made[0])))
-    first = Plan(tuple(questions), now, tuple(rows))
+
+    def made(proposals: Iterable[Proposal]) -> Iterator[Proposed]:
+        for proposal in proposals:
+            if (said := planner.with_(proposal)) is not None:
+                yield Proposed(proposal, said[1], answers(said[0]))
+
+    first = Plan(tuple(questions), now, tuple(made(starts())))
     bases = {Proposal(): None} | {b.proposal: None for i in range(len(questions)) if (b := first.best(i)) is not None}
-    for base in list(bases)[:3]:
-        for change in CHANGES:
-            if not change and base != Proposal():
-                continue
-            made = planner.with_(replace(base, **change))
-            if made is not None:
-                rows.append(Proposed(replace(base, **change), made[1], answers(made[0])))
-    return Plan(tuple(questions), now, tuple(rows))
+    changed = (replace(base, **c) for base in list(bases)[:3] for c in changes if c or base == Proposal())
+    return replace(first, rows=(*first.rows, *made(changed)))
 
 
 def open_questions(diagnosis: Diagnosis, system: DiscSystem, most: int = 6) -> tuple[Question, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
-from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem, Patience
+from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.large_faults import Assumed, find_clock, find_large, in_words, with_large
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
@@ -22,8 +22,8 @@ from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
-from disctrack.discrepancy.search import Diagnosis, Found, Settings, Tried, explain, threshold
-from disctrack.discrepancy.system import Candidate, GivenUp
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, beside, explain, threshold
+from disctrack.discrepancy.system import Budget, Candidate, GivenUp, TrialGivenUp
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
 from disctrack.rolling import CATALOGUE, Model, Regime
@@ -97,12 +97,13 @@ def _with_these_times(
         assumed = find_clock(rolling)
         if assumed is not None:
             return _with_large(assumed, settings)
-    rolling.patience = Patience(MOST_SLIP_STEPS * len(rolling.time))
+    rolling.budget = Budget(MOST_SLIP_STEPS * len(rolling.time))
     try:
         answer = _rolling_or_slipping(settings, rolling, base)
-        answer.system.patience.without_end()
+        rolling.budget.without_end()
         return answer
     except GivenUp:
+        rolling.budget.without_end()
         # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
         rolling = rolling.again(_without_slip(rolling))
         notes = (*stretch.notes, CREEPS)
@@ -126,7 +127,6 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
         return _slipping(settings, rolling, base, onset)
     if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
         slipping = rolling.again(starts_in_slip=True)
-        slipping.patience = rolling.patience
         alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
         if _at_noise(slipping, alone, settings):
             return _slipping(settings, rolling, base, onset)
@@ -140,12 +140,12 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     numbers that do away with all of an EXCESS are not those of another effect.
     """
     slipping = rolling.again(starts_in_slip=True)
-    soon = slipping.hurried()
     try:
-        alone = fit(soon, soon.base, soon.start(), MAX_ITERATIONS)
-        if not _at_noise(soon, alone, settings):
-            return False
-    except GivenUp:
+        with slipping.budget.trial(slipping.trial_steps):
+            alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
+    except TrialGivenUp:
+        return False
+    if not _at_noise(slipping, alone, settings):
         return False
     motion = simulated(slipping, alone.values)
     return bool((motion.regime[:LASTS] == Regime.SLIPPING).all())
@@ -195,11 +195,11 @@ def _onset(trajectory: Trajectory, stretch: Stretch) -> RollingOnset | None:
 def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> SlipDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     system = rolling.again(starts_in_slip=True)
-    system.patience = rolling.patience
     crept: tuple[str, ...] = ()
     try:
         diagnosis = explain(system, system.start(), settings)
     except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
+        rolling.budget.without_end()
         system = rolling.again((), starts_in_slip=True)
         diagnosis, crept = explain(system, system.start(), settings), (CREEPS_BESIDE,)
     if not crept and diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
@@ -230,7 +230,6 @@ def _after_slip(
         system = rolling.again(_without_slip(rolling), stretch=stretch)
     except AnalysisError:
         return None
-    system.patience = rolling.patience
     diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained":
         return None
@@ -262,24 +261,10 @@ def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:
 
 def with_slip(system: DiscSystem, diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
     """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
-    system_gain = (slip.without.cost - diagnosis.before.cost) / diagnosis.noise
+    gain = (slip.without.cost - diagnosis.before.cost) / diagnosis.noise
     held = diagnosis.held_out_before
     held_gain = 2 * (held.log_density - slip.held_out.log_density) / diagnosis.noise if held else np.nan
-    found = Found(
-        slip.candidate,
-        float(system_gain),
-        float(held_gain),
-        threshold(system, diagnosis.settings, len(slip.candidate.names)),
-        (),
-    )
-    tried = Tried(slip.candidate, float(system_gain), float(system_gain), float(held_gain), "chosen")
-    verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
-    return replace(
-        diagnosis,
-        verdict=verdict,
-        reason=f"with slip at the start, {diagnosis.reason}",
-        found=(found, *diagnosis.found),
-        before=slip.without,
-        held_out_before=slip.held_out,
-        tried=(tried, *diagnosis.tried),
-    )
+    enough = threshold(system, diagnosis.settings, len(slip.candidate.names))
+    found = Found(slip.candidate, float(gain), float(held_gain), enough, ())
+    reason = f"with slip at the start, {diagnosis.reason}"
+    return replace(beside(diagnosis, [found]), reason=reason, before=slip.without, held_out_before=slip.held_out)

@@ -23,7 +23,7 @@ from disctrack.diagnosis.regimes import regimes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
-from disctrack.discrepancy.laws import explained_by_law, judged_as
+from disctrack.discrepancy.laws import WithLaw, explained_by_law, judged_as
 from disctrack.discrepancy.noise import with_memory
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
@@ -35,8 +35,6 @@ from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory, trajectory_in
 from disctrack.trajectory.reuse import refuse_other
-
-DOUBTFUL = 0.05  # probability of what a single known effect leaves, below which laws outside the catalogue compete
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,41 +68,23 @@ def diagnose(
         return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    learned, kept, also = _beyond_the_catalogue(system, diagnosis, left)
+    found, notes = _beyond_the_catalogue(system, diagnosis, left)
     parts = None
     if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
         parts = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
-        also = (*also, parts.text)
-        if learned is None:
-            also = (*also, what_is_missing(system, diagnosis.after))
-    if learned is not None:
-        system = system.knowing(learned.law)
-        reason = (
-            f"{diagnosis.reason}; the law {learned.law.candidate.title} leaves {learned.fit.reduced_chi_square:.3g}"
-        )
-        enlarged = learned.fit if kept else diagnosis.after
-        diagnosis = replace(diagnosis, verdict="unexplained", found=kept, after=enlarged, reason=reason)
-    if answer.slip is not None:
-        diagnosis = with_slip(system, diagnosis, answer.slip)
-    held_before, held_after = diagnosis.held_out_before, diagnosis.held_out_after
-    assert held_before is not None
-    assert held_after is not None
-    if learned is not None:
-        remembering = with_memory(judged_as(diagnosis, system), learned.fit)
-        left = left_over(system, learned.fit, diagnosis.noise)
-        not_noise = left is not None and not left.white
-        as_found = (system, remembering, learned.law, diagnosis.noise, not_noise)
-        formed = with_form(*as_found, _of_motion(kept))
-        diagnosis, doubted = _beside_any_form(diagnosis, kept, formed.of_another, learned.law.looked)
-        if _of_motion(diagnosis.found):  # what holds beside any law does not stand in with this one
-            formed = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
-        learned = replace(learned, fit=formed.fit, course=formed.course)
-        also = (*also, *doubted)
+        notes = (*notes, parts.text) if found else (*notes, parts.text, what_is_missing(system, diagnosis.after))
+    learned = None
+    if found is not None:
+        system, learned, diagnosis, doubted = _with_law(system, diagnosis, found)
+        left, notes = left_over(system, learned.fit, diagnosis.noise), (*notes, *doubted)
     else:
         diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
-    fit_ = learned.fit if learned else diagnosis.after
+    if answer.slip is not None:
+        diagnosis = with_slip(system, diagnosis, answer.slip)
+    fit_, held_before = learned.fit if learned else diagnosis.after, diagnosis.held_out_before
+    assert held_before is not None
     before = errors(system, diagnosis.before, held_before)
-    after = errors(system, fit_, learned.held_out if learned else held_after)
+    after = errors(system, fit_, learned.held_out if learned else diagnosis.held_out_after or held_before)
     text = sentence(diagnosis, fit_, after, learned.law if learned else None, system.systematic, left)
     energy = energy_balance(system, fit_.values)
     apart = {
@@ -112,7 +92,7 @@ def diagnose(
         for f in diagnosis.found
         if f.cannot_be_told_from and separate
     }
-    notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *also) if note)
+    notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *notes) if note)
     return DiscDiagnosis(
         system, diagnosis, declared.name, text, before, after, energy, learned, apart, notes=notes, regimes=parts
     )
@@ -146,21 +126,10 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
     return diagnosis
 
 
-def _doubtful(left: LeftOver | None) -> bool:
-    """May an effect of the motion be missing, although chi-square is that of noise?
-
-    The poses' part is less like noise than that of one recording in twenty, and the numbers that no pose takes do not
-    show as much of it: what those show is the measurement's, and is in the poses as well.
-    """
-    if left is None or left.pose_p_value >= DOUBTFUL:
-        return False
-    return not (left.other_p_value < DOUBTFUL and left.as_in_all)
-
-
 def _beyond_the_catalogue(
     system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
-) -> tuple[Learned | None, tuple[Found, ...], tuple[str, ...]]:
-    """A law if that makes the shortest explanation, the known effects that stay beside it, and remarks."""
+) -> tuple[WithLaw | None, tuple[str, ...]]:
+    """The explanation with a law if that is the shortest, and remarks."""
     noise = diagnosis.noise
     limit = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
 
@@ -171,17 +140,34 @@ def _beyond_the_catalogue(
         remains = left_over(known, fitted, noise)
         return remains is None or not remains.of_the_motion
 
-    best, notes = explained_by_law(system, diagnosis, _doubtful(left), is_noise)
-    if best is None or diagnosis.held_out_before is None:
-        return None, (), notes
-    known, fitted = system.knowing(best.law), best.fit
-    rows = training_rows(known, diagnosis.settings.train_fraction)
-    held = held_out(judged_as(diagnosis, known), fitted.quantities, fitted.values, rows)
+    return explained_by_law(system, diagnosis, left is not None and left.doubtful, is_noise)
+
+
+def _with_law(
+    system: DiscSystem, diagnosis: Diagnosis, found: WithLaw
+) -> tuple[DiscSystem, Learned, Diagnosis, tuple[str, ...]]:
+    """The system that knows the law, the law with its course, the diagnosis with it, and remarks."""
+    law, fitted, kept, noise = found.law, found.fit, found.kept, diagnosis.noise
+    known = system.knowing(law)
+    judged, rows = judged_as(diagnosis, known), training_rows(known, diagnosis.settings.train_fraction)
+    held = held_out(judged, fitted.quantities, fitted.values, rows)
+    assert diagnosis.held_out_before is not None
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / noise
-    gain = (diagnosis.before.cost - fitted.cost) / noise
-    work = energy_balance(known, fitted.values)[f"by {best.law.candidate.name}"]
+    work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(known.time[-1] - known.time[0])
-    return Learned(best.law, fitted, held, gain, float(held_gain), power), best.kept, notes
+    reason = f"{diagnosis.reason}; the law {law.candidate.title} leaves {fitted.reduced_chi_square:.3g}"
+    diagnosis = replace(
+        diagnosis, verdict="unexplained", found=kept, after=fitted if kept else diagnosis.after, reason=reason
+    )
+    left = left_over(known, fitted, noise)
+    as_found = known, with_memory(judged, fitted), law, noise, left is not None and not left.white
+    formed = with_form(*as_found, _of_motion(kept))
+    diagnosis, doubted = _beside_any_form(diagnosis, kept, formed.of_another, law.looked)
+    if _of_motion(diagnosis.found):  # what holds beside any law does not stand in with this one
+        formed = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
+    gain = (diagnosis.before.cost - fitted.cost) / noise
+    learned = Learned(law, formed.fit, held, gain, float(held_gain), power, formed.course)
+    return known, learned, diagnosis, doubted
 
 
 def _beside_any_form(

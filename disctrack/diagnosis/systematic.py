@@ -9,7 +9,7 @@ with these sizes as priors, then stand beside the motion, and take from it what 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -73,14 +73,17 @@ def with_noise_of_frames(trajectory: Trajectory) -> tuple[Trajectory, float]:
     effects like chance.
     """
     ratio = noise_over_stated(trajectory)
-    if not 0 < ratio < INFLATED:
-        return trajectory, 1.0
+    return (with_noise(trajectory, ratio), ratio) if 0 < ratio < INFLATED else (trajectory, 1.0)
+
+
+def with_noise(trajectory: Trajectory, ratio: float) -> Trajectory:
+    """The trajectory with its covariances multiplied by a ratio."""
     return replace(
         trajectory,
         pose_covariance=ratio * trajectory.pose_covariance,
         markers_covariance_px2=ratio * trajectory.markers_covariance_px2,
         reduced_chi_square=trajectory.reduced_chi_square / ratio,
-    ), ratio
+    )
 
 
 @dataclass(frozen=True)
@@ -286,6 +289,39 @@ def _with_amounts(
     return replace(found, beside=names, beside_px=float(np.sqrt(powers)), amounts=amounts)
 
 
+@dataclass(frozen=True)
+class _Dots:
+    """What no pose takes of some frames' dots, and what it may be made of."""
+
+    data: Array  # (n,) whitened
+    groups: dict[str, Array]  # (n, k) columns by what they stand for, without the lenses' fields
+    faults: tuple[str, ...]  # those of the groups that are faults of the measurement
+    size: float  # rms of the data, one at least
+    per_px: float  # whitened units in a pixel
+    extent: float  # [px] of the dots' places
+    whitened: Callable[[Array], Array]  # shifts of the dots [px] as columns
+
+
+def _dots(view: StaticView) -> _Dots:
+    across = np.eye(view.residual.shape[1]) - view.by_pose @ np.linalg.pinv(view.by_pose)
+
+    def free(columns: Array) -> Array:
+        return np.asarray((across @ columns.reshape(*view.residual.shape, -1)).reshape(view.residual.size, -1), float)
+
+    def whitened(shifts: Array) -> Array:
+        return free(np.einsum("ncmab,ncmbk->ncmak", view.whiten, shifts))
+
+    data = free(view.residual)[:, 0]
+    size = max(float(np.sqrt(np.mean(data**2))), 1.0)
+    extent = float(np.max([np.ptp(view.places[:, c][view.used[:, c]], axis=0).max() for c in range(2)]))
+    faults = {name: whitened(columns) for name, columns in view.faults.items()}
+    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
+    groups = {"rig": free(view.rig), "print": free(view.dots), **faults}
+    groups["dot"] = whitened(dot_columns(view.places, view.used, DOT_LENGTH * extent, size))
+    per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))
+    return _Dots(data, groups, tuple(faults), size, per_px, extent, whitened)
+
+
 def find_systematic(
     system: DiscSystem, noise: float = 1.0, known: Values | None = None, beside: Sequence[str] | None = None
 ) -> Systematic:
@@ -300,32 +336,18 @@ def find_systematic(
         return Systematic(noise=noise)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_FRAMES, len(rows))).astype(int))]
     view = system.static_view(rows, known or {})
-    across = np.eye(view.residual.shape[1]) - view.by_pose @ np.linalg.pinv(view.by_pose)
-    free = lambda columns: (across @ columns.reshape(*view.residual.shape, -1)).reshape(view.residual.size, -1)  # noqa: E731
-    whitened = lambda shifts: free(np.einsum("ncmab,ncmbk->ncmak", view.whiten, shifts))  # noqa: E731
-    data = free(view.residual)[:, 0]
-    per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))  # whitened units in a pixel
-    rms = float(np.sqrt(np.mean(data**2)))
-    numbers = float(np.sum(system.weights[rows] - 6.0))
-    used, places = view.used, view.places
-    extent = float(np.max([np.ptp(places[:, c][used[:, c]], axis=0).max() for c in range(2)]))
-    faults = {name: whitened(columns) for name, columns in view.faults.items()}
-    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
-    size = max(rms, 1.0)
-    groups = {"rig": free(view.rig), "print": free(view.dots), **faults}
-    groups["dot"] = whitened(dot_columns(places, used, DOT_LENGTH * extent, size))
-    start = {"rig": 1.0, "print": DOT_SIGMA}
-    steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
-    prints: Array = DOT_SIGMA * 2.0 ** np.arange(7.0)
-    grids = {"print": prints, "lens": steps, "dot": steps}
-    given = tuple(name for name in beside or () if name in faults)
-    start |= dict.fromkeys(given, WIDE)
-    amounts = dict.fromkeys(faults, 1.0) if beside is None else {}
+    dots = _dots(view)
+    numbers, extent = float(np.sum(system.weights[rows] - 6.0)), dots.extent
+    steps: Array = dots.size / dots.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
+    grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
+    given = tuple(name for name in beside or () if name in dots.faults)
+    start = {"rig": 1.0, "print": DOT_SIGMA} | dict.fromkeys(given, WIDE)
+    amounts = dict.fromkeys(dots.faults, 1.0) if beside is None else {}
     best: Systematic | None = None
     nothing = 0.0
     for share in LENS_LENGTHS:
-        groups["lens"] = whitened(lens_columns(places, used, share * extent, size))
-        evidence = Evidence(data, groups)
+        lens = dots.whitened(lens_columns(view.places, view.used, share * extent, dots.size))
+        evidence = Evidence(dots.data, {**dots.groups, "lens": lens})
         if best is None:
             nothing = evidence.twice_log(start)
             value, sizes, chosen = _with_faults(evidence, start, amounts, MOST_FAULTS)

@@ -384,85 +384,69 @@ def explained_by_law(
 ) -> tuple[WithLaw | None, tuple[str, ...]]:
     """The explanation with a law if that is the shortest one, and remarks on what describes the data as well.
 
-    A single known effect has to compete where what it leaves is `doubtful`, or where a law comes as near to first
-    order: it may stand in for a law that is not known. So may each of several, or all: the law is looked for in the
-    place of all of them, and beside each. Faults of the measurement stay beside it, unless the law makes them idle: no
-    force displaces a dot on the face.
+    Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
     """
-    of_motion, faults = (
-        tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
-    )
-    explained, base = diagnosis.verdict == "found", diagnosis.before
-    if diagnosis.verdict == "nothing missing" or diagnosis.held_out_before is None:
-        return None, ()
-    if explained and not (of_motion or doubtful):
-        return None, ()
-    known = _of_found(system, diagnosis, diagnosis.after, diagnosis.found)
-    looked_for = any(f.candidate.sought for f in of_motion)
-    if explained and len(of_motion) == 1 and not (doubtful or looked_for):
-        beside = base_beside(base, faults)
-        if not shortest_to_first_order(system, beside, diagnosis.after, diagnosis.noise) < known:
-            return None, ()
-    sets: list[tuple[Found, ...]] = [faults]
-    if explained and (doubtful or len(of_motion) > 1):
-        sets += [(*faults, f) for f in of_motion]
-    elif of_motion and not explained:  # they describe most of it, and the law may be what is left
-        sets.append(diagnosis.found)
-    answers = [found for kept in sets if (found := _law_beside(system, diagnosis, kept, is_noise)) is not None]
+    known, noise = _known(system, diagnosis), diagnosis.noise
+    found = [_law_beside(system, diagnosis, kept, is_noise) for kept in _beside(system, diagnosis, doubtful, known)]
+    answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, ()
-    # of those that describe the data as well as the shortest, the one that claims the fewest known effects
-    shortest = min(answers, key=lambda a: (not a.fit.converged, a.length))
-    as_good = [a for a in answers if a.fit.converged and a.length - shortest.length < CLASS_GAIN] or [shortest]
+    shortest = min(a.length for a in answers)
+    as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
     best = min(as_good, key=lambda a: (a.of_motion, a.length))
-    if not best.fit.converged or _known_does(system, diagnosis, known, best.length):
-        at_noise = diagnosis.settings.at_noise * diagnosis.noise
-        if not best.fit.converged or best.fit.reduced_chi_square > at_noise:
-            return None, ()
-        text = f"a single law beside the catalogue describes the data too ({best.fit.reduced_chi_square:.4g})"
-        return None, (f"{text}: {best.law.title}",)
-    if best.fit.reduced_chi_square > TELLS * diagnosis.noise:
+    left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
+    if not best.length < known:
+        text = f"a single law beside the catalogue describes the data too ({left:.4g}): {best.law.title}"
+        return None, (text,) if left <= at_noise else ()
+    if left > TELLS * noise:
         return None, ()
     best = replace(best, law=replace(best.law, rivals=_rivals(best, answers, diagnosis)))
-    notes = [
-        f"{other} describes what is missing as well"
-        for other in (*best.law.alike, *(a.title for a in as_good if a is not best))
-    ]
+    others = (*best.law.alike, *(a.title for a in as_good if a is not best))
+    notes = [f"{other} describes what is missing as well" for other in others]
     after = diagnosis.after.reduced_chi_square
-    if diagnosis.found and after <= diagnosis.settings.at_noise * diagnosis.noise:
+    if diagnosis.found and after <= at_noise:
         names = ", ".join(f.candidate.name for f in diagnosis.found)
         notes.append(
             f"known effects together ({names}) leave {after:.4g} of the expected variance where the law leaves "
-            f"{best.fit.reduced_chi_square:.4g}: with their prices the law is ahead by {known - best.length:.4g}"
+            f"{left:.4g}: with their prices the law is ahead by {known - best.length:.4g}"
         )
     return best, tuple(notes)
 
 
-def _known_does(system: System, diagnosis: Diagnosis, known: float, of_law: float) -> bool:
-    """Is one of the explanations that are made of what was found shorter than the law?
+def _known(system: System, diagnosis: Diagnosis) -> float:
+    """Length of the shortest explanation by known effects.
 
-    Of two that are as good, what is known: a single effect of the motion has that credit, and neither has a sum nor
-    one that was looked for.
+    Of two that are as good, what is known: a single effect of the motion has that credit, and no sum has.
     """
-    if diagnosis.verdict != "found":
-        return not of_law < known
-    names = {f.candidate.name for f in diagnosis.found}
-    listed = [(known, [f.candidate for f in diagnosis.found])]
-    listed += [
-        (length(system, diagnosis.settings, diagnosis.noise, e.fit, e.candidates), list(e.candidates))
-        for e in diagnosis.ranked
-        if e.candidates and e.names < names
-    ]
-    for its, candidates in listed:
-        of_motion = [c for c in candidates if c.kind == "motion"]
-        credit = len(of_motion) == 1 and not of_motion[0].sought
-        if its - CLASS_GAIN * credit <= of_law:
-            return True
-    return False
+
+    def of(fitted: Fit, candidates: Sequence[Candidate]) -> float:
+        single = sum(c.kind == "motion" for c in candidates) == 1
+        return length(system, diagnosis.settings, diagnosis.noise, fitted, candidates) - CLASS_GAIN * single
+
+    answer = of(diagnosis.after, [f.candidate for f in diagnosis.found])
+    return min([answer, *(of(e.fit, e.candidates) for e in diagnosis.ranked)])
 
 
-def _of_found(system: System, diagnosis: Diagnosis, fitted: Fit, found: Sequence[Found]) -> float:
-    return length(system, diagnosis.settings, diagnosis.noise, fitted, [f.candidate for f in found])
+def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool, known: float) -> tuple[tuple[Found, ...], ...]:
+    """Sets of what was found, beside each of which a law is looked for in the place of the others.
+
+    A single known effect has to compete where what it leaves is `doubtful`, or where a law comes as near to first
+    order: it may stand in for a law that is not known. So may each of several, or all. Faults of the measurement stay
+    beside the law, unless it makes them idle: no force displaces a dot on the face.
+    """
+    of_motion, faults = (
+        tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
+    )
+    if diagnosis.verdict == "nothing missing" or diagnosis.held_out_before is None:
+        return ()
+    if diagnosis.verdict != "found":  # what was found describes most of it, and the law may be what is left
+        return (faults, diagnosis.found) if of_motion else (faults,)
+    if doubtful or len(of_motion) > 1:
+        return (faults, *((*faults, f) for f in of_motion))
+    if not of_motion:
+        return ()
+    near = shortest_to_first_order(system, base_beside(diagnosis.before, faults), diagnosis.after, diagnosis.noise)
+    return (faults,) if of_motion[0].candidate.sought or near - CLASS_GAIN < known else ()
 
 
 def judged_as(diagnosis: Diagnosis, system: System) -> System:
@@ -503,8 +487,8 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
             again, fitted = rest, without
         else:
             again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
-    of_all = _of_found(system, diagnosis, fitted, again) + law.looked * len(law.families)
-    return WithLaw(law, known, fitted, tuple(again), of_all)
+    of_known = length(system, diagnosis.settings, noise, fitted, [f.candidate for f in again])
+    return WithLaw(law, known, fitted, tuple(again), of_known + law.looked * len(law.families))
 
 
 def _rivals(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:

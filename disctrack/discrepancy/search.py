@@ -174,6 +174,13 @@ def with_shapes(system: System, diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, held_out_after=held)
 
 
+def beside(diagnosis: Diagnosis, found: Sequence[Found], how: str = "") -> Diagnosis:
+    """The diagnosis with what was found before its search among what was found."""
+    tried = [Tried(f.candidate, f.gain, f.gain, f.held_out_gain, f"chosen{how}") for f in found]
+    verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
+    return replace(diagnosis, verdict=verdict, found=(*found, *diagnosis.found), tried=(*tried, *diagnosis.tried))
+
+
 def threshold(system: System, settings: Settings, k: int) -> float:
     """Gain with k quantities that noise reaches with the allowed probability, over all candidates."""
     return float(stats.chi2.isf(settings.false_alarm / max(len(system.candidates), 1), k))
@@ -443,7 +450,8 @@ class _Search:
                 values.setdefault(name, value)
         quantities = self._quantities(candidates)
         try:
-            found = fit(self.system if patient else self.system.hurried(), quantities, values)
+            with self.system.budget.trial(np.inf if patient else self.system.trial_steps):
+                found = fit(self.system, quantities, values)
         except TrialGivenUp:
             return no_fit(quantities, values)
         if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
@@ -486,7 +494,8 @@ class _Search:
         """Have some steps from this start removed a good part of the residual?"""
         values = dict(current.fit.values) | dict(start)
         try:
-            few = fit(self.system.hurried(SOON), self._quantities(together), values, max_iterations=FIRST_STEPS)
+            with self.system.budget.trial(SOON * self.system.trial_steps):
+                few = fit(self.system, self._quantities(together), values, max_iterations=FIRST_STEPS)
         except TrialGivenUp:
             return False
         return few.cost < PROMISING * current.fit.cost
@@ -502,7 +511,8 @@ class _Search:
             return None
         for part in self.system.beginnings():
             try:
-                found = fit(part.hurried(len(self.system.time) / len(part.time)), quantities, values)
+                with self.system.budget.trial(self.system.trial_steps):
+                    found = fit(part, quantities, values)
             except TrialGivenUp:
                 return None
             if not found.converged or found.reduced_chi_square > AGREES * self.noise:

@@ -40,16 +40,16 @@ def with_free_shape(
         return None
     fits = []
     for start in starts or _grid(candidate):
-        with suppress(TrialGivenUp):
+        with suppress(TrialGivenUp), system.budget.trial(system.trial_steps):
             quantities = (*base.quantities, *candidate.quantities)
-            fits.append(fit(system.hurried(), quantities, base.values | start, MAX_STARTED))
+            fits.append(fit(system, quantities, base.values | start, MAX_STARTED))
     fitted = min(fits, key=lambda f: f.cost, default=None)
     if fitted is None or not fitted.cost < below:
         return None
     free = [(q, expected) for q in candidate.shape if np.isfinite(expected := expected_sigma(system, fitted, q))]
-    with suppress(TrialGivenUp):
+    with suppress(TrialGivenUp), system.budget.trial(ALONG * system.trial_steps):
         for q, expected in free:
-            fitted = profiled(system.hurried(ALONG), fitted, q, expected, goal)
+            fitted = profiled(system, fitted, q, expected, goal)
         if fitted.converged and all(is_determined(fitted, q) for q, _ in free):
             return replace(candidate, quantities=(*candidate.quantities, *(q for q, _ in free))), fitted
     return None

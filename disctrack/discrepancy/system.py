@@ -6,7 +6,8 @@ business of an adapter (`disctrack.diagnosis`, `examples`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 
@@ -76,6 +77,50 @@ class Candidate:
         return tuple(q.name for q in self.quantities)
 
 
+class GivenUp(Exception):
+    """A hypothesis would take too long to follow: the one who put it forward goes on without it."""
+
+
+class TrialGivenUp(GivenUp):
+    """One of many hypotheses would take too long: the others are still to be tried."""
+
+
+class Budget:
+    """Steps that predictions may still take while an answer is sought; of all systems that share it.
+
+    Steps, and not seconds, so that an answer does not depend on the machine.
+    """
+
+    def __init__(self, steps: float = np.inf) -> None:
+        """Without an end, if not given."""
+        self._left, self._trial = float(steps), np.inf
+
+    @property
+    def left(self) -> float:
+        """Steps until something is given up."""
+        return min(self._left, self._trial)
+
+    def take(self, steps: float) -> None:
+        """Count. Raises GivenUp when the last is taken, TrialGivenUp where that is a trial's last only."""
+        self._left, self._trial = max(self._left - steps, 0.0), max(self._trial - steps, 0.0)
+        if self.left == 0.0:
+            raise TrialGivenUp if self._left else GivenUp
+
+    @contextmanager
+    def trial(self, steps: float) -> Iterator[None]:
+        """Within, one trial among many, that may take so many steps; a trial within another no more than that has."""
+        outer, inner = self._trial, min(self._trial, steps)
+        self._trial = inner
+        try:
+            yield
+        finally:
+            self._trial = outer if np.isinf(outer) else outer - (inner - self._trial)
+
+    def without_end(self) -> None:
+        """An answer has been found, or given up: what is still asked is asked to the end."""
+        self._left = np.inf
+
+
 class System:
     """Data, model, and the effects it may lack. Samples are rows in time; a row has one or more whitened numbers.
 
@@ -86,6 +131,8 @@ class System:
     weights: Array  # (n,) how many numbers of each row are data
     base: tuple[Quantity, ...]  # that every fit moves: initial conditions, declared laws, nuisances with priors
     candidates: tuple[Candidate, ...]  # effects that the model may lack
+    budget: Budget = Budget()
+    trial_steps: float = np.inf  # of the budget, that one hypothesis among many may take
     several_minima: bool = False  # may fits of the same quantities end in different minima?
     frees_shapes: bool = False  # are numbers of laws' shapes tried free where no law as it is written down will do?
     blocks: Sequence[slice] = ()  # rows that may have quantities of their own (`discrepancy.own`)
@@ -106,13 +153,6 @@ class System:
         """
         return ()
 
-    def hurried(self, share: float = 1.0) -> System:
-        """The system as one trial among many sees it: raises TrialGivenUp where following it takes too long.
-
-        share : of the time that a whole fit may take
-        """
-        return self
-
     def beginnings(self) -> Sequence[System]:
         """Parts of the system from its first sample on, shorter ones first."""
         return ()
@@ -127,14 +167,6 @@ class System:
     def over(self, system: System) -> System:
         """Another system, seen as this one sees the one that it wraps."""
         return system
-
-
-class GivenUp(Exception):
-    """A hypothesis would take too long to follow: the one who put it forward goes on without it."""
-
-
-class TrialGivenUp(GivenUp):
-    """One of many hypotheses would take too long: the others are still to be tried."""
 
 
 class Wrapped(System):
@@ -152,7 +184,7 @@ class Wrapped(System):
             system.candidates,
         )
         self.several_minima, self.frees_shapes = system.several_minima, system.frees_shapes
-        self.blocks = system.blocks
+        self.blocks, self.budget, self.trial_steps = system.blocks, system.budget, system.trial_steps
 
     def over(self, system: System) -> Wrapped:
         """The same view of another system."""
@@ -167,10 +199,6 @@ class Wrapped(System):
     def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
         """As the system's."""
         return self._system.undo_each_other(candidates, values, before)
-
-    def hurried(self, share: float = 1.0) -> Wrapped:
-        """As the system's."""
-        return self.over(self._system.hurried(share))
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """As the system's."""

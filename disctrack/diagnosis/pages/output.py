@@ -11,7 +11,7 @@ from disctrack.diagnosis.errors import Ahead, Errors
 from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.pages import planned
 from disctrack.diagnosis.pages.words import UNFOLLOWED
-from disctrack.diagnosis.plan import Separation
+from disctrack.diagnosis.plan import Proposed
 from disctrack.discrepancy.document import (
     declared_json,
     effect_json,
@@ -32,16 +32,15 @@ if TYPE_CHECKING:
 GROUP = "diagnosis"
 
 
-def _separation(separation: Separation | None) -> dict[str, Any] | None:
+def _separation(separation: Proposed | None) -> dict[str, Any] | None:
     """The recording that would separate two effects; None where none of those looked at can be made."""
     if separation is None:
         return None
     return {
-        "theta_deg": separation.theta_deg,
-        "omega3_rad_s": separation.omega3,
+        "theta_deg": separation.proposal.theta_deg,
+        "omega3_rad_s": separation.proposal.omega3,
         "duration_s": separation.duration,
-        "angle_deg": np.degrees(separation.angle),
-        "sigmas": separation.sigmas,
+        "sigmas": separation.answers[0],
     }
 
 

@@ -97,10 +97,10 @@ def _class_text(found: Found, result: DiscDiagnosis) -> str:
         plan = result.separated_by.get(found.candidate.name, {}).get(rival.candidate.name)
         name = rival.candidate.name
         text = f"From {name} its predicted residual differs by an angle of {np.degrees(rival.angle):.2g} deg; "
-        if plan is None or plan.sigmas < DISTINCT:
+        if plan is None or plan.answers[0] < DISTINCT:
             text += "no recording looked at (3 to 30 deg, spin 0.5 and 5 rad/s, up to 1 s) separates them."
         else:
-            text += f"to separate them, {plan.text}."
+            text += f"to separate them, {plan.proposal.text}: {plan.answers[0]:.3g} sigmas apart."
         texts.append(text)
     return " ".join(texts)
 

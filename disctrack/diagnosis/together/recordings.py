@@ -20,6 +20,7 @@ from disctrack.diagnosis.systematic import (
     find_systematic,
     noise_over_stated,
     smooth_field,
+    with_noise,
 )
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, fit
@@ -124,7 +125,7 @@ class DiscMember:
         self.item = item
         as_tracked = recorded.trajectory
         self.noise = _noise(as_tracked)
-        trajectory = _with_noise(as_tracked, self.noise)
+        trajectory = with_noise(as_tracked, self.noise)  # recordings are weighed by it
         self.declared: Declared = declared_model(trajectory, item.model)
         self.stretch: Stretch = free_stretch(trajectory)
         self.trajectory = trajectory
@@ -246,20 +247,10 @@ class DiscMember:
 def _noise(trajectory: Trajectory) -> float:
     """Variance of the dots from frame to frame over that stated; 1 where it differs by no more than its own scatter."""
     ratio = noise_over_stated(trajectory)
+    if not 0 < ratio < np.inf:
+        return 1.0
     numbers = 2.0 * np.sum(trajectory.marker_status == MarkerStatus.MEASURED) - 6.0 * np.sum(trajectory.measured)
     return ratio if abs(ratio - 1.0) > SURE * np.sqrt(2 * (1 + THIRD) / max(numbers, 1.0)) else 1.0
-
-
-def _with_noise(trajectory: Trajectory, ratio: float) -> Trajectory:
-    """The trajectory with its covariances at the scatter from frame to frame: recordings are weighed by them."""
-    if not 0 < ratio < np.inf or ratio == 1.0:
-        return trajectory
-    return replace(
-        trajectory,
-        pose_covariance=ratio * trajectory.pose_covariance,
-        markers_covariance_px2=ratio * trajectory.markers_covariance_px2,
-        reduced_chi_square=trajectory.reduced_chi_square / ratio,
-    )
 
 
 def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Systematic]:

@@ -5,12 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, Settings, diagnose
+from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
-from disctrack.diagnosis.motion import motion_candidates
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.search import explain
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.rolling import CATALOGUE
 from tests.oracles.measured_disc import measured
@@ -103,17 +101,6 @@ def test_a_camera_that_turned_is_told_from_an_effect_of_the_motion():
     assert "right_turned" in names  # a shift of the principal point does nearly the same to a small field of view
 
 
-def test_a_wrong_effect_offered_alone_is_refused():
-    trajectory = measured({"table_tilt.tilt_x": 0.002}, seed=9)
-    model = declared_model(trajectory).model
-    system = system_of(trajectory, candidates=motion_candidates(model, ["air_quadratic"]))
-    answer = explain(system, system.start())
-    assert answer.verdict == "unexplained"
-    assert not answer.found
-    assert [c.name for c in answer.partial] in ([], ["air_quadratic"])
-    assert answer.after.reduced_chi_square > 1.1
-
-
 @pytest.mark.statistical
 def test_derivatives_agree_with_differences_of_the_prediction():
     system = system_of(measured({"kz.k_z": 2e-5}, seed=12, n=80))
@@ -140,12 +127,6 @@ def test_false_alarms_are_rare():
     assert alarms <= 2
 
 
-@pytest.mark.statistical
-def test_settings_are_kept_with_the_answer():
-    settings = Settings(false_alarm=1e-3, max_effects=1)
-    assert diagnose(measured(seed=13, n=60), settings=settings).diagnosis.settings == settings
-
-
 @pytest.mark.slow
 def test_the_recording_proposed_to_separate_two_effects_separates_them():
     """Viscous contour friction at 14 deg looks like the air; the proposed recording, once made, tells them apart."""
@@ -154,8 +135,8 @@ def test_the_recording_proposed_to_separate_two_effects_separates_them():
     (found,) = first.diagnosis.found
     name = found.candidate.name
     assert name == "contour_viscous" or first.separated_by[name]["contour_viscous"] is not None
-    plans = [p for p in first.separated_by[name].values() if p is not None and p.sigmas > 5]
-    plan = max(plans, key=lambda p: p.sigmas)
+    plans = [p for p in first.separated_by[name].values() if p is not None and p.answers[0] > 5]
+    plan = max(plans, key=lambda p: p.answers[0]).proposal
     second = measured(hidden, seed=101, n=900, theta_deg=plan.theta_deg, omega3=plan.omega3, nutation_deg=0.4)
     again = diagnose(second)
     assert [f.candidate.name for f in again.diagnosis.found] == ["contour_viscous"]
@@ -167,7 +148,7 @@ def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     result = diagnose(measured(faults=Faults(frame_rate_hz=1004.0), seed=14, n=300))
     (found,) = result.diagnosis.found
     (plan,) = result.separated_by[found.candidate.name].values()
-    assert plan.sigmas < 0.01  # all laws at hand are quadratic in the rates: time can be stretched
+    assert plan.answers[0] < 0.01  # all laws at hand are quadratic in the rates: time can be stretched
 
 
 @pytest.mark.slow

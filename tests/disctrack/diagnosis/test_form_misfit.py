@@ -8,8 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import form_misfit
-from disctrack.diagnosis.disc_system import Patience
-from disctrack.discrepancy.system import GivenUp
+from disctrack.discrepancy.system import Budget, GivenUp, TrialGivenUp
 from disctrack.rolling import Model, sensitivities, simulate, steady_precession
 from disctrack.rolling.model import body_constants
 from disctrack.synthetic.description import Scene
@@ -94,12 +93,14 @@ def test_slip_that_takes_too_long_is_not_followed():
     cut = sensitivities(model, start, times, components=["theta"], max_slip_steps=whole.slip_steps // 4)
     assert not np.isfinite(cut.dq).all()
     assert cut.slip_steps <= whole.slip_steps // 4
-    patience = Patience(100)
-    patience.take(99)
+    budget = Budget(100)
+    with budget.trial(40), pytest.raises(TrialGivenUp):
+        budget.take(50)
+    budget.take(49)
     with pytest.raises(GivenUp):
-        patience.take(1)
-    patience.without_end()
-    patience.take(100)
+        budget.take(1)
+    budget.without_end()
+    budget.take(100)
 
 
 def test_a_sum_or_a_law_with_rivals_of_another_form_is_taken_for_another_s():
@@ -118,20 +119,3 @@ def test_a_sum_or_a_law_with_rivals_of_another_form_is_taken_for_another_s():
         assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=[(rival, 1.0)])) == pytest.approx(0.5)
     same = [(law(("angle", "M_n")), 1.0)]  # a variation of the same idea, whose course is in the sigma anyway
     assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=same)) == form_misfit.SELDOM
-
-
-def test_what_is_shorter_than_a_probe_may_be_anywhere_in_it(monkeypatch):
-    """A blow of a fifth of a probe counts by its mean square over it; a course that turns once in seven probes not."""
-    time, spacing = np.linspace(0.1, 0.9, 41), 0.02
-    blow = lambda t: 1.0 * (np.abs(t - time[20] - 0.005) < 0.1 * spacing)  # noqa: E731
-    slow = lambda t: np.sin(2 * np.pi * t / (7 * spacing))  # noqa: E731
-    moment = lambda t: np.stack([blow(t), slow(t), 0.0 * t], axis=1)  # noqa: E731
-    monkeypatch.setattr(form_misfit, "WITHIN", 50)
-    monkeypatch.setattr(form_misfit, "_motion", lambda system, values, t: np.concatenate([[0.0], t]))
-    monkeypatch.setattr(form_misfit, "moment_about_contact", lambda system, values, t: moment(t))
-    blocks = SimpleNamespace(time=time, spacing=spacing)
-    found = form_misfit._within_probes(None, SimpleNamespace(values={}), blocks, moment(time))
-    assert found[20, 0] == pytest.approx(0.2)
-    assert np.delete(found[:, 0], 20).max() == 0.0
-    assert found[1:-1, 1].max() < 1e-4
-    assert found[:, 2].max() == 0.0

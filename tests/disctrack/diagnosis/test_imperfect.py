@@ -4,7 +4,6 @@ The errors are sums of plane waves and random numbers (trials.imperfect); the di
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +12,8 @@ from numpy.testing import assert_allclose
 from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.left_over import LeftOver
 from disctrack.diagnosis.model_file import declared_model
-from disctrack.diagnosis.stage import _doubtful
 from disctrack.diagnosis.stretch import at_rest
-from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise_of_frames
+from disctrack.diagnosis.systematic import find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.noise import inflation, long_run_variance
 from disctrack.discrepancy.system import Quantity, System
@@ -153,18 +151,15 @@ def test_what_is_left_is_the_motions_only_where_the_poses_hold_it():
 
 
 @pytest.mark.parametrize(
-    ("pose", "other", "p_pose", "p_other", "systematic", "kinds"),
+    ("left", "doubtful"),
     [
-        (1.00, 1.00, 0.4, 0.6, Systematic(), ()),
-        (1.09, 0.99, 0.02, 1.0, Systematic(), ("motion", "measurement")),  # a groove that a tilt stands in for
-        (1.00, 1.03, 0.3, 4e-10, Systematic(), ("measurement",)),  # a misprint beside a shaken table
-        (1.22, 1.27, 0.4, 3e-4, Systematic(lens_px=0.008), ()),  # lenses with fields: nothing of the motion
-        (1.18, 1.18, 2e-3, 5e-3, Systematic(lens_px=0.008), ()),  # likewise, and seen in the poses
-        (1.80, 1.18, 2e-3, 5e-3, Systematic(lens_px=0.008), ("motion", "measurement")),
+        (LeftOver(1.00, 1.00, 0.4, 0.6, 36), False),
+        (LeftOver(1.09, 0.99, 0.02, 1.0, 36), True),  # a groove that a tilt stands in for
+        (LeftOver(1.00, 1.03, 0.3, 4e-10, 36), False),  # a misprint beside a shaken table
+        (LeftOver(1.22, 1.27, 0.4, 3e-4, 36), False),  # lenses with fields: nothing of the motion
+        (LeftOver(1.18, 1.18, 2e-3, 5e-3, 36), False),  # likewise, and seen in the poses
+        (LeftOver(1.80, 1.18, 2e-3, 5e-3, 36), True),
     ],
 )
-def test_what_the_measurement_does_to_all_numbers_raises_no_doubt_about_the_motion(
-    pose, other, p_pose, p_other, systematic, kinds
-):
-    left = LeftOver(pose, other, p_pose, p_other, 36)
-    assert _doubtful(left, SimpleNamespace(systematic=systematic)) == kinds
+def test_what_the_measurement_does_to_all_numbers_raises_no_doubt_about_the_motion(left, doubtful):
+    assert left.doubtful is doubtful

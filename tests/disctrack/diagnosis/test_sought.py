@@ -40,23 +40,3 @@ def test_the_frequency_of_a_shaken_table_is_found_to_half_a_turn_over_the_record
 
 def test_an_exponent_is_not_looked_for():
     assert starts("rolling_power", {}, 60) == []
-
-
-@pytest.mark.statistical
-def test_what_a_flat_does_along_a_motion_nearby_is_known_and_what_gains_too_little_is_left(monkeypatch):
-    """Round the rim 48 derivatives; along a motion that is micrometres away they do as well."""
-    system, candidate, values = fitted("rim_flat", {"rim_flat.depth": 1e-5, "rim_flat.angle": 0.4}, 60)
-    asked = []
-    real = DiscSystem.linearise
-    monkeypatch.setattr(DiscSystem, "linearise", lambda *a: asked.append(a[2]) or real(*a))
-    first = system.starts(candidate, values)
-    nearby = {**values, "state.theta": values["state.theta"] + 2e-6}
-    n = len(asked)
-    again = system.starts(candidate, nearby)
-    assert (n, len(asked) - n) == (49, 1)
-    assert again[0] == first[0]
-    system.columns_known.clear()
-    assert system.starts(candidate, nearby) == again
-    assert system.starts(candidate, {**values, "state.theta": values["state.theta"] + 2e-3})
-    assert len(asked) == n + 1 + 49 + 49  # elsewhere they are others
-    assert system.starts(candidate, values, least=1e9) == []

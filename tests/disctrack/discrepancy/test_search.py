@@ -1,9 +1,7 @@
 """The engine on a system that is no disc: a damped oscillator with a known answer."""
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +13,9 @@ from calibration.kit.least_squares import solve_bounded, triangle
 from disctrack.discrepancy.fit import compress, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
-from disctrack.discrepancy.search import Settings, _Search, explain, length
+from disctrack.discrepancy.search import Settings, explain, length
 from disctrack.discrepancy.significance import ljung_box, no_memory, whiteness
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, TrialGivenUp
+from disctrack.discrepancy.system import Budget, Candidate, GivenUp, Quantity, System
 
 SIGMA = 0.01
 
@@ -312,21 +310,13 @@ def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
 
 
 class Impatient(Oscillator):
-    """Will not follow the drift, when it is in a hurry; nor at all, if it `gives_up`."""
+    """Will not follow the drift where that is one trial of many."""
 
-    in_a_hurry = gives_up = False
-
-    def hurried(self, share=1.0):
-        one = copy(self)
-        one.in_a_hurry = True
-        return one
+    trial_steps = 10.0
 
     def linearise(self, values, names):
         if values.get("drift"):
-            if self.gives_up:
-                raise GivenUp
-            if self.in_a_hurry:
-                raise TrialGivenUp
+            self.budget.take(10.0)
         return super().linearise(values, names)
 
 
@@ -334,10 +324,11 @@ def test_a_hypothesis_that_takes_too_long_is_left_and_the_others_are_tried(rng):
     system = oscillator(rng, {"drift": 0.02, "hum_c": 0.05})
     assert sorted(f.candidate.name for f in explain(system, START).found) == ["drift", "hum"]
     impatient = Impatient(system.observed, system.time)
+    impatient.budget = Budget()
     answer = explain(impatient, START)  # the twin of the drift does what the drift did
     assert sorted(f.candidate.name for f in answer.found) == ["hum", "twin"]
     assert not any(r.candidate.name == "drift" for f in answer.found for r in f.cannot_be_told_from)
-    impatient.gives_up = True  # all patience at an end is another matter
+    impatient.budget = Budget(5.0)  # when all of it is spent, that is another matter
     with pytest.raises(GivenUp):
         explain(impatient, START)
 
@@ -379,22 +370,6 @@ def test_a_fit_that_crawls_is_ended_only_where_it_must_not_crawl():
     assert not not_so.converged
     assert patient.n_iterations == 30
     assert not_so.n_iterations == 3
-
-
-@pytest.mark.parametrize(("ahead", "worth"), [((40.0, 15.0), True), ((40.0, 60.0), False), ((4000.0, 60.0), True)])
-def test_what_rests_while_it_is_kept_back_does_not_speak_against_a_name(ahead, worth):
-    """Chi-square of 1000 fitted and 100 kept samples before and after: little is at stake where nothing moves."""
-    search = object.__new__(_Search)
-    search.noise, search.settings = 1.0, Settings()
-    trials = [
-        SimpleNamespace(
-            fit=SimpleNamespace(chi_square=c, degrees_of_freedom=1000, reduced_chi_square=c / 1000, n_data=1000),
-            held_out=SimpleNamespace(chi_square=100 + h, expected=100.0, n_data=100),
-        )
-        for c, h in zip((11_000.0, 1_400.0), ahead, strict=True)
-    ]
-    search.free_runs = [(trial.fit, trial.held_out) for trial in trials]
-    assert search._worth_naming(*trials) is worth
 
 
 def test_explanations_that_fit_alike_are_listed_with_their_odds(rng):
