@@ -117,7 +117,7 @@ class Crew:
             self._kept = everyone
 
     def reduce(self, requests: Sequence[Request]) -> list[Reduced | None]:
-        """As a `Reducer`."""
+        """What each recording says of its shared quantities."""
         found = self.call("reduce", [(values, names) for _, values, names in requests])
         return [None if isinstance(answer, DiscTrackError) else answer for answer in found]
 

@@ -8,7 +8,6 @@ may have any size, and nobody differs by it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -154,43 +153,32 @@ def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
     scatter = _scatter(blocks, falls)
     for i, fall in falls.items():
         told = [
-            _Told(2.0 * len(falls[i]) * float(stats.chi2.sf(difference / scatter[k], degrees)), difference, degrees, k)
+            (2.0 * len(falls[i]) * float(stats.chi2.sf(difference / scatter[k], degrees)), -difference, degrees, k)
             for k, (difference, degrees) in enumerate(fall)
             if degrees > 0
         ]
         if not told:
             continue
-        most, own = min(told, key=lambda one: (one.p_value, -one.difference)), found[i]
-        words = _differs_by(blocks, told, own.statistic)
-        if (most.p_value, -most.difference) < (own.p_value, -own.statistic):
-            of_candidate = most.difference / scatter[most.candidate]
-            own = replace(own, statistic=of_candidate, degrees=most.degrees, p_value=min(most.p_value, 1.0))
+        (p, minus, degrees, k), own = min(told), found[i]
+        words = _differs_by(blocks, [(-x, d, k) for p, x, d, k in told if p < STANDS_OUT], own.statistic)
+        if (p, minus) < (own.p_value, -own.statistic):
+            own = replace(own, statistic=-minus / scatter[k], degrees=degrees, p_value=min(p, 1.0))
         found[i] = replace(own, differs_by=words)
     return found
 
 
-class _Told(NamedTuple):
-    """What the size of one candidate in one recording tells against the others."""
-
-    p_value: float  # for the number of candidates
-    difference: float  # of chi-square
-    degrees: int
-    candidate: int
-
-
-def _differs_by(blocks: Blocks, told: Sequence[_Told], shared: float) -> str:
+def _differs_by(blocks: Blocks, standing: Sequence[tuple[float, int, int]], shared: float) -> str:
     """The effects that tell most, those with the fewest numbers first; none where what is shared tells more.
 
     By the chi-square alone: what scatters among the others may be what first order leaves of this recording.
+    standing : difference of chi-square, its degrees, and number of each candidate that tells something
     shared : fall of chi-square with shared numbers of its own
     """
-    standing = [one for one in told if one.p_value < STANDS_OUT]
-    most = max((one.difference for one in standing), default=0.0)
+    most = max((difference for difference, _, _ in standing), default=0.0)
     if most < shared or not standing:
         return ""
-    alike = [one for one in standing if most - one.difference < max(ALIKE, ALIKE_SHARE * most)]
-    alike.sort(key=lambda one: (one.degrees, -one.difference))
-    first, *others = (blocks.candidates[one.candidate] for one in alike[:NAMED])
+    alike = [(d, -x, k) for x, d, k in standing if most - x < max(ALIKE, ALIKE_SHARE * most)]
+    first, *others = (blocks.candidates[k] for _, _, k in sorted(alike)[:NAMED])
     return f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
 
 

@@ -1,7 +1,6 @@
 """Many recordings as one system for the engine: its samples are recordings, its rows what each says of the shared."""
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,21 +10,15 @@ from disctrack.discrepancy.joint.sharing import Sharing
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 Request = tuple[int, dict[str, float], tuple[str, ...]]  # recording, its shared values, names
-
-
-class Reducer(Protocol):
-    """Holds the data of all recordings, here or in other processes."""
-
-    def reduce(self, requests: Sequence[Request]) -> list[Reduced | None]:
-        """What each recording says of its shared quantities."""
+Reduce = Callable[[Sequence[Request]], list[Reduced | None]]  # what each recording says of its shared quantities
 
 
 class JointSystem(System):
     """Recordings that share quantities. A row is a recording's least-squares problem in them, its own ones at best."""
 
-    def __init__(self, sharing: Sharing, reducer: Reducer) -> None:
-        """The reducer numbers recordings as the sharing does."""
-        self.sharing, self._reducer = sharing, reducer
+    def __init__(self, sharing: Sharing, reduce: Reduce) -> None:
+        """The requests number recordings as the sharing does."""
+        self.sharing, self._reduce = sharing, reduce
         n = len(sharing.members)
         self.time: Array = np.arange(n, dtype=float)
         free = [sum(not np.isfinite(q.prior_sigma) for q in own) for own in sharing.own]
@@ -39,7 +32,7 @@ class JointSystem(System):
             (i, self.sharing.local_values(i, values), self.sharing.local_names(i, names))
             for i in range(len(self.sharing.members))
         ]
-        found = self._reducer.reduce(requests)
+        found = self._reduce(requests)
         width = max([1, *(len(r.right) for r in found if r is not None)])
         residual, derivative = np.zeros((len(found), width)), np.zeros((len(found), width, len(names)))
         for i, (reduced, (_, _, local)) in enumerate(zip(found, requests, strict=True)):

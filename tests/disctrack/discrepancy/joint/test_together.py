@@ -25,7 +25,7 @@ def joint(items, processes=1):
     crew = Crew(build, items, processes)
     sharing = Sharing([build(item).member for item in items])
     crew.call("share", [([q.name for q in own],) for own in sharing.own])
-    return JointSystem(sharing, crew), crew
+    return JointSystem(sharing, crew.reduce), crew
 
 
 def answer(items):
