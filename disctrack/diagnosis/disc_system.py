@@ -258,17 +258,18 @@ class DiscSystem(LawSystem):
         *,
         stretch: Stretch | None = None,
         starts_in_slip: bool = False,
+        systematic: Systematic | None = None,
         freed: tuple[Candidate, ...] = (),
         known: Values | None = None,
     ) -> DiscSystem:
-        """Another question to the same recording and model, with the same systematic errors and budget."""
+        """Another question to the same recording and model, with the same budget, and errors if none are given."""
         system = DiscSystem(
             self.trajectory,
             self.model,
             candidates,
             stretch=stretch or self.stretch,
             starts_in_slip=starts_in_slip,
-            systematic=self.systematic,
+            systematic=systematic or self.systematic,
             freed=freed,
             known=self.known if known is None else known,
         )

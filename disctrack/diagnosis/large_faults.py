@@ -158,8 +158,8 @@ def _assumed(trajectory: Trajectory, model: Model, names: tuple[str, ...], stati
     except AnalysisError:
         return None
     known = static.values
-    systematic = find_systematic(DiscSystem(seen, model, stretch=stretch, known=known), noise, known, beside=names)
-    system = DiscSystem(seen, model, stretch=stretch, systematic=systematic, freed=candidates, known=known)
+    plain = DiscSystem(seen, model, stretch=stretch, known=known)
+    system = plain.again(systematic=find_systematic(plain, noise, known, beside=names), freed=candidates)
     base = fit(system, system.base, system.start())
     return Assumed(system, base, candidates, static.gain) if np.isfinite(base.cost) else None
 

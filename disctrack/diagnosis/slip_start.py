@@ -91,7 +91,7 @@ def _with_these_times(
     if assumed is not None:
         return _with_large(assumed, settings)
     if systematic != rolling.systematic:
-        rolling = DiscSystem(trajectory, model, stretch=stretch, systematic=systematic, known=faults)
+        rolling = rolling.again(systematic=systematic)
     base = fit(rolling, rolling.base, rolling.start())
     if not base.converged:
         assumed = find_clock(rolling)

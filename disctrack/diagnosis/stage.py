@@ -68,11 +68,11 @@ def diagnose(
         return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    found, notes = _beyond_the_catalogue(system, diagnosis, left)
-    parts = None
+    found, diagnosis = _beyond_the_catalogue(system, diagnosis, left)
+    parts, notes = None, tuple[str, ...]()
     if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
         parts = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
-        notes = (*notes, parts.text) if found else (*notes, parts.text, what_is_missing(system, diagnosis.after))
+        notes = (parts.text,) if found else (parts.text, what_is_missing(system, diagnosis.after))
     learned = None
     if found is not None:
         system, learned, diagnosis, doubted = _with_law(system, diagnosis, found)
@@ -128,8 +128,8 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
 
 def _beyond_the_catalogue(
     system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
-) -> tuple[WithLaw | None, tuple[str, ...]]:
-    """The explanation with a law if that is the shortest, and remarks."""
+) -> tuple[WithLaw | None, Diagnosis]:
+    """The explanation with a law if that is the shortest, and the diagnosis with what is said of others."""
     noise = diagnosis.noise
     limit = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
 

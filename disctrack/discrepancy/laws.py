@@ -185,7 +185,7 @@ def learn(
         begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scan.chi_square)
         chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, rival)
         trials = [_refitted(system, base, law, begin, g) for g in chosen]
-        lengths = [t.cost / noise + price * _numbers(one) + looked * len(one.families) for one, t in trials]
+        lengths = [t.cost / noise + sum(price * f.n_numbers + looked for f in one.families) for one, t in trials]
         if not trials or min(lengths) >= shortest:
             break
         best = int(np.argmin(lengths))
@@ -236,10 +236,6 @@ def _odds(fitted: Fit, best: Fit, noise: float) -> float:
     return float(np.exp(-0.5 * max(fitted.cost - best.cost, 0.0) / noise))
 
 
-def _numbers(law: LearnedLaw) -> int:
-    return sum(family.n_numbers for family in law.families)
-
-
 def _worth_a_refit(
     worth: Sequence[Gain], chi_square: float, inexact: float, noise: float, price: float, rival: float
 ) -> list[Gain]:
@@ -287,14 +283,11 @@ def _arrived(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     return replace(law, candidate=replace(law.candidate, start=start), values=fitted.values)
 
 
-def _start(base: Fit, law: LearnedLaw) -> dict[str, float]:
-    return dict(base.values) | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-
-
 def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] = ()) -> Fit:
     """The base model's fit with the law's numbers fitted along, but for those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
-    return fit(system, (*base.quantities, *moved), _start(base, law), MAX_ITERATIONS, may_crawl=False)
+    start = base.values | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
+    return fit(system, (*base.quantities, *moved), start, MAX_ITERATIONS, may_crawl=False)
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
@@ -367,22 +360,11 @@ class WithLaw:
     kept: tuple[Found, ...]
     length: float  # as of any explanation
 
-    @property
-    def title(self) -> str:
-        """In words."""
-        known = ", ".join(f.candidate.name for f in self.kept)
-        return f"{self.law.title}, beside {known}," if known else self.law.title
-
-    @property
-    def of_motion(self) -> int:
-        """How many known effects of the motion it claims."""
-        return sum(f.candidate.kind == "motion" for f in self.kept)
-
 
 def explained_by_law(
     system: LawSystem, diagnosis: Diagnosis, doubtful: bool, is_noise: IsNoise
-) -> tuple[WithLaw | None, tuple[str, ...]]:
-    """The explanation with a law if that is the shortest one, and remarks on what describes the data as well.
+) -> tuple[WithLaw | None, Diagnosis]:
+    """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list.
 
     Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
     """
@@ -390,27 +372,38 @@ def explained_by_law(
     found = [_law_beside(system, diagnosis, kept, is_noise) for kept in _beside(system, diagnosis, doubtful, known)]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
-        return None, ()
+        return None, diagnosis
     shortest = min(a.length for a in answers)
     as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
-    best = min(as_good, key=lambda a: (a.of_motion, a.length))
+    best = min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length))
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
+    listed = replace(diagnosis, explanations=_listed(system, diagnosis, answers))
     if not best.length < known:
         text = f"a single law beside the catalogue describes the data too ({left:.4g}): {best.law.title}"
-        return None, (text,) if left <= at_noise else ()
+        return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
     if left > TELLS * noise:
-        return None, ()
-    best = replace(best, law=replace(best.law, rivals=_rivals(best, answers, diagnosis)))
-    others = (*best.law.alike, *(a.title for a in as_good if a is not best))
-    notes = [f"{other} describes what is missing as well" for other in others]
+        return None, diagnosis
     after = diagnosis.after.reduced_chi_square
     if diagnosis.found and after <= at_noise:
         names = ", ".join(f.candidate.name for f in diagnosis.found)
-        notes.append(
+        text = (
             f"known effects together ({names}) leave {after:.4g} of the expected variance where the law leaves "
             f"{left:.4g}: with their prices the law is ahead by {known - best.length:.4g}"
         )
-    return best, tuple(notes)
+        listed = replace(listed, remarks=(*diagnosis.remarks, text))
+    return replace(best, law=replace(best.law, rivals=_rivals(best, answers, diagnosis))), listed
+
+
+def _listed(
+    system: System, diagnosis: Diagnosis, answers: Sequence[WithLaw]
+) -> tuple[tuple[tuple[str, ...], float], ...]:
+    """Explanations by known effects and by laws that are not told from the shortest, and how much longer they are."""
+    settings, noise = diagnosis.settings, diagnosis.noise
+    found = [(e.effects, length(system, settings, noise, e.fit, e.candidates)) for e in diagnosis.ranked]
+    found += [((*(f.candidate.name for f in a.kept), a.law.title), a.length) for a in answers]
+    shortest = min(its for _, its in found)
+    near = ((names, its - shortest) for names, its in found if its - shortest < CLASS_GAIN)
+    return tuple(sorted(near, key=lambda one: one[1]))
 
 
 def _known(system: System, diagnosis: Diagnosis) -> float:

@@ -87,10 +87,8 @@ def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
     return vectors[:, common], eigenvalues[common] / float(np.mean(eigenvalues[~common]))
 
 
-def whitened(system: System, modes: tuple[Array, Array] | None) -> System:
+def whitened(system: System, modes: tuple[Array, Array]) -> System:
     """The system with the scatter of these directions brought down to that of the others."""
-    if modes is None:
-        return system
     vectors, variances = modes
     matrix = np.eye(len(vectors)) + (vectors * (1.0 / np.sqrt(variances) - 1.0)) @ vectors.T
     return RowWhitened(system, matrix)

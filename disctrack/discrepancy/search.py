@@ -21,7 +21,7 @@ from disctrack.discrepancy.fit import Fit, fit, no_fit, prior_residual
 from disctrack.discrepancy.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, RowWhitened, common_modes, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all, score_pairs
-from disctrack.discrepancy.shape import with_free_shape, with_shape
+from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
 from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
 from disctrack.discrepancy.system import (
     Candidate,
@@ -42,7 +42,6 @@ CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keep
 SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
 FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
-WORTH_A_SHAPE = 0.5  # share of what exceeds the noise that a law may leave for its shape to be sought
 FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
@@ -68,6 +67,11 @@ class Explanation:
     candidates: tuple[Candidate, ...]
     fit: Fit
     credible: bool = True  # a fit that has converged, to amounts that may be
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of its effects, sorted."""
+        return tuple(sorted(c.name for c in self.candidates))
 
     @property
     def names(self) -> frozenset[str]:
@@ -627,7 +631,7 @@ class _Search:
         tried = tuple(self._tried(s, found) for s in scores)
         shortest = self.length(after)
         ranked = tuple(self._ranked())
-        listed = tuple((tuple(sorted(c.name for c in e.candidates)), self.length(e) - shortest) for e in ranked)
+        listed = tuple((e.effects, self.length(e) - shortest) for e in ranked)
         return Diagnosis(
             verdict, reason, found, before.fit, after.fit, *held, self.noise, tried, self.settings, partial,
             explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN), ranked=ranked,

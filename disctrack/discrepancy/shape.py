@@ -21,6 +21,7 @@ HOPELESS = 0.02  # of what is still too much: a step that gains less does not le
 ENOUGH = 0.01  # of chi-square: a tenth of a sigma, beyond which a shape is not pursued
 STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour says nothing of the valley's floor
 NARROW = 1e-6  # of a shape's size: as close as two values need to be
+WORTH_A_SHAPE = 0.5  # share of what is too much, that a law, and then its shape to first order, remove to be pursued
 MAX_STARTED = 12  # iterations at each shape of the grid
 DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
 
@@ -45,6 +46,10 @@ def with_free_shape(
             fits.append(fit(system, quantities, base.values | start, MAX_STARTED))
     fitted = min(fits, key=lambda f: f.cost, default=None)
     if fitted is None or not fitted.cost < below:
+        return None
+    shape = replace(candidate, quantities=candidate.shape)
+    gain, _ = Linearisation(system, fitted, [shape]).gain_of(shape.names)
+    if fitted.cost - gain > goal and gain < WORTH_A_SHAPE * (fitted.cost - goal):
         return None
     free = [(q, expected) for q in candidate.shape if np.isfinite(expected := expected_sigma(system, fitted, q))]
     with suppress(TrialGivenUp), system.budget.trial(ALONG * system.trial_steps):

@@ -141,13 +141,7 @@ class DiscMember:
     def _prepare(self, systematic: Systematic) -> None:
         self.systematic = systematic
         if systematic != self.system.systematic:
-            self.system = DiscSystem(
-                self.trajectory,
-                self.declared.model,
-                stretch=self.stretch,
-                systematic=systematic,
-                known=self.declared.faults,
-            )
+            self.system = self.system.again(systematic=systematic)
         system = self.system
         self.base = fit(system, system.base, system.start())
         if not self.base.converged:

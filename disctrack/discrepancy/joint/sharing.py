@@ -130,9 +130,6 @@ class Sharing:
     def _variants(self, having: Mapping[int, Candidate]) -> list[Candidate]:
         """The candidate with one number for all, and with one for each group, as far as that makes sense."""
         first = next(iter(having.values()))
-        for i, c in having.items():
-            for q in c.shape:
-                self._share(i, q, q, 1.0, base=False)
         groups = {self.group(self.members[i], q) for i, c in having.items() for q in c.quantities[:1]}
         variants = []
         is_law = any(k in LAWS for q in first.quantities for k in q.belongs_to)

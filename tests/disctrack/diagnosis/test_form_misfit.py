@@ -29,16 +29,6 @@ def test_numbers_beside_a_misfit_scatter_as_generalised_least_squares_has_it(rng
     assert misfit == pytest.approx(0.7)
 
 
-def test_the_size_of_a_misfit_is_read_from_the_residual(rng):
-    """Where the residual holds none, next to nothing is allowed for; where it holds one, its size."""
-    B = 1e3 * rng.standard_normal((400, 60))
-    noise = rng.standard_normal(400)
-    none = form_misfit._second_moment(B, noise, [60])[1]
-    some = form_misfit._second_moment(B, noise + 0.1 * B @ rng.standard_normal(60), [60])[1]
-    assert none < 0.003
-    assert some == pytest.approx(0.1, rel=0.3)
-
-
 def test_what_the_recording_does_not_show_of_a_misfit_is_as_large_as_before_the_data(rng):
     """Of three parts one is seen and absent, one is seen and there, one leaves no trace: each has a size of its own."""
     B = 1e3 * rng.standard_normal((400, 60))

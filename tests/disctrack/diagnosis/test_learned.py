@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose, stage
+from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.missing_force import law_of, missing_moment, probe
@@ -16,8 +16,7 @@ from disctrack.diagnosis.pages.output import as_json
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.laws import Family, busy_amounts, learn, with_law, without_idle_terms
-from disctrack.discrepancy.search import Diagnosis, Found
-from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.discrepancy.system import Quantity
 from disctrack.faults.keys import Faults
 from disctrack.rolling import Model
 from disctrack.rolling.effects import effect_from_formulas
@@ -131,31 +130,6 @@ def test_of_terms_that_move_together_those_stay_that_do_for_all(rng):
     assert amount == pytest.approx(A[:, which] @ y / (A[:, which] @ A[:, which]), rel=1e-6)
     silent = replace(fitted, values=dict(zip(names, 0.1 * values, strict=True)))
     assert busy_amounts(silent, names) == {}
-
-
-def test_an_effect_beside_a_law_is_claimed_only_if_no_form_of_the_law_may_do_as_much():
-    """Two numbers that move together, each open: what both say is judged, with the covariance that is handed over."""
-    quantities = tuple(Quantity(f"spring.{name}", "1", 1.0) for name in ("k", "F"))
-    candidate = Candidate("spring", "spring", "motion", "a spring", "", quantities)
-    values = {"spring.k": -0.6, "spring.F": 0.3}
-    nearly = np.array([[0.2, -0.199], [-0.199, 0.2]])  # what the sum may err by is a fraction of either
-    fitted = Fit(quantities, values, nearly, 1.0, 0.0, 100, True, 3)
-    found = Found(candidate, 300.0, 10.0, 21.6, ())
-    diagnosis = Diagnosis("unexplained", "", (found,), fitted, fitted, None, None, 1.0, ())
-    kept, notes = stage._beside_any_form(diagnosis, [found], fitted, 0.0)
-    assert kept.found == (found,)
-    assert notes == ()
-    wider = replace(fitted, covariance=4.0 * nearly)
-    kept, (note,) = stage._beside_any_form(diagnosis, [found], wider, 0.0)
-    assert kept.found == ()
-    assert "[spring]" in note
-    assert "not claimed" in note
-    exponent = Quantity("spring.p", "1", 0.1, null=1.0)
-    known = replace(found, candidate=replace(candidate, quantities=(*quantities, exponent), shape=(exponent,)))
-    shaped = np.zeros((3, 3))
-    shaped[:2, :2], shaped[2, 2] = wider.covariance, 1e-6
-    bent = replace(wider, quantities=(*quantities, exponent), values=values | {"spring.p": 2.0}, covariance=shaped)
-    assert stage._beside_any_form(replace(diagnosis, found=(known,)), [known], bent, 0.0)[0].found == ()
 
 
 @pytest.mark.statistical

@@ -9,8 +9,7 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.stats import chi2
 
-from calibration.kit.least_squares import solve_bounded, triangle
-from disctrack.discrepancy.fit import compress, fit
+from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, angle, score_all
 from disctrack.discrepancy.search import Settings, explain, length
@@ -63,21 +62,6 @@ def oscillator(rng, hidden=None, n=400):
 
 
 START = {"a": 0.9, "b": 0.4, "w0": 6.4}
-
-
-def test_triangle_keeps_all_inner_products(rng):
-    A = rng.standard_normal((5000, 7)) * 10.0 ** np.arange(-3, 4)
-    R = triangle(A)
-    assert R.shape == (7, 7)
-    assert_allclose(R.T @ R, A.T @ A, rtol=1e-11, atol=1e-10)
-
-
-def test_compressed_problem_has_the_same_solution(rng):
-    A, b = rng.standard_normal((500, 4)), rng.standard_normal(500)
-    right, matrix = compress(b[:, None], A[:, None])
-    assert_allclose(solve_bounded(right, matrix, np.full(4, -np.inf), np.full(4, np.inf)), np.linalg.lstsq(A, b)[0])
-    bounded = solve_bounded(right, matrix, np.zeros(4), np.full(4, np.inf))
-    assert (bounded >= 0).all()
 
 
 def test_fit_scatters_as_its_covariance_says(rng):
