@@ -8,30 +8,34 @@ fails, going back over the frames before it was found again, and measuring blur 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.cameras.camera import StereoRig
+from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array, Array32, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
+from disctrack.track.dots._kernels import Heading
 from disctrack.track.dots.acquisition import acquire
 from disctrack.track.dots.template import (
     TYPICAL_BLUR_PX,
     NoiseModel,
     TemplateLimits,
     dot_centres,
-    face_edge,
+    expected_of,
     measure_noise,
     no_more_than_left,
+    pattern_of,
     typical_noise,
 )
 from disctrack.track.follow.motion_span import StillScene
+from disctrack.track.pose import cameras_of
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
@@ -62,37 +66,27 @@ class Law:
         return replace(limits, misfit=max(limits.misfit, UNUSUAL * self.misfit))
 
 
-@dataclass(frozen=True)
-class Heading:
-    """The last three poses, from which the next is predicted (`_kernels.track_frames`)."""
+def steady(last: Pose, before: Pose) -> Heading:
+    """The next prediction makes their turn and shift once more, as if they had been made before, too."""
+    turn = last[0] @ before[0].T
+    R, t = np.stack([last[0], before[0], turn.T @ before[0]]), np.stack([last[1], before[1], 2 * before[1] - last[1]])
+    return Heading(R, t)
 
-    last: Pose
-    before: Pose
-    older: Pose
 
-    @classmethod
-    def steady(cls, last: Pose, before: Pose) -> Heading:
-        """The next prediction makes their turn and shift once more, as if they had been made before, too."""
-        turn = last[0] @ before[0].T
-        return cls(last, before, (turn.T @ before[0], 2 * before[1] - last[1]))
+def leading_to(pose: Pose, following: Pose | None) -> Heading:
+    """The next prediction is `pose`, the one after it `following`, or the same where that is not known."""
+    (R, t), (R_next, t_next) = pose, following or pose
+    turn, shift = R_next @ R.T, t_next - t
+    return steady((turn.T @ R, t - shift), (turn.T @ turn.T @ R, t - 2 * shift))
 
-    @classmethod
-    def leading_to(cls, pose: Pose, following: Pose | None) -> Heading:
-        """The next prediction is `pose`, the one after it `following`, or the same where that is not known."""
-        R, t = pose
-        turn, shift = np.eye(3), np.zeros(3)
-        if following is not None:
-            turn, shift = following[0] @ R.T, following[1] - t
-        last = (turn.T @ R, t - shift)
-        return cls.steady(last, (turn.T @ last[0], t - 2 * shift))
 
-    def carried_on(self, steps: int) -> Heading:
-        """As after so many more frames of the same motion."""
-        turn, shift = self.last[0] @ self.before[0].T, self.last[1] - self.before[1]
-        last, before = self.last, self.before
-        for _ in range(steps):
-            last, before = (turn @ last[0], last[1] + shift), last
-        return Heading.steady(last, before)
+def carried_on(heading: Heading, steps: int) -> Heading:
+    """As after so many more frames of the same motion."""
+    last, before, _ = zip(*heading, strict=True)
+    turn, shift = last[0] @ before[0].T, last[1] - before[1]
+    for _ in range(steps):
+        last, before = (turn @ last[0], last[1] + shift), last
+    return steady(last, before)
 
 
 @dataclass(frozen=True)
@@ -146,6 +140,13 @@ class TrackingSetup:
     maps_x: Array  # (2, height, width) undistorted normalised coordinates of every pixel
     maps_y: Array
 
+    @classmethod
+    def of(cls, rig: StereoRig, disc: Disc, limits: TemplateLimits) -> TrackingSetup:
+        """With the maps of the cameras, drawn side by side."""
+        with ThreadPoolExecutor(len(rig.cameras)) as pool:
+            maps = list(pool.map(normalised_maps, rig.cameras))
+        return cls(rig, disc, limits, *(np.stack(part) for part in zip(*maps, strict=True)))
+
 
 @dataclass
 class Tables:
@@ -164,19 +165,17 @@ class Tables:
     digest: NDArray[np.uint32]  # (n, 2) of some of each image's rows; 0 where there is no image
 
 
-@dataclass
-class Rows:
+class Rows(NamedTuple):
     """What the loop over frames fills."""
 
-    results: Array  # (n, 2, m, 12)
-    status: NDArray[np.uint8]  # (n, 2, m)
+    dots: NDArray[np.void]  # (n, 2, m) of _kernels.DOT
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
 
     def part(self, start: int, stop: int | None = None) -> Rows:
         """Views of the rows start..stop-1."""
         rows = slice(start, stop)
-        return Rows(self.results[rows], self.status[rows], self.R[rows], self.t[rows])
+        return Rows(self.dots[rows], self.R[rows], self.t[rows])
 
 
 @dataclass
@@ -211,56 +210,35 @@ def run(
     setup: TrackingSetup, law: Law, heading: Heading, images: Image, readable: Mask, rows: Rows
 ) -> tuple[int, Heading]:
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
-    poses = setup.rig.camera_poses()
-    # the loop moves them on
-    known = [np.array(part, float, order="C") for part in (*heading.last, *heading.before, *heading.older)]
+    heading = Heading(*(np.array(part, float, order="C") for part in heading))  # the loop moves it on
     done = kernels.track_frames(
+        kernels.addresses_for(images.dtype),
         images,
         readable,
         setup.maps_x,
         setup.maps_y,
-        np.stack([camera.parameters for camera in setup.rig.cameras]),
-        np.stack([R for R, _ in poses]),
-        np.stack([t for _, t in poses]),
-        np.ascontiguousarray(setup.disc.marker_centres_body),
-        0.5 * setup.disc.marker_diameter,
-        face_edge(setup.disc),
-        np.array(law.blur),
-        np.stack([noise.parameters for noise in law.noise]),
-        law.limits(setup.limits).array(),
-        *known,
-        rows.results,
-        rows.status,
-        rows.R,
-        rows.t,
+        cameras_of(setup.rig),
+        pattern_of(setup.disc),
+        expected_of(law.noise, law.blur, law.limits(setup.limits)),
+        heading,
+        *rows,
         MAX_PREDICTION_RMS_PX,
     )
-    R_last, t_last, R_before, t_before, R_older, t_older = known
-    return int(done), Heading((R_last, t_last), (R_before, t_before), (R_older, t_older))
+    return int(done), heading
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the loop over frames for images of this type, or load it."""
-    zeros = np.zeros
+    images, readable, *known = kernels.nothing_to_see(dtype)[1:8]
+    heading = Heading(np.zeros((3, 3, 3)), np.zeros((3, 3)))
+    rows = empty_rows(0, 1)
     kernels.track_frames(
-        zeros((0, 2, 8, 8), dtype),
-        zeros((0, 2), bool),
-        zeros((2, 8, 8)),
-        zeros((2, 8, 8)),
-        zeros((2, 9)),
-        zeros((2, 3, 3)),
-        zeros((2, 3)),
-        zeros((1, 3)),
-        1.0,
-        1.0,
-        zeros(2),
-        zeros((2, 3)),
-        zeros(5),
-        *(np.eye(3), zeros(3)) * 3,
-        zeros((0, 2, 1, kernels.N_RESULT)),
-        zeros((0, 2, 1), np.uint8),
-        zeros((0, 3, 3)),
-        zeros((0, 3)),
+        kernels.addresses_for(np.dtype(dtype)),
+        images[None][:0],
+        readable[None][:0],
+        *known,
+        heading,
+        *rows,
         MAX_PREDICTION_RMS_PX,
     )
 
@@ -291,8 +269,9 @@ def clear(tables: Tables, rows: slice) -> None:
 
 def empty_rows(n: int, m: int) -> Rows:
     """Rows of n pairs and m dots that nothing has filled."""
-    tables = empty_tables(n, m)
-    return Rows(np.full((n, 2, m, kernels.N_RESULT), np.nan), tables.status, tables.R, tables.t)
+    dots = np.zeros((n, 2, m), kernels.DOT)
+    dots["status"] = MarkerStatus.NOT_LOOKED_FOR
+    return Rows(dots, np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan))
 
 
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
@@ -302,8 +281,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
     if follower.first_row is None:
         follower.first_row = start
     readable = readable & ~_repeated_alone(images, readable, tables, start, follower.first_row)
-    results = np.full((n, 2, follower.setup.disc.n_markers, kernels.N_RESULT), np.nan)
-    rows = Rows(results, tables.status[own], tables.R[own], tables.t[own])
+    rows = empty_rows(n, follower.setup.disc.n_markers)
     status = tables.frame_status[own]
     while i < n:
         if not readable[i].any():
@@ -328,11 +306,9 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
         i += done
         follower.search = replace(follower.search.frames_later(done), failures=0, scenes=None)
         follower.lost = 0 if i < n else None
-    dots = dot_centres(results, rows.status)
-    tables.pixels[own], tables.covariance_px2[own] = dots.pixels, dots.covariance_px2
-    tables.misfit[own], tables.n_pixels[own] = dots.misfit, results[..., kernels.N_PIXELS]
-    tables.blur_px[own] = dots.blur_px
-    tables.contrast[own] = dots.contrast
+    tables.R[own], tables.t[own], dots = rows.R, rows.t, dot_centres(rows.dots)
+    for name in ("pixels", "covariance_px2", "status", "misfit", "n_pixels", "blur_px", "contrast"):
+        getattr(tables, name)[own] = getattr(dots, name)
 
 
 def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, first: int) -> Mask:
@@ -384,7 +360,7 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     than any other frame; then, now and then, it is searched for in the whole images.
     """
     if follower.heading is not None and follower.lost is not None and follower.lost <= MOST_CARRIED:
-        carried = follower.heading.carried_on(follower.lost)
+        carried = carried_on(follower.heading, follower.lost)
         if _holds(follower, carried, images, readable):
             follower.heading = carried
             return True
@@ -401,16 +377,16 @@ def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) 
     """True where the first of the pairs shows dots enough at the place where the heading leads."""
     trial = empty_rows(1, follower.setup.disc.n_markers)
     done, _ = run(follower.setup, follower.law, heading, images[:1], readable[:1], trial)
-    if done and _enough(trial.status):
+    if done and _enough(trial.dots):
         return True
-    follower.first_reason = follower.first_reason or _refusals(trial.status[0])
+    follower.first_reason = follower.first_reason or _refusals(trial.dots[0])
     return False
 
 
-def _enough(status: NDArray[np.uint8]) -> bool:
-    """True where a pose with dots of this status (1, 2, m) is not chance."""
-    found = int(np.sum(status == MarkerStatus.MEASURED))
-    return found >= min(MIN_TO_BEGIN, status.shape[-1])
+def _enough(dots: NDArray[np.void]) -> bool:
+    """True where a pose with these dots (1, 2, m) is not chance."""
+    found = int(np.sum(dots["status"] == MarkerStatus.MEASURED))
+    return found >= min(MIN_TO_BEGIN, dots.shape[-1])
 
 
 def _go_back(
@@ -429,23 +405,22 @@ def _go_back(
         return
     back = slice(first, found)
     trial = empty_rows(found - first, follower.setup.disc.n_markers)
-    heading = Heading.steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
+    heading = steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
     pairs: Image = np.ascontiguousarray(images[back][::-1])  # type: ignore[assignment]  # the stubs forget the depth
     usable = np.ascontiguousarray(readable[back][::-1])
     done, _ = run(follower.setup, follower.law, heading, pairs, usable, trial)
     for k in range(done):
-        if not _enough(trial.status[k : k + 1]):
+        if not _enough(trial.dots[k : k + 1]):
             break
         i = found - 1 - k
-        rows.results[i], rows.status[i], rows.R[i], rows.t[i] = (
-            trial.results[k], trial.status[k], trial.R[k], trial.t[k],
-        )  # fmt: skip
+        for row, found_there in zip(rows, trial, strict=True):
+            row[i] = found_there[k]
         status[i] = FrameStatus.MEASURED
 
 
-def _refusals(status: NDArray[np.uint8]) -> str:
+def _refusals(dots: NDArray[np.void]) -> str:
     """Why the dots (2, m) of a pair were refused, in words."""
-    kinds, counts = np.unique(status, return_counts=True)
+    kinds, counts = np.unique(dots["status"], return_counts=True)
     listed = ", ".join(f"{n} {MarkerStatus(k).name.lower()}" for k, n in zip(kinds, counts, strict=True))
     return f"blobs lie where the dots should be, but their grey values do not fit the dots of [markers]: {listed}"
 
@@ -458,7 +433,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     following = None
     if len(images) > 1 and readable[1].any():
         following = _found(follower, images[1], readable[1])
-    heading = Heading.leading_to(pose, following)
+    heading = leading_to(pose, following)
     if not follower.measured and (law := follower.given()) is not None:
         follower.keep_law(law)
     if not follower.measured:
@@ -503,17 +478,17 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
         trial = empty_rows(n, m)
         limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf, share=MOST_USUAL)
         done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
-        if done == 0 or not _enough(trial.status[:1]):
+        if done == 0 or not _enough(trial.dots[:1]):
             follower.law = law  # how the noise was taken to be tells why the dots are refused
             return
-        good = trial.status[:done] == MarkerStatus.MEASURED
+        good = trial.dots["status"][:done] == MarkerStatus.MEASURED
         for camera, (R_cw, t_cw) in views:
-            fits = trial.results[:done, camera][good[:, camera]]
+            fits = trial.dots[:done, camera][good[:, camera]]
             if not len(fits):
                 continue
-            blur[camera] = float(np.median(fits[:, kernels.FIT_SIGMA]))
-            light[camera] = tuple(np.median(fits[:, (kernels.FIT_LEVEL, kernels.FIT_CONTRAST)], axis=0).tolist())
-            misfit = max(misfit, float(np.sqrt(np.median(fits[:, kernels.CHI_SQUARE]))))
+            blur[camera] = float(np.median(fits["blur"]))
+            light[camera] = float(np.median(fits["level"])), float(np.median(fits["contrast"]))
+            misfit = max(misfit, float(np.sqrt(np.median(fits["misfit"]))))
             if not blur_known:
                 continue
             sample = range(0, done, NOISE_STEP)
@@ -527,17 +502,17 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             )
             noise[camera] = no_more_than_left(flat, noise[camera], fits)
     follower.saturated = (
-        _saturated(images[:done, 0], trial.results[:done, 0], noise[0]),
-        _saturated(images[:done, 1], trial.results[:done, 1], noise[1]),
+        _saturated(images[:done, 0], trial.dots[:done, 0], noise[0]),
+        _saturated(images[:done, 1], trial.dots[:done, 1], noise[1]),
     )
     follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1]), (light[0], light[1]), misfit))
 
 
-def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:
-    """Grey value at which the brighter side of the edges of dots (n, m, 12) is clipped; None where it is not."""
+def _saturated(images: Image, dots: NDArray[np.void], noise: NoiseModel) -> int | None:
+    """Grey value at which the brighter side of the edges of dots (n, m) is clipped; None where it is not."""
     saturation = saturation_level(images)
-    light = results[..., kernels.FIT_LEVEL] * (1.0 - np.minimum(results[..., kernels.FIT_CONTRAST], 0.0))
-    if saturation is None or not np.isfinite(light).any():
+    fits = dots[dots["n_pixels"] > 0]
+    if saturation is None or not len(fits):
         return None
-    level = float(np.nanmedian(light))
+    level = float(np.median(fits["level"] * (1.0 - np.minimum(fits["contrast"], 0.0))))
     return saturation if saturation - level < 3.0 * np.sqrt(noise.variance(np.array(level))) else None
