@@ -8,6 +8,7 @@ that is named after the contents of every file with compiled functions: other so
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from hashlib import sha256
@@ -16,10 +17,8 @@ from typing import Any
 
 import numba
 from filelock import FileLock
-from llvmlite import ir
-from numba import types
 from numba.core import event
-from numba.extending import intrinsic
+from numba.core.errors import NumbaExperimentalFeatureWarning
 
 njit: Any = numba.njit  # types of a decorated function say nothing of how it is called
 cfunc: Any = numba.cfunc
@@ -50,6 +49,7 @@ def _folder() -> Path:
 
 FOLDER = _folder()
 config.CACHE_DIR = str(FOLDER)
+warnings.simplefilter("ignore", NumbaExperimentalFeatureWarning)  # functions as arguments (`compiled_apart`)
 
 
 class _BeforeCompiling(event.Listener):
@@ -80,27 +80,10 @@ def one_at_a_time(tell: Callable[[], None] = lambda: None, what: str = "") -> It
         lock.release()
 
 
-@intrinsic
-def call_at(typingctx, address, *arguments):  # type: ignore[no-untyped-def]
-    """Number that the C function at `address` (`address_of`) returns; the arguments must have its own types.
+def compiled_apart(function: Callable[..., float], *like: object, **rules: Any) -> Any:
+    """The function, compiled for arguments of the types of `like` alone, as an argument of compiled functions.
 
-    For numba optimises a function anew with each that calls it; of one that is called by its address it sees nothing.
+    For numba optimises a function anew with each that calls it; of one that it is given it knows but the types.
     """
-    given = [types.unliteral(argument) for argument in arguments]
-    signature = types.float64(types.int64, types.StarArgTuple(given))
-
-    def codegen(context, builder, signature, values):  # type: ignore[no-untyped-def]
-        parts = [builder.extract_value(values[1], i) for i in range(len(given))]
-        called = ir.FunctionType(ir.DoubleType(), [context.get_value_type(each) for each in given])
-        return builder.call(builder.inttoptr(values[0], called.as_pointer()), parts)
-
-    return signature, codegen
-
-
-_kept: list[Any] = []  # C functions, which own their code
-
-
-def address_of(function: Callable[..., float], *like: object, **rules: Any) -> int:
-    """Address of the function, compiled for arguments of the types of `like`, for as long as the process lasts."""
-    _kept.append(cfunc(types.float64(*map(numba.typeof, like)), cache=True, **rules)(function))
-    return int(_kept[-1].address)
+    with event.trigger_event("numba:compile"):
+        return cfunc(numba.float64(*map(numba.typeof, like)), cache=True, **rules)(function)

@@ -5,8 +5,8 @@ pairs/s. What is done per pixel is written so that the compiler makes vector cod
 precision without a branch, in pixels as the unit of length (rounding moves a centre by less than 1e-6 px).
 
 What compiling costs grows with every level of calls, for each level is optimised anew with all that it calls. So the
-large functions are compiled apart, and call each other by address (`Addresses`); whole slices are not assigned (the
-text of the error that numba prepares for unequal shapes takes longer to compile than the loop).
+large functions are compiled apart, and given to those that call them (`compiled_for`); whole slices are not assigned
+(the text of the error that numba prepares for unequal shapes takes longer to compile than the loop).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from calibration.kit.arrays import Array
-from calibration.kit.compiled import address_of, call_at, njit
+from calibration.kit.compiled import compiled_apart, njit
 from disctrack.trajectory import MarkerStatus
 
 # No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
@@ -46,14 +46,14 @@ class Pattern(NamedTuple):
     rim: float  # about the pattern's origin [m]: no blur of an edge as wide may reach the pixels used
 
 
-class Limits(NamedTuple):
-    """When a converged fit is refused: see `template.TemplateLimits`."""
+class TemplateLimits(NamedTuple):
+    """When a converged fit is refused."""
 
-    misfit: float
-    share: float
-    clipped: float
-    radius: float
-    blur: float
+    misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
+    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
+    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
+    radius: float = 0.20  # relative departure of the fitted radius
+    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
 
 
 class Expected(NamedTuple):
@@ -61,7 +61,7 @@ class Expected(NamedTuple):
 
     blur: Array  # (c,) sigma of an edge [px]
     noise: Array  # (c, 3): variance = [0] + [1] grey, and the square of the grey values' step
-    limits: Limits
+    limits: TemplateLimits
 
 
 class Heading(NamedTuple):
@@ -132,13 +132,6 @@ class _Ellipse(NamedTuple):
     short: float
 
 
-class _Window(NamedTuple):
-    left: int
-    right: int
-    top: int
-    bottom: int
-
-
 class _Rows(NamedTuple):
     """Rows of what is kept of every pixel."""
 
@@ -164,16 +157,7 @@ class Work(NamedTuple):
     matrix: Array  # (8, 8) of the normal equations
     right: Array  # (8,)
     step: Array  # (8,)
-    told: Array  # (2,) what a function that is called by its address tells beside a number
-
-
-class Addresses(NamedTuple):
-    """Of the functions that are compiled apart."""
-
-    select: int
-    whiten: int
-    fit: int
-    look: int
+    told: Array  # (2,) what a function that is compiled apart tells beside a number
 
 
 # Pixels of a dot of 60 px; more are made room for. No power of two: rows would fall on one another's cache
@@ -392,13 +376,14 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
 
     unit: plane units per pixel. work.told receives the mean grey values in and outside.
     """
+    left, right, top, bottom = window
     pixels = work.pixels
     candidates = pixels[_ROW.jacobian :]
     band = 3.0 * p.blur + 1.0
     # Of each row the pixels between two ellipses, longer and shorter by the band than the dot's own, by the linear map:
     # its scale changes over the window, and a pixel is one more in doubt. In the ring of both nothing is decided by
     # branches, so that it is vector code.
-    doubt = 0.05 * math.hypot(window.right - window.left, window.bottom - window.top) * math.hypot(g.near_u, g.near_v)
+    doubt = 0.05 * math.hypot(right - left, bottom - top) * math.hypot(g.near_u, g.near_v)
     longest, shortest = p.radius * g.steepest / abs(g.det), p.radius / g.steepest
     more, less = band + 1.0, band + 2.0
     rim_xx, rim_xy, rim_yy = _conic(g, longest * (1.0 + doubt) + more, shortest * (1.0 + doubt) + more)
@@ -409,7 +394,7 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
     n = 0
-    for y in range(window.top, window.bottom + 1):
+    for y in range(top, bottom + 1):
         dy = y - v0
         reach2 = (rim_xy * rim_xy - rim_xx * rim_yy) * dy * dy + rim_xx
         hole2 = (hole_xy * hole_xy - hole_xx * hole_yy) * dy * dy + hole_xx
@@ -417,7 +402,7 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
             continue
         middle, hole_middle = u0 - rim_xy / rim_xx * dy, u0 - hole_xy / hole_xx * dy
         reach, hole = math.sqrt(reach2) / rim_xx, math.sqrt(max(hole2, 0.0)) / hole_xx
-        first, end = max(int(math.ceil(middle - reach)), window.left), min(int(middle + reach) + 1, window.right + 1)
+        first, end = max(int(math.ceil(middle - reach)), left), min(int(middle + reach) + 1, right + 1)
         hole_from = min(int(math.ceil(hole_middle - hole)), end) if hole2 > 0.0 else end
         hole_to = max(int(hole_middle + hole) + 1, first) if hole2 > 0.0 else end
         for part in range(2):
@@ -658,7 +643,7 @@ def _normal_equations(pixels, n, matrix, right):
 
 
 @_part
-def _descend(addresses, work, n, p, g, ellipse, radius, blurred, clip):
+def _descend(whiten, work, n, p, g, ellipse, radius, blurred, clip):
     """Levenberg-Marquardt on the template; returns converged, the template, chi-square and the clipped pixels.
 
     blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
@@ -670,7 +655,7 @@ def _descend(addresses, work, n, p, g, ellipse, radius, blurred, clip):
     before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
     previous, n_clipped = p, 0.0
     for _ in range(_MAX_ITERATIONS + 1):
-        chi2 = call_at(addresses.whiten, work, n, p, g, ellipse, blurred, clip) + prior * (p.radius - radius) ** 2
+        chi2 = whiten(work, n, p, g, ellipse, blurred, clip) + prior * (p.radius - radius) ** 2
         n_clipped = work.told[0]
         if converged:
             return True, p, chi2, n_clipped
@@ -731,7 +716,7 @@ def _weigh(pixels, n, p, noise, light):
         grey[i] *= in_light  # a product in double precision, rounded once
 
 
-def _fit_dot(addresses, image, map_x, map_y, P, start, blur, noise, rim, neighbours, work, dot):
+def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, neighbours, work, dot):
     """Fit the image of one circular dot to the grey values round its edge; fills `dot`, whose status tells of success.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> plane of the
@@ -763,16 +748,16 @@ def _fit_dot(addresses, image, map_x, map_y, P, start, blur, noise, rim, neighbo
         band = 3.0 * p.blur + 1.0
         extent_x = radius * math.hypot(g.xv, g.yv) / abs(g.det) + band
         extent_y = radius * math.hypot(g.xu, g.yu) / abs(g.det) + band
-        window = _Window(int(math.floor(u0 - extent_x)), int(math.ceil(u0 + extent_x)),
-                         int(math.floor(v0 - extent_y)), int(math.ceil(v0 + extent_y)))  # fmt: skip
-        if window.left < 1 or window.top < 1 or window.right > width - 2 or window.bottom > height - 2:
+        left, right = int(math.floor(u0 - extent_x)), int(math.ceil(u0 + extent_x))
+        top, bottom = int(math.floor(v0 - extent_y)), int(math.ceil(v0 + extent_y))
+        if left < 1 or top < 1 or right > width - 2 or bottom > height - 2:
             return 0.0
-        room = (window.right - window.left + 1) * (window.bottom - window.top + 1) + 1
+        room = (right - left + 1) * (bottom - top + 1) + 1
         if room > work.pixels.shape[1]:
             more = np.empty((_ROW.number, room), np.float32)
             work = Work(more, work.matrix, work.right, work.step, work.told)
-        found = call_at(addresses.select, image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, u0, v0,
-                        work)  # fmt: skip
+        window = left, right, top, bottom
+        found = select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, u0, v0, work)
         n, inside, outside = int(found), work.told[0], work.told[1]
         if blurred:
             reach = max(1, int(0.5 * min(extent_x, extent_y)))
@@ -791,7 +776,7 @@ def _fit_dot(addresses, image, map_x, map_y, P, start, blur, noise, rim, neighbo
         _weigh(work.pixels, n, p, noise, light)
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
-            converged, p, chi2, n_clipped = _descend(addresses, work, n, p, g, ellipse, radius, blurred, limit)
+            converged, p, chi2, n_clipped = _descend(whiten, work, n, p, g, ellipse, radius, blurred, limit)
             if not converged:
                 dot.status = MarkerStatus.NOT_CONVERGED
                 return 0.0
@@ -854,7 +839,7 @@ def _judge(dot, radius, blur, noise, limits):
         dot.status = MarkerStatus.BLURRED
 
 
-def _look(addresses, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots):
+def _look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots):
     """Locate and judge the dots (c, m) in the images (c, H, W) of one instant, the disc being near the pose R, t.
 
     u and v are the image of the dot's own centre, not the centre of its elliptical image.
@@ -892,8 +877,8 @@ def _look(addresses, images, readable, maps_x, maps_y, cameras, pattern, expecte
                 other = k + 1 if k >= i else k
                 neighbours[k, 0], neighbours[k, 1] = pattern.centres[other, 0], pattern.centres[other, 1]
             start, blur, noise = Place(x, y, pattern.radius, u, v), expected.blur[c], expected.noise[c]
-            call_at(addresses.fit, addresses, images[c], maps_x[c], maps_y[c], P, start, blur, noise, pattern.rim,
-                    neighbours, work, dot)  # fmt: skip
+            fit(select, whiten, images[c], maps_x[c], maps_y[c], P, start, blur, noise, pattern.rim, neighbours, work,
+                dot)  # fmt: skip
             if dot.status == MarkerStatus.MEASURED:
                 px, py, pz = _turned(R_cb, dot.u, dot.v, z)
                 dot.u, dot.v = _project_point(camera, px + shift[0], py + shift[1], pz + shift[2])
@@ -1023,14 +1008,15 @@ def _predict(heading, R, t):
 
 
 @_entry
-def track_frames(addresses, images, readable, maps_x, maps_y, cameras, pattern, expected, heading, dots, R_out, t_out,
+def track_frames(compiled, images, readable, maps_x, maps_y, cameras, pattern, expected, heading, dots, R_out, t_out,
                  max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the three before; `heading` is moved on.
 
-    images (n, c, H, W); readable (n, c); maps_x, maps_y (c, H, W): normalised coordinates of every pixel. Filled: dots
-    (n, c, m) of DOT, R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc
-    was lost at that frame.
+    compiled: see `compiled_for`; images (n, c, H, W); readable (n, c); maps_x, maps_y (c, H, W): normalised coordinates
+    of every pixel. Filled: dots (n, c, m) of DOT, R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed;
+    less than n where the disc was lost at that frame.
     """
+    select, whiten, fit, look = compiled
     work = Work(np.empty((_ROW.number, _PIXELS), np.float32), np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(2))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
@@ -1038,8 +1024,8 @@ def track_frames(addresses, images, readable, maps_x, maps_y, cameras, pattern, 
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
-            call_at(addresses.look, addresses, images[f], readable[f], maps_x, maps_y, cameras, pattern, expected, R, t,
-                    work, dots[f])  # fmt: skip
+            look(select, whiten, fit, images[f], readable[f], maps_x, maps_y, cameras, pattern, expected, R, t, work,
+                 dots[f])  # fmt: skip
             rms = _settle(dots[f], cameras, pattern, R, t)
             turned = 0.0
             for i in range(3):
@@ -1061,19 +1047,20 @@ def track_frames(addresses, images, readable, maps_x, maps_y, cameras, pattern, 
 
 
 @_entry
-def look(addresses, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots):
-    """`_look` for Python."""
-    call_at(addresses.look, addresses, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots)
+def fit_dot(compiled, image, map_x, map_y, P, start, expected, rim, neighbours, work, dot):
+    """`_fit_dot` for Python, judged; `expected` of one camera."""
+    select, whiten, fit, _ = compiled
+    blur, noise = expected.blur[0], expected.noise[0]
+    fit(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, neighbours, work, dot)
+    if dot.status == MarkerStatus.MEASURED:
+        _judge(dot, start.radius, blur, noise, expected.limits)
 
 
 @_entry
-def fit_dot(addresses, image, map_x, map_y, P, start, expected, rim, neighbours, work, dot):
-    """`_fit_dot` for Python, judged; `expected` of one camera."""
-    noise = expected.noise[0]
-    call_at(addresses.fit, addresses, image, map_x, map_y, P, start, expected.blur[0], noise, rim, neighbours, work,
-            dot)  # fmt: skip
-    if dot.status == MarkerStatus.MEASURED:
-        _judge(dot, start.radius, expected.blur[0], noise, expected.limits)
+def look(compiled, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots):
+    """`_look` for Python."""
+    select, whiten, fit, look = compiled
+    look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots)
 
 
 # The same where Python calls them: compiled the first time that they are called.
@@ -1087,31 +1074,31 @@ def scratch() -> Work:
 
 
 @cache
-def addresses_for(dtype: np.dtype) -> Addresses:
-    """The functions that are compiled apart, for images of this type: compiled now, or loaded."""
-    own, images, flag, maps, _, cameras, pattern, expected, plane, vector, work, dots = nothing_to_see(dtype)
+def compiled_for(dtype: np.dtype) -> tuple[Any, ...]:
+    """`_select`, `_whiten`, `_fit_dot` and `_look` for images of this type: compiled now, or loaded."""
+    images, flag, maps, _, cameras, pattern, expected, plane, vector, work, dots = nothing_to_see(dtype)
     template, near, ellipse = _Template(*[0.0] * 8), _Map(*[0.0] * 8), _Ellipse(*[0.0] * 10)
-    place, window = Place(*[0.0] * 5), _Window(0, 0, 0, 0)
-    select = address_of(_select, images[0], plane, plane, plane, place, window, 0.0, plane, near, 0.0, template, 0.0,
-                        0.0, work, **_RULES)  # fmt: skip
-    whiten = address_of(_whiten, work, 0, template, near, ellipse, True, 0.0, **_RULES)
-    fit = address_of(_fit_dot, own, images[0], plane, plane, plane, place, 0.0, vector, 0.0, plane, work, dots[0, 0],
-                     **_RULES)  # fmt: skip
-    seen = address_of(_look, own, images, flag, maps, maps, cameras, pattern, expected, plane, vector, work, dots,
-                      **_RULES)  # fmt: skip
-    return Addresses(select, whiten, fit, seen)
+    place, image = Place(*[0.0] * 5), images[0]
+    select = compiled_apart(_select, image, plane, plane, plane, place, (0, 0, 0, 0), 0.0, plane, near, 0.0, template,
+                            0.0, 0.0, work, **_RULES)  # fmt: skip
+    whiten = compiled_apart(_whiten, work, 0, template, near, ellipse, True, 0.0, **_RULES)
+    fit = compiled_apart(_fit_dot, select, whiten, image, plane, plane, plane, place, 0.0, vector, 0.0, plane, work,
+                         dots[0, 0], **_RULES)  # fmt: skip
+    seen = compiled_apart(_look, select, whiten, fit, images, flag, maps, maps, cameras, pattern, expected, plane,
+                          vector, work, dots, **_RULES)  # fmt: skip
+    return select, whiten, fit, seen
 
 
 def nothing_to_see(dtype: DTypeLike) -> tuple[Any, ...]:
     """Arguments of `look` with an image (1, 1) that cannot be read, of one camera and one dot."""
     plane, vector = np.eye(3), np.zeros(3)
-    cameras, expected = Cameras(plane, plane[None], plane), Expected(vector, plane, Limits(*[0.0] * 5))
+    cameras, expected = Cameras(plane, plane[None], plane), Expected(vector, plane, TemplateLimits())
     return (
-        Addresses(0, 0, 0, 0), np.zeros((1, 1, 1), dtype), np.zeros(1, bool), plane[None], plane[None], cameras,
+        np.zeros((1, 1, 1), dtype), np.zeros(1, bool), plane[None], plane[None], cameras,
         Pattern(plane[:1], 0.0, 0.0), expected, plane, vector, scratch(), np.zeros((1, 1), DOT),
     )  # fmt: skip
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile `look` for images of this type, or load it."""
-    look(addresses_for(np.dtype(dtype)), *nothing_to_see(dtype)[1:])
+    look(compiled_for(np.dtype(dtype)), *nothing_to_see(dtype))

@@ -14,7 +14,7 @@ printed too large, or motion blur, costs no accuracy.
 """
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
+from disctrack.track.dots._kernels import TemplateLimits
 from disctrack.trajectory import MarkerStatus
 
 TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
@@ -52,17 +53,6 @@ def typical_noise(image: Image) -> NoiseModel:
     """Noise of an ordinary camera (50 electrons per grey value of 8 bits), where nothing was measured."""
     grey = full_scale(image) / 255.0
     return NoiseModel(grey**2, 0.02 * grey, float(level_step(image)))
-
-
-@dataclass(frozen=True)
-class TemplateLimits:
-    """When a converged fit is refused."""
-
-    misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
-    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
-    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
-    radius: float = 0.20  # relative departure of the fitted radius
-    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
 
 
 @dataclass(frozen=True)
@@ -109,7 +99,7 @@ def locate_on_disc(
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
     dots = np.zeros((1, disc.n_markers), kernels.DOT)
     kernels.look(
-        kernels.addresses_for(image.dtype),
+        kernels.compiled_for(image.dtype),
         np.ascontiguousarray(image)[None],
         np.ones(1, bool),
         map_x[None],
@@ -154,7 +144,7 @@ def locate_on_plane(
         others = np.delete(centres, i, axis=0)
         near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
         kernels.fit_dot(
-            kernels.addresses_for(image.dtype), contiguous, map_x, map_y, np.linalg.inv(H[i]), start, expected, np.inf,
+            kernels.compiled_for(image.dtype), contiguous, map_x, map_y, np.linalg.inv(H[i]), start, expected, np.inf,
             near, kernels.scratch(), dots[i],
         )  # fmt: skip
         u = H[i] @ (dots[i]["u"], dots[i]["v"], 1.0)
@@ -172,7 +162,7 @@ def pattern_of(disc: Disc) -> kernels.Pattern:
 def expected_of(noise: Sequence[NoiseModel], blur_px: Sequence[float], limits: TemplateLimits) -> kernels.Expected:
     """What is known of each camera's images, for the compiled kernels."""
     rows = np.array([model.parameters for model in noise])
-    return kernels.Expected(np.array(blur_px, float), rows, kernels.Limits(*map(float, astuple(limits))))
+    return kernels.Expected(np.array(blur_px, float), rows, TemplateLimits(*map(float, limits)))
 
 
 def dot_centres(dots: NDArray[np.void]) -> DotCentres:

@@ -21,12 +21,11 @@ from calibration.kit.arrays import Array, Array32, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots._kernels import Heading
+from disctrack.track.dots._kernels import Heading, TemplateLimits
 from disctrack.track.dots.acquisition import acquire
 from disctrack.track.dots.template import (
     TYPICAL_BLUR_PX,
     NoiseModel,
-    TemplateLimits,
     dot_centres,
     expected_of,
     measure_noise,
@@ -63,7 +62,7 @@ class Law:
 
     def limits(self, limits: TemplateLimits) -> TemplateLimits:
         """A dot is refused for a misfit that is unusual in this recording."""
-        return replace(limits, misfit=max(limits.misfit, UNUSUAL * self.misfit))
+        return limits._replace(misfit=max(limits.misfit, UNUSUAL * self.misfit))
 
 
 def steady(last: Pose, before: Pose) -> Heading:
@@ -212,7 +211,7 @@ def run(
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
     heading = Heading(*(np.array(part, float, order="C") for part in heading))  # the loop moves it on
     done = kernels.track_frames(
-        kernels.addresses_for(images.dtype),
+        kernels.compiled_for(images.dtype),
         images,
         readable,
         setup.maps_x,
@@ -229,11 +228,11 @@ def run(
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the loop over frames for images of this type, or load it."""
-    images, readable, *known = kernels.nothing_to_see(dtype)[1:8]
+    images, readable, *known = kernels.nothing_to_see(dtype)[:7]
     heading = Heading(np.zeros((3, 3, 3)), np.zeros((3, 3)))
     rows = empty_rows(0, 1)
     kernels.track_frames(
-        kernels.addresses_for(np.dtype(dtype)),
+        kernels.compiled_for(np.dtype(dtype)),
         images[None][:0],
         readable[None][:0],
         *known,
@@ -476,7 +475,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
     for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
         law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit=misfit)
         trial = empty_rows(n, m)
-        limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf, share=MOST_USUAL)
+        limits = setup.limits if blur_known else setup.limits._replace(blur=np.inf, share=MOST_USUAL)
         done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
         if done == 0 or not _enough(trial.dots[:1]):
             follower.law = law  # how the noise was taken to be tells why the dots are refused
