@@ -18,7 +18,6 @@ from typing import Any
 import numba
 from filelock import FileLock
 from numba.core import event
-from numba.core.errors import NumbaExperimentalFeatureWarning
 
 njit: Any = numba.njit  # types of a decorated function say nothing of how it is called
 cfunc: Any = numba.cfunc
@@ -49,7 +48,7 @@ def _folder() -> Path:
 
 FOLDER = _folder()
 config.CACHE_DIR = str(FOLDER)
-warnings.simplefilter("ignore", NumbaExperimentalFeatureWarning)  # functions as arguments (`compiled_apart`)
+warnings.filterwarnings("ignore", ".*First-class function")  # functions as arguments (`compiled_apart`)
 
 
 class _BeforeCompiling(event.Listener):
@@ -80,7 +79,7 @@ def one_at_a_time(tell: Callable[[], None] = lambda: None, what: str = "") -> It
         lock.release()
 
 
-def compiled_apart(function: Callable[..., float], *like: object, **rules: Any) -> Any:
+def compiled_apart(function: Callable[..., float], *like: object, **rules: object) -> object:
     """The function, compiled for arguments of the types of `like` alone, as an argument of compiled functions.
 
     For numba optimises a function anew with each that calls it; of one that it is given it knows but the types.

@@ -12,8 +12,7 @@ import numpy as np
 from calibration import Board, CalibrationSettings, CornerView, calibrate_from_corners
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
-from disctrack.track.dots._kernels import TemplateLimits
-from disctrack.track.dots.template import NoiseModel
+from disctrack.track.dots.template import NoiseModel, TemplateLimits
 from disctrack.track.follow.following import Follower, Law, Tables, TrackingSetup
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus

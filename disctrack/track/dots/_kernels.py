@@ -38,14 +38,6 @@ class Cameras(NamedTuple):
     t: Array  # (c, 3) t_camera_world [m]
 
 
-class Pattern(NamedTuple):
-    """The dots of a disc."""
-
-    centres: Array  # (m, 3) in body axes [m]
-    radius: float  # of a dot [m]
-    rim: float  # about the pattern's origin [m]: no blur of an edge as wide may reach the pixels used
-
-
 class TemplateLimits(NamedTuple):
     """When a converged fit is refused."""
 
@@ -57,8 +49,11 @@ class TemplateLimits(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """What is known of each camera's images."""
+    """What is known of the dots, and of each camera's images of them."""
 
+    centres: Array  # (m, 3) in body axes [m]
+    radius: float  # of a dot [m]
+    rim: float  # about the dots' origin [m]: no blur of an edge as wide may reach the pixels used
     blur: Array  # (c,) sigma of an edge [px]
     noise: Array  # (c, 3): variance = [0] + [1] grey, and the square of the grey values' step
     limits: TemplateLimits
@@ -92,16 +87,6 @@ class _Template(NamedTuple):
     contrast: float
 
 
-class Place(NamedTuple):
-    """Where a dot is expected."""
-
-    x: float  # on the plane
-    y: float
-    radius: float
-    u: float  # in the image
-    v: float
-
-
 class _Map(NamedTuple):
     """The map pixel -> plane near a pixel."""
 
@@ -132,34 +117,21 @@ class _Ellipse(NamedTuple):
     short: float
 
 
-class _Rows(NamedTuple):
-    """Rows of what is kept of every pixel."""
-
-    x: int  # on the plane, from the expected centre [px]
-    y: int
-    offset_x: int  # in the image, from the expected centre [10 px]
-    offset_y: int
-    grey: int
-    distance: int  # from the edge
-    jacobian: int  # by the template's eight numbers, over the pixel's sigma; before, pixels to be chosen from
-    residual: int  # the same
-    weight: int  # one over sigma
-    number: int
-
-
-_ROW = _Rows(0, 1, 2, 3, 4, 5, 6, 14, 15, 16)
-
-
 class Work(NamedTuple):
     """Working memory of one thread."""
 
-    pixels: Array  # (_ROW.number, k)
+    pixels: Array  # (_PIXEL_ROWS, k)
     matrix: Array  # (8, 8) of the normal equations
     right: Array  # (8,)
     step: Array  # (8,)
     told: Array  # (2,) what a function that is compiled apart tells beside a number
 
 
+# Rows of what is kept of every pixel: place on the plane from the expected centre [px], place in the image from there
+# [10 px], grey value, distance from the edge; derivatives by the template's eight numbers and residual, over the pixel's
+# sigma; weight, one over that. The rows of the derivatives also hold the pixels that are to be chosen from.
+_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _DISTANCE, _JACOBIAN = range(7)
+_RESIDUAL, _WEIGHT, _PIXEL_ROWS = range(_JACOBIAN + 8, _JACOBIAN + 11)
 # Pixels of a dot of 60 px; more are made room for. No power of two: rows would fall on one another's cache
 _PIXELS = 4096 + 64
 _MAX_SELECTIONS = 4
@@ -377,8 +349,9 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
     unit: plane units per pixel. work.told receives the mean grey values in and outside.
     """
     left, right, top, bottom = window
+    start_x, start_y, start_radius, _, _ = start
     pixels = work.pixels
-    candidates = pixels[_ROW.jacobian :]
+    candidates = pixels[_JACOBIAN:]
     band = 3.0 * p.blur + 1.0
     # Of each row the pixels between two ellipses, longer and shorter by the band than the dot's own, by the linear map:
     # its scale changes over the window, and a pixel is one more in doubt. In the ring of both nothing is decided by
@@ -390,7 +363,7 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
     hole_xx, hole_xy, hole_yy = _conic(
         g, max(longest * (1.0 - doubt) - less, 0.1), max(shortest * (1.0 - doubt) - less, 0.1)
     )
-    x_from, y_from = start.x / unit, start.y / unit
+    x_from, y_from = start_x / unit, start_y / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
     n = 0
@@ -422,10 +395,10 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
     # which of the dot's surroundings can come near any pixel at all
     reach = unit * (p.radius + band * g.steepest + math.hypot(p.a, p.b))
     blur = p.blur * g.steepest * unit
-    crowded = math.hypot(start.x, start.y) + reach > rim - 2.5 * blur
+    crowded = math.hypot(start_x, start_y) + reach > rim - 2.5 * blur
     for j in range(neighbours.shape[0]):
-        apart = math.hypot(start.x - neighbours[j, 0], start.y - neighbours[j, 1])
-        crowded |= apart - reach - start.radius < 3.0 * blur
+        apart = math.hypot(start_x - neighbours[j, 0], start_y - neighbours[j, 1])
+        crowded |= apart - reach - start_radius < 3.0 * blur
     xu, xv, yu, yv = _f(g.xu), _f(g.xv), _f(g.yu), _f(g.yv)
     shift_x, shift_y, radius = _f(p.a), _f(p.b), _f(p.radius)
     for i in range(n):
@@ -438,18 +411,18 @@ def _select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, 
         d = candidates[5, i]
         good = nearest < d < farthest  # not so for NaN either: a pixel without a ray
         if crowded and good:
-            X, Y = start.x + unit * candidates[0, i], start.y + unit * candidates[1, i]
+            X, Y = start_x + unit * candidates[0, i], start_y + unit * candidates[1, i]
             blur = p.blur * unit / candidates[6, i]
             good = math.hypot(X, Y) <= rim - 2.5 * blur
             for j in range(neighbours.shape[0]):
-                good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start.radius >= 3.0 * blur
-        for row in range(_ROW.jacobian):
+                good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start_radius >= 3.0 * blur
+        for row in range(_JACOBIAN):
             pixels[row, kept] = candidates[row, i]
         kept += 1 if good else 0
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
     well_inside, well_outside = _f(-min(1.2 * p.blur, 0.4 * p.radius / g.steepest)), _f(1.2 * p.blur)
     for i in range(kept):
-        d, grey = pixels[_ROW.distance, i], pixels[_ROW.grey, i]
+        d, grey = pixels[_DISTANCE, i], pixels[_GREY, i]
         is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
         inside_n += is_in
         outside_n += is_out
@@ -486,12 +459,12 @@ def _whitened_edge(pixels, n, p, g, clip):
     inv_sigma, sigma, half_sigma = _f(1.0 / p.blur), _f(p.blur), _f(0.5 * p.blur)
     level, slope_x, slope_y, limit = _f(p.level), _f(p.slope_x), _f(p.slope_y), _f(clip)
     half_step = _f(0.05)
-    jacobian = pixels[_ROW.jacobian :]
+    jacobian = pixels[_JACOBIAN:]
     chi2, n_clipped = _0, _0
     for i in range(n):
-        x, y = pixels[_ROW.offset_x, i], pixels[_ROW.offset_y, i]
+        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[_ROW.x, i] - a, pixels[_ROW.y, i] - b, radius, xu, xv, yu, yv, det2
+            pixels[_X, i] - a, pixels[_Y, i] - b, radius, xu, xv, yu, yv, det2
         )
         # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
         # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
@@ -502,8 +475,8 @@ def _whitened_edge(pixels, n, p, g, clip):
         z = d * inv_sigma + half_sigma * curvature
         s, bell = _edge_profile(z)
         light = level + slope_x * x + slope_y * y
-        weight = pixels[_ROW.weight, i]
-        r = weight * (pixels[_ROW.grey, i] - light * (_1 - contrast * s))
+        weight = pixels[_WEIGHT, i]
+        r = weight * (pixels[_GREY, i] - light * (_1 - contrast * s))
         squared = r * r
         fits = _1 if squared <= limit else _0
         chi2 += min(squared, limit)
@@ -515,12 +488,12 @@ def _whitened_edge(pixels, n, p, g, clip):
         jacobian[3, i] = edge * (z - curvature * sigma)
         jacobian[4, i], jacobian[5, i], jacobian[6, i] = seen, seen * x, seen * y
         jacobian[7, i] = -light * s * weight
-        pixels[_ROW.residual, i] = r * fits
+        pixels[_RESIDUAL, i] = r * fits
     return chi2, n_clipped
 
 
 @_part
-def _ellipse_of(map_x, map_y, P, g, start, radius, reach, u0, v0, unit):
+def _ellipse_of(map_x, map_y, P, g, u, v, radius, reach, u0, v0, unit):
     """The image of a dot as an ellipse about its own centroid, to second order of the map.
 
     reach: pixels over which the map's second derivatives are taken.
@@ -551,7 +524,7 @@ def _ellipse_of(map_x, map_y, P, g, start, radius, reach, u0, v0, unit):
     shift_u = quarter * (0.5 * (s_uu * c_uu + s_vv * c_vv) + s_uv * c_uv + c_uu * div_u + c_uv * div_v)
     shift_v = quarter * (0.5 * (t_uu * c_uu + t_vv * c_vv) + t_uv * c_uv + c_uv * div_u + c_vv * div_v)
     return _Ellipse(
-        start.u - u0 + shift_u, start.v - v0 + shift_v, ux, uy, vx, vy, math.cos(angle), math.sin(angle), longer,
+        u - u0 + shift_u, v - v0 + shift_v, ux, uy, vx, vy, math.cos(angle), math.sin(angle), longer,
         1.0 / (abs(g.det) * longer),
     )  # fmt: skip
 
@@ -580,10 +553,10 @@ def _whitened_ellipse(pixels, n, p, e, clip):
     inv_radius, inv_sigma, ten = _f(1.0 / p.radius), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p.contrast), _f(p.level), _f(p.slope_x), _f(p.slope_y)
     limit = _f(clip)
-    jacobian = pixels[_ROW.jacobian :]
+    jacobian = pixels[_JACOBIAN:]
     chi2, n_clipped = _0, _0
     for i in range(n):
-        x, y = pixels[_ROW.offset_x, i], pixels[_ROW.offset_y, i]
+        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
         from_u, from_v = ten * x - from_x, ten * y - from_y
         along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
         covered, d_along, d_across, edge = _0, _0, _0, _0
@@ -601,8 +574,8 @@ def _whitened_ellipse(pixels, n, p, e, clip):
             edge += bell * (bell_above + bell_below)
         edge *= round_edge
         light = level + slope_x * x + slope_y * y
-        weight = pixels[_ROW.weight, i]
-        r = weight * (pixels[_ROW.grey, i] - light * (_1 - contrast * covered))
+        weight = pixels[_WEIGHT, i]
+        r = weight * (pixels[_GREY, i] - light * (_1 - contrast * covered))
         squared = r * r
         fits = _1 if squared <= limit else _0
         chi2 += min(squared, limit)
@@ -616,7 +589,7 @@ def _whitened_ellipse(pixels, n, p, e, clip):
         jacobian[3, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
         jacobian[4, i], jacobian[5, i], jacobian[6, i] = seen, seen * x, seen * y
         jacobian[7, i] = -light * covered * weight
-        pixels[_ROW.residual, i] = r * fits
+        pixels[_RESIDUAL, i] = r * fits
     return chi2, n_clipped
 
 
@@ -624,9 +597,9 @@ def _whitened_ellipse(pixels, n, p, e, clip):
 def _normal_equations(pixels, n, matrix, right):
     """Fill matrix (8, 8), lower triangle, and right (8,) with the sums over n pixels."""
     for j in range(0, 8, 2):  # two by two: what is loaded serves twice
-        row, next_row = pixels[_ROW.jacobian + j], pixels[_ROW.jacobian + j + 1]
+        row, next_row = pixels[_JACOBIAN + j], pixels[_JACOBIAN + j + 1]
         for k in range(0, j + 1, 2):
-            column, next_column = pixels[_ROW.jacobian + k], pixels[_ROW.jacobian + k + 1]
+            column, next_column = pixels[_JACOBIAN + k], pixels[_JACOBIAN + k + 1]
             a, b, c, d = _0, _0, _0, _0
             for i in range(n):
                 a += row[i] * column[i]
@@ -634,7 +607,7 @@ def _normal_equations(pixels, n, matrix, right):
                 c += next_row[i] * column[i]
                 d += next_row[i] * next_column[i]
             matrix[j, k], matrix[j, k + 1], matrix[j + 1, k], matrix[j + 1, k + 1] = a, b, c, d
-        residual = pixels[_ROW.residual]
+        residual = pixels[_RESIDUAL]
         a, b = _0, _0
         for i in range(n):
             a += row[i] * residual[i]
@@ -707,7 +680,7 @@ def _weigh(pixels, n, p, noise, light):
     dark = p.level * (1.0 - p.contrast)
     read, gain, floor = _f(noise[0] / (light * light)), _f(noise[1] / light), _f(noise[2] / (12.0 * light * light))
     level, step, inv_sigma, in_light = _f(p.level), _f(dark - p.level), _f(1.0 / p.blur), 1.0 / light
-    distance, weight, grey = pixels[_ROW.distance], pixels[_ROW.weight], pixels[_ROW.grey]
+    distance, weight, grey = pixels[_DISTANCE], pixels[_WEIGHT], pixels[_GREY]
     for i in range(n):
         # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
         s, _ = _edge_profile(distance[i] * inv_sigma)
@@ -720,16 +693,18 @@ def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, ne
     """Fit the image of one circular dot to the grey values round its edge; fills `dot`, whose status tells of success.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> plane of the
-    dot; start: where it is expected; blur: to start from [px]; noise (3,): as of `Expected`; rim: radius of an edge
-    about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
-    centres. u and v of the dot are those of its centre on the plane: the caller projects it.
+    dot; start: x, y and radius on the plane, u, v in the image, as expected; blur: to start from [px]; noise (3,): as of
+    `Expected`; rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of
+    `neighbours` (k, 2), the other dots' centres. u and v of the dot are those of its centre on the plane: the caller
+    projects it.
     """
     height, width = image.shape
-    u0, v0, unit = start.u, start.v, 1.0
-    p = _Template(0.0, 0.0, start.radius, blur, 1.0, 0.0, 0.0, 0.0)
+    start_x, start_y, expected_radius, start_u, start_v = start
+    u0, v0, unit = start_u, start_v, 1.0
+    p = _Template(0.0, 0.0, expected_radius, blur, 1.0, 0.0, 0.0, 0.0)
     g = _Map(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     ellipse = _Ellipse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    n, n_clipped, chi2, light, radius, settled = 0, 0.0, 0.0, 1.0, start.radius, False
+    n, n_clipped, chi2, light, radius, settled = 0, 0.0, 0.0, 1.0, expected_radius, False
     for selection in range(_MAX_SELECTIONS):
         dot.status = MarkerStatus.OUTSIDE
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
@@ -754,14 +729,14 @@ def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, ne
             return 0.0
         room = (right - left + 1) * (bottom - top + 1) + 1
         if room > work.pixels.shape[1]:
-            more = np.empty((_ROW.number, room), np.float32)
+            more = np.empty((_PIXEL_ROWS, room), np.float32)
             work = Work(more, work.matrix, work.right, work.step, work.told)
         window = left, right, top, bottom
         found = select(image, map_x, map_y, P, start, window, rim, neighbours, g, unit, p, u0, v0, work)
         n, inside, outside = int(found), work.told[0], work.told[1]
         if blurred:
             reach = max(1, int(0.5 * min(extent_x, extent_y)))
-            ellipse = _ellipse_of(map_x, map_y, P, g, start, radius, reach, u0, v0, unit)
+            ellipse = _ellipse_of(map_x, map_y, P, g, start_u, start_v, radius, reach, u0, v0, unit)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             dot.status = MarkerStatus.OCCLUDED
             return 0.0
@@ -783,8 +758,8 @@ def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, ne
             if limit < np.inf:
                 chi2 -= n_clipped * limit
                 break
-            moved_u = start.u + (g.yv * p.a - g.xv * p.b) / g.det - u0
-            moved_v = start.v + (g.xu * p.b - g.yu * p.a) / g.det - v0
+            moved_u = start_u + (g.yv * p.a - g.xv * p.b) / g.det - u0
+            moved_v = start_v + (g.xu * p.b - g.yu * p.a) / g.det - v0
             u0 += moved_u
             v0 += moved_v
             settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
@@ -794,7 +769,7 @@ def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, ne
                 break
             # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
-            worst, residual = _0, work.pixels[_ROW.residual]
+            worst, residual = _0, work.pixels[_RESIDUAL]
             for i in range(n):
                 worst = max(worst, abs(residual[i]))
             if worst * worst <= limit:
@@ -811,14 +786,9 @@ def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, ne
     dot.var_u = a * a * x[0] + 2 * a * b * x[1] + b * b * y[1]
     dot.var_v = c * c * x[0] + 2 * c * d * x[1] + d * d * y[1]
     dot.cov_uv = a * c * x[0] + (a * d + b * c) * x[1] + b * d * y[1]
-    dot.u, dot.v, dot.radius = start.x + unit * p.a, start.y + unit * p.b, unit * p.radius
-    dot.misfit, dot.blur, dot.level, dot.contrast = (
-        chi2 / max(n - n_clipped - 8, 1),
-        p.blur,
-        light * p.level,
-        p.contrast,
-    )
-    dot.clipped, dot.n_pixels, dot.status = n_clipped / n, n, MarkerStatus.MEASURED
+    dot.u, dot.v, dot.radius = start_x + unit * p.a, start_y + unit * p.b, unit * p.radius
+    dot.misfit, dot.clipped, dot.n_pixels = chi2 / max(n - n_clipped - 8, 1), n_clipped / n, n
+    dot.blur, dot.level, dot.contrast, dot.status = p.blur, light * p.level, p.contrast, MarkerStatus.MEASURED
     return 0.0
 
 
@@ -839,12 +809,12 @@ def _judge(dot, radius, blur, noise, limits):
         dot.status = MarkerStatus.BLURRED
 
 
-def _look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots):
+def _look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, expected, R, t, work, dots):
     """Locate and judge the dots (c, m) in the images (c, H, W) of one instant, the disc being near the pose R, t.
 
     u and v are the image of the dot's own centre, not the centre of its elliptical image.
     """
-    m = pattern.centres.shape[0]
+    m = expected.centres.shape[0]
     R_cb, P, shift = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     neighbours = np.empty((max(m - 1, 0), 2))
     for c in range(images.shape[0]):
@@ -858,7 +828,7 @@ def _look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, patter
             if not readable[c]:
                 dot.status = MarkerStatus.NOT_LOOKED_FOR
                 continue
-            x, y, z = pattern.centres[i, 0], pattern.centres[i, 1], pattern.centres[i, 2]
+            x, y, z = expected.centres[i, 0], expected.centres[i, 1], expected.centres[i, 2]
             px, py, pz = _turned(R_cb, x, y, z)
             px, py, pz = px + shift[0], py + shift[1], pz + shift[2]
             if pz <= 0.0:
@@ -875,14 +845,14 @@ def _look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, patter
             u, v = _project_point(camera, px, py, pz)
             for k in range(m - 1):
                 other = k + 1 if k >= i else k
-                neighbours[k, 0], neighbours[k, 1] = pattern.centres[other, 0], pattern.centres[other, 1]
-            start, blur, noise = Place(x, y, pattern.radius, u, v), expected.blur[c], expected.noise[c]
-            fit(select, whiten, images[c], maps_x[c], maps_y[c], P, start, blur, noise, pattern.rim, neighbours, work,
+                neighbours[k, 0], neighbours[k, 1] = expected.centres[other, 0], expected.centres[other, 1]
+            start, blur, noise = (x, y, expected.radius, u, v), expected.blur[c], expected.noise[c]
+            fit(select, whiten, images[c], maps_x[c], maps_y[c], P, start, blur, noise, expected.rim, neighbours, work,
                 dot)  # fmt: skip
             if dot.status == MarkerStatus.MEASURED:
                 px, py, pz = _turned(R_cb, dot.u, dot.v, z)
                 dot.u, dot.v = _project_point(camera, px + shift[0], py + shift[1], pz + shift[2])
-                _judge(dot, pattern.radius, blur, noise, expected.limits)
+                _judge(dot, expected.radius, blur, noise, expected.limits)
     return 0.0
 
 
@@ -928,7 +898,7 @@ def _dot_by_pose(cameras, c, centre, R, t, J, rows):
 
 
 @_part
-def _pose_step(dots, cameras, pattern, R, t, step):
+def _pose_step(dots, cameras, expected, R, t, step):
     """One Gauss-Newton step (translation, world rotation vector) of the disc's pose from the dots (c, m) of one pair.
 
     Huber weights keep one wrong dot from pulling the prediction away. Returns the rms residual before the step [px],
@@ -943,7 +913,7 @@ def _pose_step(dots, cameras, pattern, R, t, step):
             dot = dots[c, m]
             if dot.status != MarkerStatus.MEASURED:
                 continue
-            u, v, depth = _dot_by_pose(cameras, c, pattern.centres[m], R, t, J, rows)
+            u, v, depth = _dot_by_pose(cameras, c, expected.centres[m], R, t, J, rows)
             if depth <= 0.0:
                 return -1.0
             du, dv = dot.u - u, dot.v - v
@@ -964,12 +934,12 @@ def _pose_step(dots, cameras, pattern, R, t, step):
 
 
 @_part
-def _settle(dots, cameras, pattern, R, t):
+def _settle(dots, cameras, expected, R, t):
     """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer."""
     step, R_new = np.empty(6), np.empty((3, 3))
     rms = -1.0
     for _ in range(5):
-        rms = _pose_step(dots, cameras, pattern, R, t, step)
+        rms = _pose_step(dots, cameras, expected, R, t, step)
         if rms < 0.0:
             return rms
         for i in range(3):
@@ -1007,8 +977,13 @@ def _predict(heading, R, t):
         t[i] = 3.0 * (heading.t[0, i] - heading.t[1, i]) + heading.t[2, i]
 
 
+def scratch() -> Work:
+    """Working memory of one thread."""
+    return Work(np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(2))
+
+
 @_entry
-def track_frames(compiled, images, readable, maps_x, maps_y, cameras, pattern, expected, heading, dots, R_out, t_out,
+def track_frames(compiled, images, readable, maps_x, maps_y, cameras, expected, heading, work, dots, R_out, t_out,
                  max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the three before; `heading` is moved on.
 
@@ -1017,16 +992,15 @@ def track_frames(compiled, images, readable, maps_x, maps_y, cameras, pattern, e
     less than n where the disc was lost at that frame.
     """
     select, whiten, fit, look = compiled
-    work = Work(np.empty((_ROW.number, _PIXELS), np.float32), np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(2))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
         _predict(heading, R, t)
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
-            look(select, whiten, fit, images[f], readable[f], maps_x, maps_y, cameras, pattern, expected, R, t, work,
+            look(select, whiten, fit, images[f], readable[f], maps_x, maps_y, cameras, expected, R, t, work,
                  dots[f])  # fmt: skip
-            rms = _settle(dots[f], cameras, pattern, R, t)
+            rms = _settle(dots[f], cameras, expected, R, t)
             turned = 0.0
             for i in range(3):
                 for j in range(3):
@@ -1047,20 +1021,19 @@ def track_frames(compiled, images, readable, maps_x, maps_y, cameras, pattern, e
 
 
 @_entry
-def fit_dot(compiled, image, map_x, map_y, P, start, expected, rim, neighbours, work, dot):
-    """`_fit_dot` for Python, judged; `expected` of one camera."""
+def fit_dot(compiled, image, map_x, map_y, P, start, blur, noise, limits, rim, neighbours, work, dot):
+    """`_fit_dot` for Python, judged."""
     select, whiten, fit, _ = compiled
-    blur, noise = expected.blur[0], expected.noise[0]
     fit(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, neighbours, work, dot)
     if dot.status == MarkerStatus.MEASURED:
-        _judge(dot, start.radius, blur, noise, expected.limits)
+        _judge(dot, start[2], blur, noise, limits)
 
 
 @_entry
-def look(compiled, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots):
+def look(compiled, images, readable, maps_x, maps_y, cameras, expected, R, t, work, dots):
     """`_look` for Python."""
     select, whiten, fit, look = compiled
-    look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, pattern, expected, R, t, work, dots)
+    look(select, whiten, fit, images, readable, maps_x, maps_y, cameras, expected, R, t, work, dots)
 
 
 # The same where Python calls them: compiled the first time that they are called.
@@ -1068,34 +1041,28 @@ project_point = _entry(_project_point.py_func)
 project_point_jacobian = _entry(_project_point_jacobian.py_func)
 
 
-def scratch() -> Work:
-    """Working memory of one thread."""
-    return Work(np.empty((_ROW.number, _PIXELS), np.float32), np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(2))
-
-
 @cache
-def compiled_for(dtype: np.dtype) -> tuple[Any, ...]:
+def compiled_for(dtype: np.dtype) -> tuple[object, ...]:
     """`_select`, `_whiten`, `_fit_dot` and `_look` for images of this type: compiled now, or loaded."""
-    images, flag, maps, _, cameras, pattern, expected, plane, vector, work, dots = nothing_to_see(dtype)
+    images, flag, maps, _, cameras, expected, plane, vector, work, dots = nothing_to_see(dtype)
     template, near, ellipse = _Template(*[0.0] * 8), _Map(*[0.0] * 8), _Ellipse(*[0.0] * 10)
-    place, image = Place(*[0.0] * 5), images[0]
+    place, image = (0.0, 0.0, 0.0, 0.0, 0.0), images[0]
     select = compiled_apart(_select, image, plane, plane, plane, place, (0, 0, 0, 0), 0.0, plane, near, 0.0, template,
                             0.0, 0.0, work, **_RULES)  # fmt: skip
     whiten = compiled_apart(_whiten, work, 0, template, near, ellipse, True, 0.0, **_RULES)
     fit = compiled_apart(_fit_dot, select, whiten, image, plane, plane, plane, place, 0.0, vector, 0.0, plane, work,
                          dots[0, 0], **_RULES)  # fmt: skip
-    seen = compiled_apart(_look, select, whiten, fit, images, flag, maps, maps, cameras, pattern, expected, plane,
+    seen = compiled_apart(_look, select, whiten, fit, images, flag, maps, maps, cameras, expected, plane,
                           vector, work, dots, **_RULES)  # fmt: skip
     return select, whiten, fit, seen
 
 
-def nothing_to_see(dtype: DTypeLike) -> tuple[Any, ...]:
+def nothing_to_see(dtype):
     """Arguments of `look` with an image (1, 1) that cannot be read, of one camera and one dot."""
     plane, vector = np.eye(3), np.zeros(3)
-    cameras, expected = Cameras(plane, plane[None], plane), Expected(vector, plane, TemplateLimits())
     return (
-        np.zeros((1, 1, 1), dtype), np.zeros(1, bool), plane[None], plane[None], cameras,
-        Pattern(plane[:1], 0.0, 0.0), expected, plane, vector, scratch(), np.zeros((1, 1), DOT),
+        np.zeros((1, 1, 1), dtype), np.zeros(1, bool), plane[None], plane[None], Cameras(plane, plane[None], plane),
+        Expected(plane[:1], 0.0, 0.0, vector, plane, TemplateLimits()), plane, vector, scratch(), np.zeros((1, 1), DOT),
     )  # fmt: skip
 
 

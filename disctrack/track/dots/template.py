@@ -105,8 +105,7 @@ def locate_on_disc(
         map_x[None],
         map_y[None],
         kernels.Cameras(camera.parameters[None], np.eye(3)[None], np.zeros((1, 3))),
-        pattern_of(disc),
-        expected_of([noise or typical_noise(image)], [blur_px], limits or TemplateLimits()),
+        expected_of(disc, [noise or typical_noise(image)], [blur_px], limits or TemplateLimits()),
         np.ascontiguousarray(R_camera_body),
         np.ascontiguousarray(t_camera_body),
         kernels.scratch(),
@@ -134,35 +133,30 @@ def locate_on_plane(
     H = np.broadcast_to(np.asarray(image_from_plane, float), (len(centres), 3, 3))
     height, width = image.shape
     map_x, map_y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    noise = noise or typical_noise(image)
-    limits = limits or TemplateLimits()
-    dots = np.zeros(len(centres), kernels.DOT)
-    contiguous, expected = np.ascontiguousarray(image), expected_of([noise], [blur_px], limits)
+    variance = (noise or typical_noise(image)).parameters
+    dots, contiguous = np.zeros(len(centres), kernels.DOT), np.ascontiguousarray(image)
     for i, (x, y) in enumerate(centres):  # the body is one compiled call
         u = H[i] @ (x, y, 1.0)
-        start = kernels.Place(x, y, float(radius), u[0] / u[2], u[1] / u[2])
+        start = x, y, float(radius), u[0] / u[2], u[1] / u[2]
         others = np.delete(centres, i, axis=0)
         near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
         kernels.fit_dot(
-            kernels.compiled_for(image.dtype), contiguous, map_x, map_y, np.linalg.inv(H[i]), start, expected, np.inf,
-            near, kernels.scratch(), dots[i],
+            kernels.compiled_for(image.dtype), contiguous, map_x, map_y, np.linalg.inv(H[i]), start, float(blur_px),
+            variance, limits or TemplateLimits(), np.inf, near, kernels.scratch(), dots[i],
         )  # fmt: skip
         u = H[i] @ (dots[i]["u"], dots[i]["v"], 1.0)
         dots[i]["u"], dots[i]["v"] = u[:2] / u[2]
     return dot_centres(dots)
 
 
-def pattern_of(disc: Disc) -> kernels.Pattern:
-    """The disc's dots for the compiled kernels."""
-    return kernels.Pattern(
-        np.ascontiguousarray(disc.marker_centres_body), 0.5 * disc.marker_diameter, float(face_edge(disc))
-    )
-
-
-def expected_of(noise: Sequence[NoiseModel], blur_px: Sequence[float], limits: TemplateLimits) -> kernels.Expected:
-    """What is known of each camera's images, for the compiled kernels."""
-    rows = np.array([model.parameters for model in noise])
-    return kernels.Expected(np.array(blur_px, float), rows, TemplateLimits(*map(float, limits)))
+def expected_of(
+    disc: Disc, noise: Sequence[NoiseModel], blur_px: Sequence[float], limits: TemplateLimits
+) -> kernels.Expected:
+    """What is known of the dots and of each camera's images, for the compiled kernels."""
+    return kernels.Expected(
+        np.ascontiguousarray(disc.marker_centres_body), 0.5 * disc.marker_diameter, float(face_edge(disc)),
+        np.array(blur_px, float), np.array([model.parameters for model in noise]), TemplateLimits(*map(float, limits)),
+    )  # fmt: skip
 
 
 def dot_centres(dots: NDArray[np.void]) -> DotCentres:

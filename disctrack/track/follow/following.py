@@ -30,7 +30,6 @@ from disctrack.track.dots.template import (
     expected_of,
     measure_noise,
     no_more_than_left,
-    pattern_of,
     typical_noise,
 )
 from disctrack.track.follow.motion_span import StillScene
@@ -217,9 +216,9 @@ def run(
         setup.maps_x,
         setup.maps_y,
         cameras_of(setup.rig),
-        pattern_of(setup.disc),
-        expected_of(law.noise, law.blur, law.limits(setup.limits)),
+        expected_of(setup.disc, law.noise, law.blur, law.limits(setup.limits)),
         heading,
+        kernels.scratch(),
         *rows,
         MAX_PREDICTION_RMS_PX,
     )
@@ -228,18 +227,12 @@ def run(
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the loop over frames for images of this type, or load it."""
-    images, readable, *known = kernels.nothing_to_see(dtype)[:7]
-    heading = Heading(np.zeros((3, 3, 3)), np.zeros((3, 3)))
-    rows = empty_rows(0, 1)
+    images, readable, *known = kernels.nothing_to_see(dtype)[:6]
+    heading, compiled = Heading(np.zeros((3, 3, 3)), np.zeros((3, 3))), kernels.compiled_for(np.dtype(dtype))
     kernels.track_frames(
-        kernels.compiled_for(np.dtype(dtype)),
-        images[None][:0],
-        readable[None][:0],
-        *known,
-        heading,
-        *rows,
+        compiled, images[None][:0], readable[None][:0], *known, heading, kernels.scratch(), *empty_rows(0, 1),
         MAX_PREDICTION_RMS_PX,
-    )
+    )  # fmt: skip
 
 
 def empty_tables(n: int, m: int) -> Tables:

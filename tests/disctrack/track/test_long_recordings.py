@@ -10,8 +10,7 @@ from numpy.testing import assert_array_equal
 
 from disctrack import frames
 from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.track.dots._kernels import TemplateLimits
-from disctrack.track.dots.template import NoiseModel
+from disctrack.track.dots.template import NoiseModel, TemplateLimits
 from disctrack.track.follow.following import Follower, Law, TrackingSetup, empty_tables
 from disctrack.track.follow.tracking import MOST_STRETCHES, WAITED_FOR, stretch_edges
 from disctrack.track.pose import marker_pixels

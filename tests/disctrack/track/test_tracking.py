@@ -77,9 +77,7 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     assert np.allclose(R, frames.rotation_from_euler(*trajectory.q[:, 3:].T), atol=1e-9)
 
 
-@njit
-def predict(heading, R_next, t_next):
-    kernels._predict(heading, R_next, t_next)
+predict = njit(lambda heading, R_next, t_next: kernels._predict(heading, R_next, t_next))
 
 
 def _predicted(R, t, i):
