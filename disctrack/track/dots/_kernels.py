@@ -128,8 +128,8 @@ class Work(NamedTuple):
 
 
 # Rows of what is kept of every pixel: place on the plane from the expected centre [px], place in the image from there
-# [10 px], grey value, distance from the edge; derivatives by the template's eight numbers and residual, over the pixel's
-# sigma; weight, one over that. The rows of the derivatives also hold the pixels that are to be chosen from.
+# [10 px], grey value, distance from the edge; derivatives by the template's eight numbers and residual, over the
+# pixel's sigma; weight, one over that. The rows of the derivatives also hold the pixels that are to be chosen from.
 _X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _DISTANCE, _JACOBIAN = range(7)
 _RESIDUAL, _WEIGHT, _PIXEL_ROWS = range(_JACOBIAN + 8, _JACOBIAN + 11)
 # Pixels of a dot of 60 px; more are made room for. No power of two: rows would fall on one another's cache
@@ -693,7 +693,7 @@ def _fit_dot(select, whiten, image, map_x, map_y, P, start, blur, noise, rim, ne
     """Fit the image of one circular dot to the grey values round its edge; fills `dot`, whose status tells of success.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> plane of the
-    dot; start: x, y and radius on the plane, u, v in the image, as expected; blur: to start from [px]; noise (3,): as of
+    dot; start: x, y and radius on the plane, u, v in the image, as expected; blur: to start from [px]; noise (3,): see
     `Expected`; rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of
     `neighbours` (k, 2), the other dots' centres. u and v of the dot are those of its centre on the plane: the caller
     projects it.
