@@ -8,7 +8,6 @@ that is named after the contents of every file with compiled functions: other so
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from hashlib import sha256
@@ -48,7 +47,6 @@ def _folder() -> Path:
 
 FOLDER = _folder()
 config.CACHE_DIR = str(FOLDER)
-warnings.filterwarnings("ignore", ".*First-class function")  # functions as arguments (`compiled_apart`)
 
 
 class _BeforeCompiling(event.Listener):
@@ -77,12 +75,3 @@ def one_at_a_time(tell: Callable[[], None] = lambda: None, what: str = "") -> It
             yield
     finally:
         lock.release()
-
-
-def compiled_apart(function: Callable[..., float], *like: object, **rules: object) -> object:
-    """The function, compiled for arguments of the types of `like` alone, as an argument of compiled functions.
-
-    For numba optimises a function anew with each that calls it; of one that it is given it knows but the types.
-    """
-    with event.trigger_event("numba:compile"):
-        return cfunc(numba.float64(*map(numba.typeof, like)), cache=True, **rules)(function)

@@ -15,7 +15,7 @@ from disctrack.progress import compiling
 from disctrack.recording.readers import _png as png
 from disctrack.rolling import _assembly as assembly
 from disctrack.synthetic import board_raster, disc_raster
-from disctrack.track.dots import _kernels as dots
+from disctrack.track.dots import template as dots
 from disctrack.track.follow.tracking import prepare
 
 

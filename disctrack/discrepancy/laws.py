@@ -407,7 +407,7 @@ def _listed(
 
 
 def _known(system: System, diagnosis: Diagnosis) -> float:
-    """Length of the answer, or of the shortest explanation by known effects where these describe the data.
+    """Length of the shortest explanation by known effects.
 
     Of two that are as good, what is known: a single effect of the motion has that credit, and no sum has.
     """
@@ -416,8 +416,8 @@ def _known(system: System, diagnosis: Diagnosis) -> float:
         single = sum(c.kind == "motion" for c in candidates) == 1
         return length(system, diagnosis.settings, diagnosis.noise, fitted, candidates) - CLASS_GAIN * single
 
-    listed = [of(e.fit, e.candidates) for e in diagnosis.ranked if diagnosis.verdict == "found"]
-    return min([of(diagnosis.after, [f.candidate for f in diagnosis.found]), *listed])
+    answer = of(diagnosis.after, [f.candidate for f in diagnosis.found])
+    return min([answer, *(of(e.fit, e.candidates) for e in diagnosis.ranked)])
 
 
 def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool, known: float) -> tuple[tuple[Found, ...], ...]:

@@ -1,18 +1,15 @@
-"""What all examples share: their command line, the two files that each writes, and how errors end."""
+"""What all examples share: their command line, their files, and how errors end."""
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from matplotlib.figure import Figure
-
-from disctrack.errors import DiscTrackError
+from disctrack.discrepancy.equations import Answer
+from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
-from disctrack.report.figures import save_figure
 
 
 @dataclass(frozen=True)
@@ -20,19 +17,27 @@ class Outcome:
     """What an example has to say."""
 
     table: str  # for people
-    document: dict[str, Any]  # diagnosis.json
-    figure: Figure
+    document: Mapping[str, object]  # diagnosis.json
+    answers: Mapping[str, Answer] = field(default_factory=dict)  # each on a page of its own, in a folder of this name
+
+
+def needed(folder: Path, name: str) -> Path:
+    """A file that an example reads. Raises AnalysisError."""
+    path = Path(folder) / name
+    if not path.is_file():
+        raise AnalysisError(f"{path}: not there. Name the folder that holds {name}.")
+    return path
 
 
 def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words: Sequence[str] | None = None) -> int:
-    """Run one example: print its table, write diagnosis.json and NAME.png where asked for; returns the exit code.
+    """Run one example: print its table, write diagnosis.json and pages where asked for; returns the exit code.
 
     data : what the folder that is given to `diagnose` holds; None for data that come with the sources
     """
     parser = argparse.ArgumentParser(prog=f"python -m disctrack.examples.{name}", description=diagnose.__doc__)
     if data is not None:
         parser.add_argument("folder", type=Path, help=f"folder with {data}")
-    parser.add_argument("-o", "--output", type=Path, help="folder for diagnosis.json and the figure")
+    parser.add_argument("-o", "--output", type=Path, help="folder for diagnosis.json and the pages")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
     given = parser.parse_args(words)
     try:
@@ -41,8 +46,9 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
         outcome = diagnose() if data is None else diagnose(given.folder)
         print(outcome.table)
         if given.output is not None:
-            write_whole(given.output / "diagnosis.json", json_file(outcome.document))
-            save_figure(outcome.figure, given.output / f"{name}.png")
+            for where, answer in outcome.answers.items():
+                answer.write(given.output / where, given.overwrite)
+            write_whole(given.output / "diagnosis.json", json_file(dict(outcome.document)))
     except DiscTrackError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

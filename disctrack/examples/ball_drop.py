@@ -10,13 +10,14 @@ Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 
 import csv
 import sys
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
@@ -28,9 +29,7 @@ from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Subset
 from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command
-from disctrack.report.figures import panels
-from disctrack.report.palette import BLUE, RED
+from disctrack.examples._command import Outcome, command, needed
 
 GRAVITY = 9.81  # [m/s^2] as declared
 AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
@@ -80,31 +79,20 @@ class Drop:
 
 def read_drops(folder: Path) -> tuple[Drop, ...]:
     """All drops of `ball_drops.csv`, with mass and radius from `balls.txt`. Raises AnalysisError."""
-    path, sizes = Path(folder) / "ball_drops.csv", Path(folder) / "balls.txt"
-    for file in (path, sizes):
-        if not file.is_file():
-            raise AnalysisError(f"{file}: not there. Name the folder that holds ball_drops.csv and balls.txt.")
-    per_cd = {}
-    for words in (line.split() for line in sizes.read_text().splitlines()[1:] if line.strip()):
-        try:
+    path, per_cd = needed(folder, "ball_drops.csv"), {}
+    for words in map(str.split, needed(folder, "balls.txt").read_text().splitlines()[1:]):
+        with suppress(ValueError, IndexError):  # nobody measured it
             mass, radius = OUNCE * float(words[1]), 0.01 * float(words[2]) / (2 * np.pi)
-        except ValueError:
-            continue  # nobody measured it
-        per_cd[_key(words[0])] = AIR_DENSITY * np.pi * radius**2 / (2 * mass)
-    rows: dict[tuple[str, int], list[tuple[float, float]]] = {}
+            per_cd[_key(words[0])] = AIR_DENSITY * np.pi * radius**2 / (2 * mass)
+    rows = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     with path.open(newline="") as stream:
         for line, row in enumerate(csv.DictReader(stream), start=2):
             try:
-                key = (row["ball"], int(row["drop"]))
-                sample = (float(row["t_s"]), float(row["height_m"]))
+                rows[row["ball"], int(row["drop"])].append((float(row["t_s"]), float(row["height_m"])))
             except (KeyError, TypeError, ValueError) as error:
                 raise AnalysisError(f"{path}, line {line}: expected ball,drop,t_s,height_m; found {row}.") from error
-            rows.setdefault(key, []).append(sample)
-    found = []
-    for (ball, number), samples in rows.items():
-        time, height = np.array(samples, float).T
-        found.append(Drop(ball, number, time, height, per_cd.get(_key(ball), 0.0)))
-    return tuple(found)
+    columns = {key: np.array(samples, float).T for key, samples in rows.items()}
+    return tuple(Drop(b, n, time, height, per_cd.get(_key(b), 0.0)) for (b, n), (time, height) in columns.items())
 
 
 def _key(name: str) -> str:
@@ -142,14 +130,6 @@ class Form:
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Rms [m] on the second drop of every ball of a law fitted to the first."""
-
-    whole: dict[str, float]  # start of the second drop fitted to all of it
-    forecast: dict[str, float]  # start fitted to its first SEEN seconds, error after them
-
-
-@dataclass(frozen=True)
 class BallAnswer:
     """Everything asked of a set of drops."""
 
@@ -157,7 +137,9 @@ class BallAnswer:
     together: Answer
     alone: Mapping[str, Answer]
     forms: tuple[Form, ...]  # best first
-    errors: Mapping[str, Errors]  # by form, and "gravity alone"
+    # by form, and "gravity alone": rms [m] on the second drop of every ball of a law fitted to the first, with a start
+    # that is fitted to "whole" of it, or to its first SEEN seconds and the error taken after them, "forecast"
+    errors: Mapping[str, Mapping[str, dict[str, float]]]
 
     @property
     def undecided(self) -> tuple[Form, ...]:
@@ -204,7 +186,7 @@ def _form(answer: Answer, effects: tuple[str, ...]) -> Form:
     return Form(effects, fitted, float(criterion), held.log_density)
 
 
-def errors_of(answer: Answer, form: str) -> Errors:
+def errors_of(answer: Answer, form: str) -> dict[str, dict[str, float]]:
     """Least squares without a model of the noise: a law fitted to drops 1, errors on drops 2 of the same balls."""
     plain = [replace(s, noise=None) for s in answer.system.stretches]
     drops = {k: [s for s in plain if s.run.endswith(f",{k}")] for k in (1, 2)}
@@ -216,7 +198,7 @@ def errors_of(answer: Answer, form: str) -> Errors:
     values = fit(first, (*first.base, *law), answer.diagnosis.before.values).values
     whole = fit(second, second.base, values).values
     begun = fit(Subset(second, second.training), second.base, values).values
-    return Errors(_rms(second, whole, -np.inf), _rms(second, begun, SEEN))
+    return {"whole": _rms(second, whole, -np.inf), "forecast": _rms(second, begun, SEEN)}
 
 
 def _rms(system: EquationSystem, values: Mapping[str, float], since: float) -> dict[str, float]:
@@ -250,7 +232,7 @@ def report(answer: BallAnswer) -> str:
              f"Noise of a height: {n.white:.3f} m white and {n.smooth:.3f} m with a memory of {n.memory:.2f} s.", "",
              f"{'rms on the second drop [m], median of the balls':<52}{'whole':>8}{f'after {SEEN} s':>13}"]  # fmt: skip
     for name, e in answer.errors.items():
-        whole, forecast = (float(np.median(list(x.values()))) if x else np.nan for x in (e.whole, e.forecast))
+        whole, forecast = (float(np.median(list(x.values()))) if x else np.nan for x in e.values())
         lines.append(f"  {_words([name]):<50}{whole:8.2f}{forecast:13.2f}")
     lines += ["", f"{'all balls together':<36}{'chi-square':>11}{'criterion':>11}{'held-out 2 ln p':>17}"]
     lines.append(f"  {'gravity alone':<34}{answer.together.diagnosis.before.reduced_chi_square:11.2f}")
@@ -264,19 +246,6 @@ def report(answer: BallAnswer) -> str:
     )
 
 
-def figure(answer: BallAnswer) -> Figure:
-    """What gravity alone and the best law leave of every drop."""
-    picture, (axes,) = panels(9, 4)
-    sides = ((answer.together.diagnosis.before, RED, "gravity alone"),
-             (answer.forms[0].fit, BLUE, _words(answer.forms[0].effects)))  # fmt: skip
-    for fitted, colour, label in sides:
-        for i, (s, seen) in enumerate(answer.together.predicted(fitted)):
-            axes.plot(s.time, (s.data - seen)[:, 0], lw=0.8, color=colour, label=None if i else label)
-    axes.set(title="measured minus fitted, all drops", xlabel="time [s]", ylabel="height [m]")
-    axes.legend(frameon=False)
-    return picture
-
-
 def example(folder: Path) -> Outcome:
     """What does gravity alone lack for falling balls, and is its law identifiable?"""
     answer = analyse_drops(read_drops(folder))
@@ -288,10 +257,10 @@ def example(folder: Path) -> Outcome:
         "identifiable": answer.identifiable,
         "cannot_be_told_apart": [f.effects for f in answer.undecided],
         "forms": forms,
-        "errors_m": {name: vars(e) for name, e in answer.errors.items()},
+        "errors_m": answer.errors,
         "balls": {name: a.document() for name, a in answer.alone.items()},
     }
-    return Outcome(report(answer), found, figure(answer))
+    return Outcome(report(answer), found, {"all balls": answer.together})
 
 
 main = partial(command, "ball_drop", "ball_drops.csv and balls.txt", example)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.kit.arrays import Array
 from disctrack.errors import AnalysisError
+from disctrack.examples._command import needed
 
 HALF_WIDTH = 0.0524  # [m] as declared
 FRAME_RATE = 148.0  # [Hz]
@@ -60,9 +61,7 @@ class Flight:
 
 def read_tosses(folder: Path) -> tuple[Toss, ...]:
     """All tosses of `cube_tosses.npz`. Raises AnalysisError."""
-    path = Path(folder) / "cube_tosses.npz"
-    if not path.is_file():
-        raise AnalysisError(f"{path}: not there. Name the folder that holds cube_tosses.npz.")
+    path = needed(folder, "cube_tosses.npz")
     with np.load(path) as file:
         if not {"state", "offset"} <= set(file.files):
             raise AnalysisError(f"{path}: holds {sorted(file.files)}; expected state (n, 13) and offset (tosses + 1,).")

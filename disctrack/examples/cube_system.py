@@ -78,18 +78,10 @@ class CubeTosses(System):
         residual = self._left - self._columns @ amounts
         return residual, self._columns[..., [self._index[n] for n in names]]
 
-    def residuals(self, values: Values, seen: float = 1.0) -> list[Array]:
-        """Measured minus predicted (n, 6) [m], [rad] of every flight.
-
-        Its own start and rates are fitted by least squares to the first share `seen` of it; the rest is a forecast.
-        """
+    def residuals(self, values: Values) -> list[Array]:
+        """Measured minus predicted (n, 6) [m], [rad] of every flight, its own start and rates by least squares."""
         amounts = np.array([values.get(n, 0.0) for n in self.names])
-        found = []
-        for r in self._rows:
-            n = len(r.left)
-            rows = np.arange(n) < max(4, round(seen * n))
-            found.append(_cleared(r.left - r.effects @ amounts, r.own, rows))
-        return found
+        return [_cleared(r.left - r.effects @ amounts, r.own) for r in self._rows]
 
 
 def _resting_rows(cubes: Sequence[Resting], names: Sequence[str]) -> Array:
@@ -124,16 +116,15 @@ def _rows(flight: Flight, names: Sequence[str]) -> _Rows:
     own[:, 3:, 6:9], own[1:, 3:, 9:] = np.eye(3), np.cumsum(0.5 * (step[1:] + step[:-1]) * dt, axis=0)
     left = np.concatenate([flight.position - falling, flight.turn], axis=1)
     everything = np.concatenate([columns(flight, names), left[..., None]], axis=-1)
-    cleared = _cleared(everything, own, np.ones(len(left), bool))
+    cleared = _cleared(everything, own)
     # rounding is left of an effect that the flight's own motion makes whole: no trace
     before, after = (np.linalg.norm(x[..., :-1], axis=(0, 1)) for x in (everything, cleared))
     return _Rows(flight, cleared[..., -1], np.where(after > ABSORBED * before, everything[..., :-1], 0.0), own)
 
 
-def _cleared(left: Array, own: Array, seen: Mask) -> Array:
-    """Columns (n, 6, ...) without what the flight's own motion, fitted to the samples `seen`, makes of them."""
-    k = int(np.prod(left.shape[2:]))
-    amounts = np.linalg.lstsq(own[seen].reshape(-1, 12), left[seen].reshape(-1, k), rcond=None)[0]
+def _cleared(left: Array, own: Array) -> Array:
+    """Columns (n, 6, ...) without what the flight's own motion makes of them."""
+    amounts = np.linalg.lstsq(own.reshape(-1, 12), left.reshape(-1, int(np.prod(left.shape[2:]))), rcond=None)[0]
     return np.asarray(left - (own @ amounts).reshape(left.shape), float)
 
 
@@ -167,7 +158,7 @@ def _measured_noise(rows: Sequence[_Rows]) -> dict[str, SmoothNoise]:
         # normal equations: 50 columns of length one, of which some are alike by intention
         A = whitened[:, :-1] / scale
         amounts = np.linalg.pinv(A.T @ A, rcond=1e-10, hermitian=True) @ (A.T @ whitened[:, -1]) / scale
-        left = [_cleared(r.left - r.effects @ amounts, r.own, np.ones(len(r.left), bool)) for r in rows]
+        left = [_cleared(r.left - r.effects @ amounts, r.own) for r in rows]
         for name, channels in GROUPS.items():
             noise[name] = estimate(_by_length(rows, left, channels), noise[name])
     return noise

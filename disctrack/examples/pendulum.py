@@ -12,14 +12,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations import Answer, Equations, Run, Term, diagnose, terms
-from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command
-from disctrack.report.figures import panels
-from disctrack.report.palette import BLUE, MUTED, RED
+from disctrack.examples._command import Outcome, command, needed
 
 FITTED_S = 36.668  # by the authors; the rest is their validation
 STEP = 0.157e-3  # [rad] of the encoder
@@ -44,66 +39,41 @@ MISSING = (
 )  # fmt: skip
 
 
-def swing(folder: Path) -> tuple[Array, Array]:
-    """Time [s] and angle [rad] from hanging. Raises AnalysisError."""
-    path = Path(folder) / "single_free_swing.npz"
-    if not path.is_file():
-        raise AnalysisError(f"{path}: not there. Name the folder that holds single_free_swing.npz.")
-    with np.load(path) as data:
-        return data["time_s"], data["angle_rad"] - np.pi
+def swing(folder: Path) -> Run:
+    """Angle [rad] from hanging. Raises AnalysisError."""
+    with np.load(needed(folder, "single_free_swing.npz")) as data:
+        return Run(data["time_s"], {"angle": data["angle_rad"] - np.pi}, name="swing")
 
 
-def asked(time: Array, angle: Array, last: float) -> Answer:
-    """The diagnosis of the swing up to an instant [s]."""
-    rows = time <= last
-    return diagnose(PENDULUM, Run(time[rows], {"angle": angle[rows]}, name="swing"), MISSING)
+def asked(run: Run) -> Answer:
+    """The diagnosis of the swing as far as the authors fit it."""
+    time, angle = np.asarray(run.time), np.asarray(run.data["angle"])
+    rows = time <= FITTED_S
+    return diagnose(PENDULUM, Run(time[rows], {"angle": angle[rows]}, name=run.name), MISSING)
 
 
-def forecasts(answer: Answer, time: Array, angle: Array) -> dict[str, Array]:
-    """Measured minus modelled angle [rad] over the whole swing, by model: what was kept back is foretold."""
-    run = Run(time, {"angle": angle}, name="swing")
-    return {side: angle - answer.forecast(run, before=side == "before")["angle"] for side in ("before", "after")}
-
-
-def table(answer: Answer, left: dict[str, Array], kept: Mask) -> str:
-    """Before and after, for people."""
-    best = 1e3 * STEP / np.sqrt(12)
-    lines = [str(answer), "", f"{'rms [mrad]':<38}{'before':>10}{'after':>10}"]
-    for name, rows in (("fitted, 0 to 36.668 s", ~kept), ("kept back, 36.668 to 55 s, foretold", kept)):
-        lines.append(f"{name:<38}" + "".join(f"{1e3 * _rms(x[rows]):10.3g}" for x in left.values()))
-    lines.append(f"{'the step of the encoder allows':<38}{best:10.3g}{best:10.3g}")
-    return "\n".join(lines)
-
-
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(x**2)))
+def rms_left(answer: Answer, run: Run) -> dict[str, tuple[float, float]]:
+    """Rms [rad] of measured minus modelled angle, by model: of what was fitted, and of what was kept back."""
+    kept = np.asarray(run.time) > FITTED_S
+    found = {}
+    for side in ("before", "after"):
+        left = np.asarray(run.data["angle"]) - answer.forecast(run, before=side == "before")["angle"]
+        found[side] = float(np.sqrt(np.mean(left[~kept] ** 2))), float(np.sqrt(np.mean(left[kept] ** 2)))
+    return found
 
 
 def example(folder: Path) -> Outcome:
     """What does a pendulum with viscous friction lack, and does what is found foretell the rest of its swing?"""
-    time, angle = swing(folder)
-    answer = asked(time, angle, FITTED_S)
-    left, kept = forecasts(answer, time, angle), time > FITTED_S
-    document = answer.document() | {
-        "kept_back_rms_rad": {side: _rms(x[kept]) for side, x in left.items()},
-        "encoder_rms_rad": STEP / np.sqrt(12),
-    }
-    return Outcome(table(answer, left, kept), document, figure(time, angle, left))
-
-
-def figure(time: Array, angle: Array, left: dict[str, Array]) -> Figure:
-    """The swing, and what the models leave of it: fitted up to the line, foretold after it."""
-    picture, (top, bottom) = panels(9, 6, 2, sharex=True)
-    thin = slice(None, None, 10)
-    top.plot(time[thin], angle[thin], lw=0.7, color=MUTED)
-    for (side, x), colour in zip(left.items(), (RED, BLUE), strict=True):
-        bottom.plot(time[thin], 1e3 * x[thin], lw=0.7, color=colour, label=side)
-    for axes in (top, bottom):
-        axes.axvline(FITTED_S, color=MUTED, lw=1, ls="--")
-    top.set(ylabel="angle [rad]")
-    bottom.set(ylabel="measured - model [mrad]", xlabel="time [s]")
-    bottom.legend(frameon=False)
-    return picture
+    run = swing(folder)
+    answer = asked(run)
+    left, encoder = rms_left(answer, run), STEP / np.sqrt(12)
+    lines = [str(answer), "", f"{'rms [mrad]':<38}{'before':>10}{'after':>10}"]
+    for i, name in enumerate(("fitted, 0 to 36.668 s", "kept back, 36.668 to 55 s, foretold")):
+        lines.append(f"{name:<38}" + "".join(f"{1e3 * rms[i]:10.3g}" for rms in left.values()))
+    lines.append(f"{'the step of the encoder allows':<38}{1e3 * encoder:10.3g}{1e3 * encoder:10.3g}")
+    kept = {side: rms[1] for side, rms in left.items()}
+    document = answer.document() | {"kept_back_rms_rad": kept, "encoder_rms_rad": encoder}
+    return Outcome("\n".join(lines), document, {"swing": answer})
 
 
 main = partial(command, "pendulum", "single_free_swing.npz", example)

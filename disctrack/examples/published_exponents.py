@@ -11,10 +11,8 @@ contradiction, and which of them these tables cannot tell apart.
 import sys
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import stats
 
 from calibration.kit.arrays import Array
@@ -26,8 +24,6 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.words import quantity_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_system import ExponentSystem, published_series
-from disctrack.report.figures import panels
-from disctrack.report.palette import INK, MUTED
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 ASKED = ("t_f", "air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # looked at, found or not
@@ -46,11 +42,7 @@ class Misfit:
     t: Array  # (3,) Student's
     sigmas: Array  # (3,) deviations as a normal variable of the same probability would have them
     p_value: float  # of all three together, Hotelling's T-squared
-
-    @property
-    def joint_sigmas(self) -> float:
-        """The joint deviation, two-sided, in normal standard deviations."""
-        return float(stats.norm.isf(self.p_value / 2))
+    joint_sigmas: float  # the same in normal standard deviations, two-sided
 
 
 def misfit(surface: str, exponents: Array, predicted: Array) -> Misfit:
@@ -61,7 +53,8 @@ def misfit(surface: str, exponents: Array, predicted: Array) -> Misfit:
     t = difference / sigma
     t_squared = float(difference @ np.linalg.solve(covariance, difference))
     p = float(stats.f.sf(t_squared * (n - k) / (k * (n - 1)), k, n - k))
-    return Misfit(surface, predicted, mean, sigma, t, np.sign(t) * stats.norm.isf(stats.t.sf(np.abs(t), n - 1)), p)
+    sigmas = np.sign(t) * stats.norm.isf(stats.t.sf(np.abs(t), n - 1))
+    return Misfit(surface, predicted, mean, sigma, t, sigmas, p, float(stats.norm.isf(p / 2)))
 
 
 @dataclass(frozen=True)
@@ -155,47 +148,21 @@ def report(answer: Answer) -> str:
     return "\n".join([*lines, "", *table(answer.diagnosis)])
 
 
-def figure(system: ExponentSystem, answer: Answer) -> Figure:
-    """Per surface: trials, the thin disc's exponents, and what each explanation predicts."""
-    picture, grid = panels(10.5, 4.1, 1, len(system.series))
-    for i, (axes, series) in enumerate(zip(grid, system.series, strict=True)):
-        axes.plot(*series.exponents[:, :2].T, ".", color=MUTED, label="trials")
-        axes.plot(*THIN_DISC[:2], "*", color=INK, ms=13, label="thin disc: 2/3, $-$1/3")
-        for e in answer.explanations:
-            axes.plot(*e.misfits[i].predicted[:2], "o", ms=7, alpha=0.8, mec="white", label=e.name)
-        axes.set(xlabel=r"$n_\theta$", ylabel=r"$n_{\dot\psi}$", title=series.setup.surface)
-    grid[-1].legend(fontsize=8, frameon=False)
-    return picture
-
-
-def as_document(answer: Answer) -> dict[str, Any]:
-    """The findings for programs; keys as in the diagnosis.json of a recording, and what only these tables have."""
-
-    def of(m: Misfit) -> dict[str, Any]:
-        kinds = ("mean", "sigma", "predicted", "t")
-        columns = {k: dict(zip(NAMES, map(float, getattr(m, k)), strict=True)) for k in kinds}
-        return {"surface": m.surface, **columns, "p_value": m.p_value, "joint_sigmas": m.joint_sigmas}
-
-    def explained(e: Explanation) -> dict[str, Any]:
-        numbers = {n: {"value": e.fit.values[n], "sigma": e.fit.sigma(n)} for n in e.sizes}
-        exponents = [of(m) for m in e.misfits]
-        return {"name": e.name, "gain": e.gain, "parameters": numbers, "held_out_gain": e.held_out_gain,
-                "exponents": exponents}  # fmt: skip
-
-    model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
-    return document(answer.diagnosis, model, sentence(answer)) | {
-        "source": "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3",
-        "cannot_be_told_apart": [e.name for e in answer.undecided],
-        "against_thin_disc": [of(m) for m in answer.thin],
-        "explanations": [explained(e) for e in answer.explanations],
-    }
-
-
 def example() -> Outcome:
     """Diagnose the published exponents of Ma et al. (2014)."""
-    system = ExponentSystem(published_series())
-    answer = examine(system)
-    return Outcome(report(answer), as_document(answer), figure(system, answer))
+    answer = examine(ExponentSystem(published_series()))
+    model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
+    explained = [
+        {"name": e.name, "gain": e.gain, "parameters": {n: (e.fit.values[n], e.fit.sigma(n)) for n in e.sizes},
+         "held_out_gain": e.held_out_gain, "exponents": [vars(m) for m in e.misfits]}
+        for e in answer.explanations
+    ]  # fmt: skip
+    return Outcome(report(answer), document(answer.diagnosis, model, sentence(answer)) | {
+        "source": "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3",
+        "cannot_be_told_apart": [e.name for e in answer.undecided],
+        "against_thin_disc": [vars(m) for m in answer.thin],
+        "explanations": explained,
+    })  # fmt: skip
 
 
 main = partial(command, "published_exponents", None, example)

@@ -15,7 +15,7 @@ _MATRIX, _GRADIENT, _STEP, _WORK_ROWS = 6, 6, 7, 8
 
 
 @_part
-def _evaluate(observed, covariance, used, cameras, centres, R, t, pixels, residual, jacobian, sums):
+def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pixels, residual, jacobian, sums):
     """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns their cost.
 
     sums (7, 6): J^T J and J^T r.
@@ -25,9 +25,9 @@ def _evaluate(observed, covariance, used, cameras, centres, R, t, pixels, residu
         for j in range(6):
             sums[i, j] = 0.0
     cost = 0.0
-    for c in range(pixels.shape[0]):
+    for c in range(2):
         for m in range(centres.shape[0]):
-            u, v, _ = _dot_by_pose(cameras, c, centres[m], R, t, J, row)
+            u, v, _ = _dot_by_pose(cameras[c], R_cw[c], t_cw[c], centres[m], R, t, J, row)
             pixels[c, m, 0], pixels[c, m, 1] = u, v
             # W with W C W^T = 1, as `pose.whitening` has it; no weight where C is not a covariance
             a, b = covariance[c, m, 0, 0], covariance[c, m, 0, 1]
@@ -57,11 +57,11 @@ def _evaluate(observed, covariance, used, cameras, centres, R, t, pixels, residu
 
 
 @_entry
-def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, converged, pixels, residuals,
+def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, tolerance, R, t, converged, pixels, residuals,
         jacobian):  # fmt: skip
     """Fit the poses of some rows (k,) of n frames, from R (n, 3, 3), t (n, 3) on, which are moved to the minimum.
 
-    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m). Marquardt 1963, with Nielsen-like
+    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras (2, 9). Marquardt 1963, with Nielsen-like
     damping; a pose has converged when its Gauss-Newton step is shorter than `tolerance` standard deviations of its own
     parameters, sqrt(step^T J^T J step); a negative tolerance leaves it where it is. Filled: converged (n,), pixels
     (n, 2, m, 2) of all dots, NaN behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian
@@ -73,7 +73,7 @@ def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, con
     R_trial, t_trial = np.empty((3, 3)), np.empty(3)
     step = sums[_STEP]
     for f in rows:
-        cost = _evaluate(observed[f], covariance[f], used[f], cameras, centres, R[f], t[f], pixels[f],
+        cost = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R[f], t[f], pixels[f],
                          residuals[f], jacobian[f], sums)  # fmt: skip
         damping, converged[f] = 1e-8, False
         for _ in range(_MAX_ITERATIONS if tolerance >= 0.0 else 0):
@@ -92,7 +92,7 @@ def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, con
             _rotate_from_left(step[3:6], R[f], R_trial)
             for i in range(3):
                 t_trial[i] = t[f, i] + step[i]
-            new = _evaluate(observed[f], covariance[f], used[f], cameras, centres, R_trial, t_trial,
+            new = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R_trial, t_trial,
                             trial_pixels, trial_residuals, trial_jacobian, trial_sums)  # fmt: skip
             small = solved and length2 < tolerance * tolerance and damping < 1e-2
             if solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12)):
@@ -101,7 +101,7 @@ def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, con
                 _copy(sums, trial_sums)
                 for i in range(3):
                     t[f, i] = t_trial[i]
-                for c in range(shape[0]):
+                for c in range(2):
                     _copy(pixels[f, c], trial_pixels[c])
                     _copy(residuals[f, c], trial_residuals[c])
                     for m in range(shape[1]):

@@ -294,14 +294,13 @@ def trajectory_provenance(
     recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
 ) -> Provenance:
     """What the trajectory is made from; reads the images' content where it was not read yet."""
-    settings = settings or TrackingSettings()
     return Provenance(
         recording=recording.name,
         inputs={**pairs.inputs(), "rig": rig_sha256(rig)},
         settings={
             "recording": dict(recording.declared),
             "frames": [pairs.start, pairs.stop],
-            "tracking": dataclasses.asdict(settings) | {"limits": settings.limits._asdict()},
+            "tracking": dataclasses.asdict(settings or TrackingSettings()),
             **pairs.camera_headers(),
         },
     )

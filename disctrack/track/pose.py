@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
 from disctrack.track import _pose_kernel as kernel
-from disctrack.track.dots._kernels import Cameras
 
 MIN_DOTS = 3  # six unknowns, two numbers per dot
 # A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
@@ -84,24 +83,29 @@ def _fit(
     *filled: NDArray,
 ) -> None:
     """`_pose_kernel.fit` with the rig's numbers."""
-    centres = np.ascontiguousarray(centres_body, float)
-    kernel.fit(rows, observed, covariance, used, cameras_of(rig), centres, tolerance, *filled)
+    poses = rig.camera_poses()
+    kernel.fit(
+        rows,
+        observed,
+        covariance,
+        used,
+        np.stack([camera.parameters for camera in rig.cameras]),
+        np.stack([R for R, _ in poses]),
+        np.stack([t for _, t in poses]),
+        np.ascontiguousarray(centres_body, float),
+        tolerance,
+        *filled,
+    )
 
 
 def prepare() -> None:
     """Compile the loop over poses, or load it."""
     zeros = np.zeros
-    cameras, dots = Cameras(zeros((2, 9)), zeros((2, 3, 3)), zeros((2, 3))), zeros((0, 2, 1, 2))
     kernel.fit(
-        zeros(0, int), dots, zeros((0, 2, 1, 2, 2)), zeros((0, 2, 1), bool), cameras, zeros((1, 3)), TOLERANCE,
-        zeros((0, 3, 3)), zeros((0, 3)), zeros(0, bool), dots, dots, zeros((0, 2, 1, 2, 6)),
+        zeros(0, int), zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2, 2)), zeros((0, 2, 1), bool), zeros((2, 9)),
+        zeros((2, 3, 3)), zeros((2, 3)), zeros((1, 3)), TOLERANCE, zeros((0, 3, 3)), zeros((0, 3)), zeros(0, bool),
+        zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2, 6)),
     )  # fmt: skip
-
-
-def cameras_of(rig: StereoRig) -> Cameras:
-    """The rig's cameras for the compiled kernels."""
-    R, t = (np.stack(part) for part in zip(*rig.camera_poses(), strict=True))
-    return Cameras(np.stack([camera.parameters for camera in rig.cameras]), R, t)
 
 
 def whitening(covariance: Array) -> Array:

@@ -14,6 +14,18 @@ is disctrack/docs/systems.md.
 from disctrack.discrepancy.equations import terms
 from disctrack.discrepancy.equations.answer import Answer, diagnose
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Run, Term
+from disctrack.discrepancy.equations.forecast import Forecast, RunScore
 from disctrack.discrepancy.noise import SmoothNoise
 
-__all__ = ["Answer", "Equations", "Parameter", "Run", "SmoothNoise", "Term", "diagnose", "terms"]
+__all__ = [
+    "Answer",
+    "Equations",
+    "Forecast",
+    "Parameter",
+    "Run",
+    "RunScore",
+    "SmoothNoise",
+    "Term",
+    "diagnose",
+    "terms",
+]

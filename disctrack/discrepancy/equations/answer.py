@@ -15,6 +15,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
 from disctrack.discrepancy.document import document, table
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.discrepancy.equations.forecast import Forecast, RunScore, foretold, scored
 from disctrack.discrepancy.equations.law import LearnedForce
 from disctrack.discrepancy.equations.loop import Answered, ask
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
@@ -110,10 +111,7 @@ class Answer:
         if law.held and named:
             notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")
         if law.along.variable == "t":
-            notes.append(
-                "a force that depends on time alone describes any motion: a sensor whose zero wanders may do as much, "
-                "and another run will not repeat it unless time is what drives it"
-            )
+            notes.append("a force that depends on time alone describes any motion, and is never what is missing")
         if law.alike:
             others = " or ".join(a.title for a in law.alike)
             notes.append(f"these data cannot tell the law from {others}")
@@ -228,25 +226,37 @@ class Answer:
         stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
         return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
 
-    def forecast(self, run: Run, *, before: bool = False, nearest: bool = False) -> dict[str, Array]:
-        """What the sensors should show (n,) at the instants of a run, by channel: a free run of the model.
+    def forecast(self, run: Run, *, window: float = 0.0, before: bool = False, nearest: bool = False) -> Forecast:
+        """A free run of the model: what the sensors should show at the instants of a run, with a band.
 
         A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
         begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
+        window : [s] from the first sample: data to which the initial state is fitted, those and no others
         before : by the equations as declared (and fitted)
         nearest : with the terms that help most, where none is named
         """
+        samples = self._checked(run)
+        d, errors = self.diagnosis, self.before if before else self.after
+        fit = d.before if before else d.after
+        if nearest and not before and self.nearest and d.nearest is not None:
+            fit, errors = d.nearest, self._errors(d.nearest, None)
+        of_noise = d.verdict != "unexplained" and not before
+        left = [e.noise if of_noise else np.nanmax([e.noise, e.rms, e.held_out]) for e in errors.values()]
+        return foretold(self.system, fit, samples, np.array(left), window)
+
+    def score(
+        self, run: Run, *, window: float = 0.0, before: bool = False, nearest: bool = False
+    ) -> dict[str, RunScore]:
+        """By channel, how well a free run (`forecast`) foretells the samples of a run after the window."""
+        samples, found = self._checked(run), self.forecast(run, window=window, before=before, nearest=nearest)
+        return scored(found, samples, self.system.formulas.channels, window)
+
+    def _checked(self, run: Run) -> Samples:
         (samples,) = checked(self.equations, [run])
-        if not run.name:
-            first = self.system.stretches[0]
-            samples = replace(samples, run=first.run, groups=first.groups)
-        fit = self.diagnosis.before if before else self.diagnosis.after
-        if nearest and self.nearest and self.diagnosis.nearest is not None:
-            fit = self.diagnosis.nearest
-        (found,) = self.system.with_(stretches=[samples]).predictions(fit.values)
-        shape = (len(samples.time), len(self.system.formulas.channels))
-        seen = np.full(shape, np.nan) if found is None else found.seen
-        return dict(zip(self.system.formulas.channels, seen.T, strict=True))
+        if run.name:
+            return samples
+        first = self.system.stretches[0]
+        return replace(samples, run=first.run, groups=first.groups)
 
     def _errors(self, fit: Fit, held: Any) -> dict[str, ChannelErrors]:
         names = self.system.formulas.channels

@@ -122,11 +122,13 @@ class Run:
     data : (n,) by channel; NaN where a sample is missing
     sigma : standard deviation of the noise by channel, a number or (n,); a channel that is not named, or None: found
             from the data's fast part
-    inputs : (n,) by input, without gaps
+    inputs : (m,) by input, without gaps
+    input_time : (m,) [s] instants of the inputs, on the clock of `time` and from its first sample to its last; None:
+            those of the samples
     constants : those that differ from the declared ones in this run
     start : states at the first sample from which the fit begins, where the guess from the data is not wanted
     known : states at the first sample that are known: value, or (value, sigma)
-    hold : how inputs go on between samples: "smooth" (cubic), "linear", or "hold" (a step at each sample)
+    hold : how inputs go on between their instants: "smooth" (cubic), "linear", or "hold" (a step at each)
     groups : what the run belongs to, by kind of group: {"ball": "golf"}; a `Parameter(per="ball")` is one of each ball
     noise : noise that remembers, of every channel, in place of sigma
     fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run). 0: all
@@ -147,6 +149,34 @@ class Run:
     noise: SmoothNoise | None = None
     fit_until: float | None = None
     at_rest: bool = False
+    input_time: ArrayLike | None = None
+
+    def thinned(self, every: int) -> Run:
+        """One sample in `every`, with the inputs averaged over a quarter of the time between two of these.
+
+        A sample of a force in place of its mean would drive another motion.
+        """
+        time = np.asarray(self.time if self.input_time is None else self.input_time, float)
+        own = len(time) / len(np.asarray(self.time))
+        first = np.arange(0, len(time), max(1, int(own * every / 4)))
+
+        def averaged(values: ArrayLike) -> Array:
+            return np.asarray(np.add.reduceat(np.asarray(values, float), first) / np.diff([*first, len(time)]), float)
+
+        def rows(values: ArrayLike) -> Array:
+            return np.asarray(values, float)[::every]
+
+        inputs, at = {u: averaged(values) for u, values in self.inputs.items()}, time[first]
+        if self.hold != "hold":  # a mean belongs to the middle
+            at = averaged(time)
+            at[[0, -1]] = time[[0, -1]]
+        sigma = self.sigma
+        if isinstance(sigma, Mapping):
+            sigma = {k: rows(v) if np.ndim(v) else v for k, v in sigma.items()}
+        return replace(
+            self, time=rows(self.time), data={k: rows(v) for k, v in self.data.items()}, sigma=sigma, inputs=inputs,
+            input_time=at if inputs else None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -247,7 +277,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
             if key not in known:
                 raise AnalysisError(f"run {name}, {what}: {unknown_name(key, known)}")
     known_states = {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
-    knots, pieces = _inputs(equations, run, name, time - time[0])
+    knots, pieces = _inputs(equations, run, name, time)
     return Samples(
         name, 0, time - time[0], data, sigma, knots, pieces, dict(run.constants), dict(run.start), known_states,
         {**run.groups, "run": name}, run.noise, run.fit_until, run.at_rest,
@@ -259,6 +289,17 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
 
     if not equations.inputs:
         return np.zeros(0), np.zeros((0, 5, 0))
+    begin, end = time[0], time[-1]
+    if run.input_time is not None:
+        time = _numbers(run.input_time, f"run {name}, input_time")
+        spacing = float(np.max(np.diff(time), initial=0.0))
+        if len(time) < 4 or not np.all(np.diff(time) > 0) or time[0] > begin or time[-1] < end - spacing:
+            raise AnalysisError(
+                f"run {name}, input_time: needs 4 increasing instants or more, from the first sample ({begin:g} s) to "
+                f"the last ({end:g} s); found {len(time)}"
+                + (f" from {time[0]:g} to {time[-1]:g} s." if len(time) else ".")
+            )
+    time = time - begin
     columns = []
     for u in equations.inputs:
         if u not in run.inputs:

@@ -27,7 +27,7 @@ from disctrack.discrepancy.fit import Fit, compress, fit, prior_rows
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.noise import THIRD
-from disctrack.discrepancy.search import CLASS_GAIN, OBVIOUS, Diagnosis, Found, Tried
+from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
@@ -221,8 +221,7 @@ class _Competition:
         if not self.arrived(law.fit) or d.held_out_before is None:
             return False
         ahead = 2 * (law.held_out.log_density - d.held_out_before.log_density) / self.noise
-        gain = (d.before.cost - law.fit.cost) / self.noise
-        if not (ahead > 0 or (ahead > -CLASS_GAIN and gain > OBVIOUS * self.looked)):
+        if not ahead > CLASS_GAIN:
             return False
         excess = [f.chi_square / self.noise - f.degrees_of_freedom for f in (d.before, law.fit)]
         return law.at_noise or (law.is_shorter and excess[1] < d.settings.unexplained_share * excess[0])
@@ -301,7 +300,8 @@ class _Competition:
             U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
             root = np.sqrt(self.noise)
             found = evidence(size * singular / root, U.T @ right / root, SIZES)
-            if not np.isfinite(found).all():  # columns of nothing: no size can be told from them
+            # columns of nothing: no size can be told from them
+            if not (np.isfinite(found).all() and np.isfinite(right @ right / self.noise)):
                 return np.inf, own
             best = int(np.argmin(found))
             priors.append(SIZES[best] * size * falls)
@@ -469,8 +469,7 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> Equatio
     known = formulas(replace(e, constants=constants), (*f.terms, term), channels)
     widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
     new = {w.name: 1.0 for w in known.widths.values() if w.name not in widths}
-    return EquationSystem(known, system.stretches, system.sizes, widths | new, system.promoted, system.held,
-                          system.typical, system.aims)  # fmt: skip
+    return system.with_(formulas=known, widths=widths | new)
 
 
 def _names() -> list[str]:
@@ -692,10 +691,10 @@ def _joining(values: Values, system: EquationSystem) -> dict[str, float]:
 def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
     """The answer with the law in place of known terms, and with those that act beside it.
 
-    Where more than noise is left, it is the nearest description.
+    Where more than noise is left, it is the nearest description; so is a function of time alone, which any motion has.
     """
     level = f"{law.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {diagnosis.noise:.3g}"
-    if not law.at_noise:
+    if not law.at_noise or law.along.variable == "t":
         reason = (
             f"chi-square stays at {diagnosis.before.reduced_chi_square:.3g}, with a law that was learned at {level}"
         )

@@ -1,9 +1,6 @@
 """From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
 
-import sys
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +14,7 @@ from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Te
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, turn
+from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out
@@ -50,14 +47,12 @@ SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over 
 BLUNT = 0.1  # of chi-square, by which a sharper jump may move the motion: numbers then move by 0.3 sigma at most
 REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
-NO_SENSOR = 5.0  # times the declared noise: nobody knows a sensor so badly
+NO_SENSOR = 5.0  # times the noise that was declared or is seen from sample to sample: no sensor's error
 FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 SCANNED = 8  # values along the motion that are tried for a limit
 ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
-PATIENCE = 60.0  # [s] of a search without a word
-ENOUGH_A_TURN = 40  # samples of a turn: more of them tell little more than the noise of each
 MOST_LED = 2  # terms with which a fit is led anew over growing windows
 ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that no term describes
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
@@ -77,45 +72,14 @@ class Answered:
 
 
 def ask(
-    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None,
-    stretch: float | None = None,
+    equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None,
+    settings: Settings | None = None, stretch: float | None = None,
 ) -> Answered:  # fmt: skip
     """Fit the equations to the runs and look for what they lack.
 
     terms : None: the usual ones (`terms.usual`)
     stretch : [s] after which every run begins anew with a state of its own; None: as far as the model follows
     """
-    samples: list[Samples] = []
-    with _word_of_patience(samples):
-        return _asked(equations, runs, terms, settings, stretch, samples)
-
-
-@contextmanager
-def _word_of_patience(samples: list[Samples]) -> Iterator[None]:
-    """After a minute, a line on stderr: what makes the search shorter. `samples` may be filled in meanwhile."""
-    timer = threading.Timer(PATIENCE, lambda: print(_shorter(samples), file=sys.stderr, flush=True))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
-def _shorter(samples: Sequence[Samples]) -> str:
-    count = sum(len(s.time) for s in samples)
-    text = f"the search goes on after {PATIENCE:.0f} s; there are {count} samples"
-    a_turn = min((min(turn(s), _pace(s)) / float(np.median(np.diff(s.time))) for s in samples), default=0.0)
-    if a_turn > 2 * ENOUGH_A_TURN:
-        every = int(a_turn / ENOUGH_A_TURN)
-        return f"{text}, {a_turn:.0f} a turn. One in {every} tells nearly as much, sooner: Run(time[::{every}], ...)."
-    return f"{text}. A part of the record, or fewer terms, are answered sooner; what they tell can be declared."
-
-
-def _asked(
-    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None, settings: Settings | None,
-    stretch: float | None, read: list[Samples],
-) -> Answered:  # fmt: skip
     runs = [runs] if isinstance(runs, Run) else list(runs)
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
@@ -125,7 +89,6 @@ def _asked(
     offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
     compiled = formulas(equations, offered, channels)
     samples = with_noise(given)
-    read += samples
     notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
     system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
     system, declared = _prepared(system)
@@ -134,9 +97,9 @@ def _asked(
     if stretch is None:
         start = led(system, declared)
         followed = system.with_(stretches=first_part(system.stretches, start.followed))
-        held, remark = redundant(followed, start.values) if start.followed > 0.0 else ((), "")
+        held = redundant(followed, start.values) if start.followed > 0.0 else ()
         if held:
-            system, notes = system.with_(held=held), [*notes, remark]
+            system = system.with_(held=held)
             start = led(system, declared)
         if start.followed < min(turn(s) for s in system.stretches):
             leading = _leading(system, declared)
@@ -173,8 +136,7 @@ def _asked(
     judged: System = diagnosis.judged or system
     memory = None
     if settings.noise is None:
-        sensor_known = all(np.isfinite(s.sigma).all() for s in given)
-        again, memory, remark = _with_memory(system, diagnosis, settings, sensor_known)
+        again, memory, remark = _with_memory(system, diagnosis, settings)
         if again is not None:
             diagnosis, judged = again, again.judged or judged
             notes.append(remark)
@@ -187,6 +149,9 @@ def _asked(
     elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
         diagnosis = with_shapes(judged, diagnosis)
         notes += diagnosis.remarks
+    if system.held:
+        held_ones = ", ".join(system.held)
+        notes.append(f"{held_ones} cannot be told from other numbers with these data, which hold for it as declared")
     return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory, law)
 
 
@@ -225,6 +190,11 @@ def _searched(
         share = len(system.candidates) / (len(system.candidates) + scans)
         settings = replace(settings, false_alarm=settings.false_alarm * share)
     diagnosis = explain(system, values, settings, system.training)
+    if diagnosis.held_out_before is None and np.isfinite(diagnosis.before.chi_square):
+        # no step leads down: by way of others, and without what the data do not tell apart
+        system = system.with_(held=(*system.held, *redundant(system, diagnosis.before.values)))
+        values = trusted(system, system.base, diagnosis.before.values)
+        diagnosis = explain(system, values, settings, system.training)
     if (anew := _led_with_terms(system, diagnosis)) is not None:
         diagnosis = explain(system, diagnosis.before.values, settings, system.training, anew)
     sharper = _sharp_enough(system, diagnosis.after)
@@ -391,8 +361,8 @@ def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, f
     return found
 
 
-def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tuple[str, ...], str]:
-    """Parameters that the data cannot part from others, to be held as declared; and how to say that."""
+def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters that the data cannot part from others, to be held as declared."""
     # of many runs with numbers of their own a few tell it
     system = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
     states = [q for q in system.base if q.is_initial]
@@ -401,7 +371,7 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tupl
     states = [q for q in states if not q.slot]
     residual, derivative = system.linearise(values, [*own.slots, *(q.name for q in (*states, *free))])
     if len(free) < 2 or not np.isfinite(derivative).all():
-        return (), ""
+        return ()
     _, matrix, _ = own.reduced(residual, derivative, values)
     k = len(states)
     basis = np.linalg.qr(matrix[:, :k] / np.maximum(np.linalg.norm(matrix[:, :k], axis=0), 1e-300))[0]
@@ -417,13 +387,7 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[tupl
         if not open_:
             break
         weak.append(max(reversed(open_), key=open_.count))  # runs may leave one or the other of two open
-    if not weak:
-        return (), ""
-    names, others = sorted(weak), sorted(set(stems.tolist()) - set(weak))
-    return tuple(names), (
-        f"{', '.join(names)} cannot be told from {', '.join(others) or 'the initial states'} with these data and "
-        f"{'is' if len(names) == 1 else 'are'} held as declared; values of the others hold for that"
-    )
+    return tuple(sorted(weak))
 
 
 def _in_stretches(
@@ -512,12 +476,9 @@ def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, flo
 
 
 def _with_memory(
-    system: EquationSystem, diagnosis: Diagnosis, settings: Settings, sensor_known: bool
+    system: EquationSystem, diagnosis: Diagnosis, settings: Settings
 ) -> tuple[Diagnosis | None, Array | None, str]:
-    """Search again with noise that remembers, where what is left of the best model does.
-
-    sensor_known : all noise was declared; what is left may be larger than that, but not as it pleases
-    """
+    """Search again with noise that remembers, where what is left of the best model does and is as small as noise."""
     if diagnosis.held_out_before is None:
         return None, None, ""
     residual, _ = system.linearise(diagnosis.after.values, [])
@@ -532,7 +493,7 @@ def _with_memory(
     shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
     # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
-    as_noise &= not (sensor_known and size > NO_SENSOR)
+    as_noise &= size <= NO_SENSOR
     remembering = Remembering(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
     if diagnosis.verdict == "unexplained" and (base is None or not base.converged):

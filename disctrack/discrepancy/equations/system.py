@@ -43,7 +43,7 @@ class Prediction:
 class EquationSystem(System):
     """Samples of all stretches, one after the other, with a row without data between two of them."""
 
-    several_minima = frees_shapes = True  # what users declare may bend anyhow
+    several_minima = True  # what users declare may bend anyhow
 
     def __init__(
         self, formulas: Formulas, stretches: Sequence[Samples], sizes: Array, widths: Mapping[str, float],
@@ -83,10 +83,10 @@ class EquationSystem(System):
     def with_(self, **changes: object) -> EquationSystem:
         """The same with other stretches, promoted terms, ..."""
         given = {
-            "stretches": self.stretches, "sizes": self.sizes, "widths": self.widths, "promoted": self.promoted,
-            "held": self.held, "typical": self.typical, "aims": self.aims,
+            "formulas": self.formulas, "stretches": self.stretches, "sizes": self.sizes, "widths": self.widths,
+            "promoted": self.promoted, "held": self.held, "typical": self.typical, "aims": self.aims,
         } | changes  # fmt: skip
-        return EquationSystem(self.formulas, **given)  # type: ignore[arg-type]
+        return EquationSystem(**given)  # type: ignore[arg-type]
 
     def _base(self) -> list[Quantity]:
         found = []
@@ -215,6 +215,16 @@ class EquationSystem(System):
     def predictions(self, values: Values) -> list[Prediction | None]:
         """What every stretch should show; None where the motion cannot be followed to its end."""
         return [self._predict(values, s, []) for s in self.stretches]
+
+    def predict(self, values: Values, s: Samples, names: Sequence[str]) -> Prediction | None:
+        """As `predictions`, of one stretch with its derivatives by quantities that it has (`names_of`)."""
+        own = [self._own(name, s) for name in names]
+        return self._predict(values, s, [number for number in own if number is not None])
+
+    def names_of(self, s: Samples) -> set[str]:
+        """Quantities that move a stretch."""
+        states = (f"state.{name}[{s.name}]" for name in self.formulas.equations.states)
+        return {*states, *(self._name(name, s) for name in self.formulas.fitted)}
 
     def _own(self, name: str, s: Samples) -> int | None:
         """Which number of a stretch a quantity is: its place in p, or -1 - i for the i-th state at the start."""

@@ -5,6 +5,7 @@ a term is added. `v` is a velocity, `x` its coordinate; both may be formulas. A 
 so that formulas which are handed in mean the equations' numbers of the same name.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 
@@ -198,23 +199,44 @@ def input_delay(v: str, u: str, gain: str, name: str = "") -> Term:
                 parameters={"tau": Parameter(0.0, unit="s")}, title=f"input {u} acts late")  # fmt: skip
 
 
-def usual(equations: Equations) -> tuple[Term, ...]:
-    """What is offered where the user offers nothing: friction on velocities, springs on coordinates, and sensors.
+def sensor_limit(channel: str, shown: str = "", name: str = "") -> Term:
+    """Above a value that is looked for the sensor shows no more (share 1). `shown`: its formula, as for its scale."""
+    shown = shown or channel
+    return Term(name or f"limit_{channel}", observed={channel: f"-own_share*Max(({shown}) - own_top, 0)"},
+                parameters={"share": Parameter(0.0, lower=0.0, upper=1.0),
+                            "top": Parameter(0.0, shape=True, along=shown)},
+                title=f"{channel} is limited by its sensor")  # fmt: skip
 
-    A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}.
+
+def usual(equations: Equations) -> tuple[Term, ...]:
+    """What is offered where the user offers nothing, by the structure of the equations; and what sensors do.
+
+    A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, on
+    which friction and springs act. Any other state is a level (of a tank, a charge, a temperature): it leaks, is fed,
+    runs over into the first of the states that it drives.
     """
     found: list[Term] = []
-    pairs = {x: str(f).strip() for x, f in equations.rates.items() if str(f).strip() in equations.rates}
-    for v in equations.rates:
-        if v not in pairs:
-            found += [constant(v), viscous(v), coulomb(v), quadratic(v)]
-            if v not in pairs.values():  # of first order: what it is itself drives it
-                found += [asymmetric_spring(v, v, f"square_{v}"), cubic_spring(v, v, f"cube_{v}")]
+    written = {y: str(f).strip() for y, f in equations.rates.items()}
+    pairs = {x: v for x, v in written.items() if v in written}
+    for y in written:
+        if y in pairs:
+            continue
+        found += [constant(y), viscous(y)]
+        if y in pairs.values():
+            found += [coulomb(y), quadratic(y)]
+            continue
+        fed = next((z for z, f in written.items() if z not in (y, *pairs) and re.search(rf"\b{y}\b", f)), "")
+        found += [asymmetric_spring(y, y, f"square_{y}"), cubic_spring(y, y, f"cube_{y}"), overflow(equations, y, fed)]
     for x, v in pairs.items():
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x)]
     observed = equations.observed if equations.observed is not None else {}
     for channel, formula in observed.items():
         found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]
+        if str(formula).strip() in {*written} - {
+            *pairs,
+            *pairs.values(),
+        }:  # a share of a limit looks like drag in a fall
+            found.append(sensor_limit(channel, str(formula)))
         if equations.inputs or len(observed) > 1:
             found.append(sensor_lag(channel))
     found.append(clock_rate())

@@ -13,18 +13,16 @@ Free per dot: centre (2), R, sigma, L, g (2), c. R and sigma do not couple with 
 printed too large, or motion blur, costs no accuracy.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from calibration.cameras.camera import Camera, normalised_maps, project
 from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots._kernels import TemplateLimits
 from disctrack.trajectory import MarkerStatus
 
 TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
@@ -56,6 +54,21 @@ def typical_noise(image: Image) -> NoiseModel:
 
 
 @dataclass(frozen=True)
+class TemplateLimits:
+    """When a converged fit is refused."""
+
+    misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
+    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
+    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
+    radius: float = 0.20  # relative departure of the fitted radius
+    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
+
+    def array(self) -> Array:
+        """(5,) for the compiled kernels."""
+        return np.array([self.misfit, self.share, self.clipped, self.radius, self.blur])
+
+
+@dataclass(frozen=True)
 class DotCentres:
     """Centres of m dots in one image."""
 
@@ -67,7 +80,6 @@ class DotCentres:
     radius: Array  # (m,) fitted radius, plane units
     level: Array  # (m,) grey value beside the dot
     contrast: Array  # (m,) 1 - dark / light
-    n_pixels: Array  # (m,) grey values that were fitted
 
 
 def face_edge(disc: Disc) -> float:
@@ -97,21 +109,40 @@ def locate_on_disc(
     image (height, width) uint8 or uint16; R_camera_body (3, 3), t_camera_body (3,) [m].
     """
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
-    dots = np.zeros((1, disc.n_markers), kernels.DOT)
+    results = np.full((1, disc.n_markers, kernels.N_RESULT), np.nan)
+    status = np.zeros((1, disc.n_markers), np.uint8)
+    noise = noise or typical_noise(image)
     kernels.look(
-        kernels.compiled_for(image.dtype),
         np.ascontiguousarray(image)[None],
         np.ones(1, bool),
         map_x[None],
         map_y[None],
-        kernels.Cameras(camera.parameters[None], np.eye(3)[None], np.zeros((1, 3))),
-        expected_of(disc, [noise or typical_noise(image)], [blur_px], limits or TemplateLimits()),
+        camera.parameters[None],
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        np.ascontiguousarray(disc.marker_centres_body),
+        0.5 * disc.marker_diameter,
+        face_edge(disc),
+        np.array([blur_px]),
+        noise.parameters[None],
+        (limits or TemplateLimits()).array(),
         np.ascontiguousarray(R_camera_body),
         np.ascontiguousarray(t_camera_body),
-        kernels.scratch(),
-        dots,
+        *kernels.scratch(),
+        results,
+        status,
     )
-    return dot_centres(dots[0])
+    return dot_centres(results[0], status[0])
+
+
+def prepare(dtype: DTypeLike = np.uint8) -> None:
+    """Compile the inner loop of `locate_on_disc` for images of this type, or load it."""
+    zeros = np.zeros
+    kernels.look(
+        zeros((1, 8, 8), dtype), zeros(1, bool), zeros((1, 8, 8)), zeros((1, 8, 8)), zeros((1, 9)), zeros((1, 3, 3)),
+        zeros((1, 3)), zeros((0, 3)), 1.0, 1.0, zeros(1), zeros((1, 3)), zeros(5), zeros((3, 3)), zeros(3),
+        *kernels.scratch(), zeros((1, 0, kernels.N_RESULT)), zeros((1, 0), np.uint8),
+    )  # fmt: skip
 
 
 def locate_on_plane(
@@ -133,50 +164,48 @@ def locate_on_plane(
     H = np.broadcast_to(np.asarray(image_from_plane, float), (len(centres), 3, 3))
     height, width = image.shape
     map_x, map_y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    variance = (noise or typical_noise(image)).parameters
-    dots, contiguous = np.zeros(len(centres), kernels.DOT), np.ascontiguousarray(image)
+    noise = noise or typical_noise(image)
+    limits = limits or TemplateLimits()
+    results = np.full((len(centres), kernels.N_RESULT), np.nan)
+    status = np.zeros(len(centres), np.uint8)
+    scratch = kernels.scratch()
+    contiguous = np.ascontiguousarray(image)
     for i, (x, y) in enumerate(centres):  # the body is one compiled call
+        p = np.empty(8)
         u = H[i] @ (x, y, 1.0)
-        start = x, y, float(radius), u[0] / u[2], u[1] / u[2]
+        start = np.array([x, y, radius, u[0] / u[2], u[1] / u[2]])
         others = np.delete(centres, i, axis=0)
         near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
-        kernels.fit_dot(
-            kernels.compiled_for(image.dtype), contiguous, map_x, map_y, np.linalg.inv(H[i]), start, float(blur_px),
-            variance, limits or TemplateLimits(), np.inf, near, kernels.scratch(), dots[i],
+        status[i] = kernels.fit_dot(
+            contiguous, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, *scratch, p,
+            results[i],
         )  # fmt: skip
-        u = H[i] @ (dots[i]["u"], dots[i]["v"], 1.0)
-        dots[i]["u"], dots[i]["v"] = u[:2] / u[2]
-    return dot_centres(dots)
+        if status[i] == MarkerStatus.MEASURED:
+            status[i] = kernels.judge_dot(results[i], radius, blur_px, noise.parameters, limits.array())
+            u = H[i] @ (x + p[0], y + p[1], 1.0)
+            results[i, kernels.U], results[i, kernels.V] = u[:2] / u[2]
+    return dot_centres(results, status)
 
 
-def expected_of(
-    disc: Disc, noise: Sequence[NoiseModel], blur_px: Sequence[float], limits: TemplateLimits
-) -> kernels.Expected:
-    """What is known of the dots and of each camera's images, for the compiled kernels."""
-    return kernels.Expected(
-        np.ascontiguousarray(disc.marker_centres_body), 0.5 * disc.marker_diameter, float(face_edge(disc)),
-        np.array(blur_px, float), np.array([model.parameters for model in noise]), TemplateLimits(*map(float, limits)),
-    )  # fmt: skip
-
-
-def dot_centres(dots: NDArray[np.void]) -> DotCentres:
-    """Arrays with names from the kernels' table of dots (..., m); NaN where a dot was not measured."""
-    good = dots["status"] == MarkerStatus.MEASURED
-    r = {name: np.where(good, dots[name], np.nan) for name in dots.dtype.names or () if name != "status"}
-    upper = np.stack([r["var_u"], r["cov_uv"]], axis=-1)
-    covariance = np.stack([upper, np.stack([r["cov_uv"], r["var_v"]], axis=-1)], axis=-1)
+def dot_centres(results: Array, status: NDArray[np.uint8]) -> DotCentres:
+    """Arrays with names from the kernels' table of results (..., m, 12) and status (..., m)."""
+    good = status == MarkerStatus.MEASURED
+    r = np.where(good[..., None], results, np.nan)
+    covariance = np.empty((*good.shape, 2, 2))
+    covariance[..., 0, 0], covariance[..., 1, 1] = r[..., kernels.VAR_U], r[..., kernels.VAR_V]
+    covariance[..., 0, 1] = covariance[..., 1, 0] = r[..., kernels.COV_UV]
+    misfit = r[..., kernels.CHI_SQUARE]
     # grey values that scatter more than the noise model says (print, speckle, compression) scatter the centre too
-    covariance *= np.maximum(r["misfit"], 1.0)[..., None, None]
+    covariance *= np.maximum(misfit, 1.0)[..., None, None]
     return DotCentres(
-        pixels=np.stack([r["u"], r["v"]], axis=-1),
+        pixels=r[..., : kernels.V + 1],
         covariance_px2=covariance,
-        status=dots["status"],
-        misfit=r["misfit"],
-        blur_px=r["blur"],
-        radius=r["radius"],
-        level=r["level"],
-        contrast=r["contrast"],
-        n_pixels=r["n_pixels"],
+        status=status,
+        misfit=misfit,
+        blur_px=r[..., kernels.FIT_SIGMA],
+        radius=r[..., kernels.FIT_RADIUS],
+        level=r[..., kernels.FIT_LEVEL],
+        contrast=r[..., kernels.FIT_CONTRAST],
     )
 
 
@@ -236,14 +265,14 @@ def measure_noise(
     return NoiseModel(float(read), float(gain), step)
 
 
-def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, dots: NDArray[np.void]) -> NoiseModel:
+def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: Array) -> NoiseModel:
     """The law found in flat parts, unless dots leave less than it says: then there were no flat parts.
 
-    Dots that are small beside their blur, or beside one another, have none. dots (k,) of fits that took the noise as
-    `assumed`; what they leave is noise and misfit, and so never less than the noise.
+    Dots that are small beside their blur, or beside one another, have none. results (k, N_RESULT) of fits that took the
+    noise as `assumed`; what they leave is noise and misfit, and so never less than the noise.
     """
-    middle = dots["level"] * (1.0 - 0.5 * dots["contrast"])
-    left = float(np.median(dots["misfit"] * assumed.variance(middle) / flat.variance(middle)))
+    middle = results[:, kernels.FIT_LEVEL] * (1.0 - 0.5 * results[:, kernels.FIT_CONTRAST])
+    left = float(np.median(results[:, kernels.CHI_SQUARE] * assumed.variance(middle) / flat.variance(middle)))
     if left > LESS_THAN_FLAT:  # within the scatter of both
         return flat
     return replace(flat, read=flat.read * left, gain=flat.gain * left)

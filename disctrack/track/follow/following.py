@@ -8,32 +8,30 @@ fails, going back over the frames before it was found again, and measuring blur 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.cameras.camera import StereoRig, normalised_maps
+from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Array32, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots._kernels import Heading, TemplateLimits
 from disctrack.track.dots.acquisition import acquire
 from disctrack.track.dots.template import (
     TYPICAL_BLUR_PX,
     NoiseModel,
+    TemplateLimits,
     dot_centres,
-    expected_of,
+    face_edge,
     measure_noise,
     no_more_than_left,
     typical_noise,
 )
 from disctrack.track.follow.motion_span import StillScene
-from disctrack.track.pose import cameras_of
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
@@ -61,30 +59,40 @@ class Law:
 
     def limits(self, limits: TemplateLimits) -> TemplateLimits:
         """A dot is refused for a misfit that is unusual in this recording."""
-        return limits._replace(misfit=max(limits.misfit, UNUSUAL * self.misfit))
+        return replace(limits, misfit=max(limits.misfit, UNUSUAL * self.misfit))
 
 
-def steady(last: Pose, before: Pose) -> Heading:
-    """The next prediction makes their turn and shift once more, as if they had been made before, too."""
-    turn = last[0] @ before[0].T
-    R, t = np.stack([last[0], before[0], turn.T @ before[0]]), np.stack([last[1], before[1], 2 * before[1] - last[1]])
-    return Heading(R, t)
+@dataclass(frozen=True)
+class Heading:
+    """The last three poses, from which the next is predicted (`_kernels.track_frames`)."""
 
+    last: Pose
+    before: Pose
+    older: Pose
 
-def leading_to(pose: Pose, following: Pose | None) -> Heading:
-    """The next prediction is `pose`, the one after it `following`, or the same where that is not known."""
-    (R, t), (R_next, t_next) = pose, following or pose
-    turn, shift = R_next @ R.T, t_next - t
-    return steady((turn.T @ R, t - shift), (turn.T @ turn.T @ R, t - 2 * shift))
+    @classmethod
+    def steady(cls, last: Pose, before: Pose) -> Heading:
+        """The next prediction makes their turn and shift once more, as if they had been made before, too."""
+        turn = last[0] @ before[0].T
+        return cls(last, before, (turn.T @ before[0], 2 * before[1] - last[1]))
 
+    @classmethod
+    def leading_to(cls, pose: Pose, following: Pose | None) -> Heading:
+        """The next prediction is `pose`, the one after it `following`, or the same where that is not known."""
+        R, t = pose
+        turn, shift = np.eye(3), np.zeros(3)
+        if following is not None:
+            turn, shift = following[0] @ R.T, following[1] - t
+        last = (turn.T @ R, t - shift)
+        return cls.steady(last, (turn.T @ last[0], t - 2 * shift))
 
-def carried_on(heading: Heading, steps: int) -> Heading:
-    """As after so many more frames of the same motion."""
-    last, before, _ = zip(*heading, strict=True)
-    turn, shift = last[0] @ before[0].T, last[1] - before[1]
-    for _ in range(steps):
-        last, before = (turn @ last[0], last[1] + shift), last
-    return steady(last, before)
+    def carried_on(self, steps: int) -> Heading:
+        """As after so many more frames of the same motion."""
+        turn, shift = self.last[0] @ self.before[0].T, self.last[1] - self.before[1]
+        last, before = self.last, self.before
+        for _ in range(steps):
+            last, before = (turn @ last[0], last[1] + shift), last
+        return Heading.steady(last, before)
 
 
 @dataclass(frozen=True)
@@ -138,13 +146,6 @@ class TrackingSetup:
     maps_x: Array  # (2, height, width) undistorted normalised coordinates of every pixel
     maps_y: Array
 
-    @classmethod
-    def of(cls, rig: StereoRig, disc: Disc, limits: TemplateLimits) -> TrackingSetup:
-        """With the maps of the cameras, drawn side by side."""
-        with ThreadPoolExecutor(len(rig.cameras)) as pool:
-            maps = list(pool.map(normalised_maps, rig.cameras))
-        return cls(rig, disc, limits, *(np.stack(part) for part in zip(*maps, strict=True)))
-
 
 @dataclass
 class Tables:
@@ -163,17 +164,19 @@ class Tables:
     digest: NDArray[np.uint32]  # (n, 2) of some of each image's rows; 0 where there is no image
 
 
-class Rows(NamedTuple):
+@dataclass
+class Rows:
     """What the loop over frames fills."""
 
-    dots: NDArray[np.void]  # (n, 2, m) of _kernels.DOT
+    results: Array  # (n, 2, m, 12)
+    status: NDArray[np.uint8]  # (n, 2, m)
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
 
     def part(self, start: int, stop: int | None = None) -> Rows:
         """Views of the rows start..stop-1."""
         rows = slice(start, stop)
-        return Rows(self.dots[rows], self.R[rows], self.t[rows])
+        return Rows(self.results[rows], self.status[rows], self.R[rows], self.t[rows])
 
 
 @dataclass
@@ -208,31 +211,58 @@ def run(
     setup: TrackingSetup, law: Law, heading: Heading, images: Image, readable: Mask, rows: Rows
 ) -> tuple[int, Heading]:
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
-    heading = Heading(*(np.array(part, float, order="C") for part in heading))  # the loop moves it on
+    poses = setup.rig.camera_poses()
+    # the loop moves them on
+    known = [np.array(part, float, order="C") for part in (*heading.last, *heading.before, *heading.older)]
     done = kernels.track_frames(
-        kernels.compiled_for(images.dtype),
         images,
         readable,
         setup.maps_x,
         setup.maps_y,
-        cameras_of(setup.rig),
-        expected_of(setup.disc, law.noise, law.blur, law.limits(setup.limits)),
-        heading,
-        kernels.scratch(),
-        *rows,
+        np.stack([camera.parameters for camera in setup.rig.cameras]),
+        np.stack([R for R, _ in poses]),
+        np.stack([t for _, t in poses]),
+        np.ascontiguousarray(setup.disc.marker_centres_body),
+        0.5 * setup.disc.marker_diameter,
+        face_edge(setup.disc),
+        np.array(law.blur),
+        np.stack([noise.parameters for noise in law.noise]),
+        law.limits(setup.limits).array(),
+        *known,
+        rows.results,
+        rows.status,
+        rows.R,
+        rows.t,
         MAX_PREDICTION_RMS_PX,
     )
-    return int(done), heading
+    R_last, t_last, R_before, t_before, R_older, t_older = known
+    return int(done), Heading((R_last, t_last), (R_before, t_before), (R_older, t_older))
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the loop over frames for images of this type, or load it."""
-    images, readable, *known = kernels.nothing_to_see(dtype)[:6]
-    heading, compiled = Heading(np.zeros((3, 3, 3)), np.zeros((3, 3))), kernels.compiled_for(np.dtype(dtype))
+    zeros = np.zeros
     kernels.track_frames(
-        compiled, images[None][:0], readable[None][:0], *known, heading, kernels.scratch(), *empty_rows(0, 1),
+        zeros((0, 2, 8, 8), dtype),
+        zeros((0, 2), bool),
+        zeros((2, 8, 8)),
+        zeros((2, 8, 8)),
+        zeros((2, 9)),
+        zeros((2, 3, 3)),
+        zeros((2, 3)),
+        zeros((1, 3)),
+        1.0,
+        1.0,
+        zeros(2),
+        zeros((2, 3)),
+        zeros(5),
+        *(np.eye(3), zeros(3)) * 3,
+        zeros((0, 2, 1, kernels.N_RESULT)),
+        zeros((0, 2, 1), np.uint8),
+        zeros((0, 3, 3)),
+        zeros((0, 3)),
         MAX_PREDICTION_RMS_PX,
-    )  # fmt: skip
+    )
 
 
 def empty_tables(n: int, m: int) -> Tables:
@@ -261,9 +291,8 @@ def clear(tables: Tables, rows: slice) -> None:
 
 def empty_rows(n: int, m: int) -> Rows:
     """Rows of n pairs and m dots that nothing has filled."""
-    dots = np.zeros((n, 2, m), kernels.DOT)
-    dots["status"] = MarkerStatus.NOT_LOOKED_FOR
-    return Rows(dots, np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan))
+    tables = empty_tables(n, m)
+    return Rows(np.full((n, 2, m, kernels.N_RESULT), np.nan), tables.status, tables.R, tables.t)
 
 
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
@@ -273,7 +302,8 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
     if follower.first_row is None:
         follower.first_row = start
     readable = readable & ~_repeated_alone(images, readable, tables, start, follower.first_row)
-    rows = empty_rows(n, follower.setup.disc.n_markers)
+    results = np.full((n, 2, follower.setup.disc.n_markers, kernels.N_RESULT), np.nan)
+    rows = Rows(results, tables.status[own], tables.R[own], tables.t[own])
     status = tables.frame_status[own]
     while i < n:
         if not readable[i].any():
@@ -298,9 +328,11 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
         i += done
         follower.search = replace(follower.search.frames_later(done), failures=0, scenes=None)
         follower.lost = 0 if i < n else None
-    tables.R[own], tables.t[own], dots = rows.R, rows.t, dot_centres(rows.dots)
-    for name in ("pixels", "covariance_px2", "status", "misfit", "n_pixels", "blur_px", "contrast"):
-        getattr(tables, name)[own] = getattr(dots, name)
+    dots = dot_centres(results, rows.status)
+    tables.pixels[own], tables.covariance_px2[own] = dots.pixels, dots.covariance_px2
+    tables.misfit[own], tables.n_pixels[own] = dots.misfit, results[..., kernels.N_PIXELS]
+    tables.blur_px[own] = dots.blur_px
+    tables.contrast[own] = dots.contrast
 
 
 def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, first: int) -> Mask:
@@ -352,7 +384,7 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     than any other frame; then, now and then, it is searched for in the whole images.
     """
     if follower.heading is not None and follower.lost is not None and follower.lost <= MOST_CARRIED:
-        carried = carried_on(follower.heading, follower.lost)
+        carried = follower.heading.carried_on(follower.lost)
         if _holds(follower, carried, images, readable):
             follower.heading = carried
             return True
@@ -369,16 +401,16 @@ def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) 
     """True where the first of the pairs shows dots enough at the place where the heading leads."""
     trial = empty_rows(1, follower.setup.disc.n_markers)
     done, _ = run(follower.setup, follower.law, heading, images[:1], readable[:1], trial)
-    if done and _enough(trial.dots):
+    if done and _enough(trial.status):
         return True
-    follower.first_reason = follower.first_reason or _refusals(trial.dots[0])
+    follower.first_reason = follower.first_reason or _refusals(trial.status[0])
     return False
 
 
-def _enough(dots: NDArray[np.void]) -> bool:
-    """True where a pose with these dots (1, 2, m) is not chance."""
-    found = int(np.sum(dots["status"] == MarkerStatus.MEASURED))
-    return found >= min(MIN_TO_BEGIN, dots.shape[-1])
+def _enough(status: NDArray[np.uint8]) -> bool:
+    """True where a pose with dots of this status (1, 2, m) is not chance."""
+    found = int(np.sum(status == MarkerStatus.MEASURED))
+    return found >= min(MIN_TO_BEGIN, status.shape[-1])
 
 
 def _go_back(
@@ -397,22 +429,23 @@ def _go_back(
         return
     back = slice(first, found)
     trial = empty_rows(found - first, follower.setup.disc.n_markers)
-    heading = steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
+    heading = Heading.steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
     pairs: Image = np.ascontiguousarray(images[back][::-1])  # type: ignore[assignment]  # the stubs forget the depth
     usable = np.ascontiguousarray(readable[back][::-1])
     done, _ = run(follower.setup, follower.law, heading, pairs, usable, trial)
     for k in range(done):
-        if not _enough(trial.dots[k : k + 1]):
+        if not _enough(trial.status[k : k + 1]):
             break
         i = found - 1 - k
-        for row, found_there in zip(rows, trial, strict=True):
-            row[i] = found_there[k]
+        rows.results[i], rows.status[i], rows.R[i], rows.t[i] = (
+            trial.results[k], trial.status[k], trial.R[k], trial.t[k],
+        )  # fmt: skip
         status[i] = FrameStatus.MEASURED
 
 
-def _refusals(dots: NDArray[np.void]) -> str:
+def _refusals(status: NDArray[np.uint8]) -> str:
     """Why the dots (2, m) of a pair were refused, in words."""
-    kinds, counts = np.unique(dots["status"], return_counts=True)
+    kinds, counts = np.unique(status, return_counts=True)
     listed = ", ".join(f"{n} {MarkerStatus(k).name.lower()}" for k, n in zip(kinds, counts, strict=True))
     return f"blobs lie where the dots should be, but their grey values do not fit the dots of [markers]: {listed}"
 
@@ -425,7 +458,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     following = None
     if len(images) > 1 and readable[1].any():
         following = _found(follower, images[1], readable[1])
-    heading = leading_to(pose, following)
+    heading = Heading.leading_to(pose, following)
     if not follower.measured and (law := follower.given()) is not None:
         follower.keep_law(law)
     if not follower.measured:
@@ -468,19 +501,19 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
     for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
         law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit=misfit)
         trial = empty_rows(n, m)
-        limits = setup.limits if blur_known else setup.limits._replace(blur=np.inf, share=MOST_USUAL)
+        limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf, share=MOST_USUAL)
         done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
-        if done == 0 or not _enough(trial.dots[:1]):
+        if done == 0 or not _enough(trial.status[:1]):
             follower.law = law  # how the noise was taken to be tells why the dots are refused
             return
-        good = trial.dots["status"][:done] == MarkerStatus.MEASURED
+        good = trial.status[:done] == MarkerStatus.MEASURED
         for camera, (R_cw, t_cw) in views:
-            fits = trial.dots[:done, camera][good[:, camera]]
+            fits = trial.results[:done, camera][good[:, camera]]
             if not len(fits):
                 continue
-            blur[camera] = float(np.median(fits["blur"]))
-            light[camera] = float(np.median(fits["level"])), float(np.median(fits["contrast"]))
-            misfit = max(misfit, float(np.sqrt(np.median(fits["misfit"]))))
+            blur[camera] = float(np.median(fits[:, kernels.FIT_SIGMA]))
+            light[camera] = tuple(np.median(fits[:, (kernels.FIT_LEVEL, kernels.FIT_CONTRAST)], axis=0).tolist())
+            misfit = max(misfit, float(np.sqrt(np.median(fits[:, kernels.CHI_SQUARE]))))
             if not blur_known:
                 continue
             sample = range(0, done, NOISE_STEP)
@@ -494,17 +527,17 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             )
             noise[camera] = no_more_than_left(flat, noise[camera], fits)
     follower.saturated = (
-        _saturated(images[:done, 0], trial.dots[:done, 0], noise[0]),
-        _saturated(images[:done, 1], trial.dots[:done, 1], noise[1]),
+        _saturated(images[:done, 0], trial.results[:done, 0], noise[0]),
+        _saturated(images[:done, 1], trial.results[:done, 1], noise[1]),
     )
     follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1]), (light[0], light[1]), misfit))
 
 
-def _saturated(images: Image, dots: NDArray[np.void], noise: NoiseModel) -> int | None:
-    """Grey value at which the brighter side of the edges of dots (n, m) is clipped; None where it is not."""
+def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:
+    """Grey value at which the brighter side of the edges of dots (n, m, 12) is clipped; None where it is not."""
     saturation = saturation_level(images)
-    fits = dots[dots["n_pixels"] > 0]
-    if saturation is None or not len(fits):
+    light = results[..., kernels.FIT_LEVEL] * (1.0 - np.minimum(results[..., kernels.FIT_CONTRAST], 0.0))
+    if saturation is None or not np.isfinite(light).any():
         return None
-    level = float(np.median(fits["level"] * (1.0 - np.minimum(fits["contrast"], 0.0))))
+    level = float(np.nanmedian(light))
     return saturation if saturation - level < 3.0 * np.sqrt(noise.variance(np.array(level))) else None

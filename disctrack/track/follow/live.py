@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
+from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array, Image, Mask
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.follow.following import Follower, Pose, Rows, TrackingSetup, empty_rows, recover, run, steady
+from disctrack.track.follow.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
 from disctrack.track.follow.tracking import check_images
 from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
 from disctrack.track.refine.assembly import MIN_GOOD_DOT_IMAGES, TrackingSettings
@@ -64,7 +64,10 @@ class Tracker:
         self.rig, self.disc = rig, disc
         self.frame = -1
         self._settings = settings or TrackingSettings()
-        self._follower = Follower(TrackingSetup.of(rig, disc, self._settings.limits))
+        maps_x, maps_y = (
+            np.stack(part) for part in zip(*(normalised_maps(camera) for camera in rig.cameras), strict=True)
+        )
+        self._follower = Follower(TrackingSetup(rig, disc, self._settings.limits, maps_x, maps_y))
         self._readable = np.ones((1, 2), bool)
         self._angles: Array | None = None  # of the last pose
         self._found: Pose | None = None  # in the pair before, by a search
@@ -117,15 +120,15 @@ class Tracker:
         if not recover(follower, images, self._readable):
             return 0
         if before is not None and follower.heading is not None:
-            (R, t), (R_now, t_now) = before, (follower.heading.R[0], follower.heading.t[0])
-            follower.heading = steady((R, t), (R @ R_now.T @ R, 2 * t - t_now))
+            (R, t), (R_now, t_now) = before, follower.heading.last
+            follower.heading = Heading.steady((R, t), (R @ R_now.T @ R, 2 * t - t_now))
         done = self._run(images, rows)
         if done:
             self._found = (rows.R[0].copy(), rows.t[0].copy())
         return done
 
     def _pose(self, rows: Rows) -> LivePose:
-        dots = dot_centres(rows.dots)
+        dots = dot_centres(rows.results, rows.status)
         pixels, covariances = dots.pixels, dots.covariance_px2
         R, t, covariance, residuals, chi_square, used = _refined(
             pixels, covariances, self.rig, self.disc, rows.R, rows.t, self._settings.reject_outliers

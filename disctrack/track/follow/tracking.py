@@ -13,7 +13,7 @@ from threading import Event, Lock
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.cameras.camera import StereoRig
+from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
@@ -95,8 +95,12 @@ def track(
             + (" on one line" if disc.n_markers > 2 else "")
             + ": a pose needs at least three dots that are not on one line"
         )
-    read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-    setup = TrackingSetup.of(rig, disc, settings.limits)
+    with ThreadPoolExecutor(2) as pool:
+        drawing = pool.map(normalised_maps, rig.cameras)
+        read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
+        maps = list(drawing)
+    maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
+    setup = TrackingSetup(rig, disc, settings.limits, maps_x, maps_y)
     edges = stretch_edges(pairs, disc)
     followers, tables = _followed(read_blocks, edges, setup, settings, workers, progress)
     if not np.isfinite(tables.t).any():

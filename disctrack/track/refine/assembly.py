@@ -13,8 +13,7 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import normal_of_rows
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.track.dots._kernels import TemplateLimits
-from disctrack.track.dots.template import NoiseModel
+from disctrack.track.dots.template import NoiseModel, TemplateLimits
 from disctrack.track.dots.template_response import Pull
 from disctrack.track.follow.following import Follower, Tables, TrackingSetup, repeats
 from disctrack.track.judge.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of

@@ -107,8 +107,8 @@ def test_errors_on_the_second_drops_are_those_that_others_found(answer):
     }
     for name, (whole, forecast) in reference.items():
         found = answer.errors[name]
-        assert np.median(list(found.whole.values())) == pytest.approx(whole, abs=0.01)
-        assert np.median(list(found.forecast.values())) == pytest.approx(forecast, abs=0.03)
+        assert np.median(list(found["whole"].values())) == pytest.approx(whole, abs=0.01)
+        assert np.median(list(found["forecast"].values())) == pytest.approx(forecast, abs=0.03)
 
 
 @pytest.mark.statistical
@@ -133,7 +133,7 @@ def test_shuffled_residuals_of_the_balls_give_no_finding(answer, rng):
 
 
 @pytest.mark.statistical
-def test_command_writes_the_diagnosis_and_a_figure(shared_data, tmp_path, capsys, monkeypatch, answer):
+def test_command_writes_the_diagnosis_and_a_page(shared_data, tmp_path, capsys, monkeypatch, answer):
     monkeypatch.setattr("disctrack.examples.ball_drop.analyse_drops", lambda drops: answer)
     words = [str(shared_data / "ball_drop"), "-o", str(tmp_path)]
     assert main(words) == 0
@@ -142,7 +142,7 @@ def test_command_writes_the_diagnosis_and_a_figure(shared_data, tmp_path, capsys
     assert {"verdict", "effects", "before", "after", "tried", "identifiable"} <= set(found)
     assert len(found["effects"]) == 1
     assert len(found["cannot_be_told_apart"]) > 1
-    assert (tmp_path / "ball_drop.png").stat().st_size > 10_000
+    assert (tmp_path / "all balls" / "diagnosis.html").stat().st_size > 10_000
     assert main(words) == 1  # an earlier result is kept
     assert "exists" in capsys.readouterr().err
     assert main([str(tmp_path)]) == 1

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.kit.compiled import njit
 from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
@@ -77,13 +76,9 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     assert np.allclose(R, frames.rotation_from_euler(*trajectory.q[:, 3:].T), atol=1e-9)
 
 
-predict = njit(lambda heading, R_next, t_next: kernels._predict(heading, R_next, t_next))
-
-
 def _predicted(R, t, i):
     R_next, t_next = np.empty((3, 3)), np.empty(3)
-    before = slice(i - 1, i - 4 if i > 3 else None, -1)
-    predict(kernels.Heading(np.ascontiguousarray(R[before]), np.ascontiguousarray(t[before])), R_next, t_next)
+    kernels._predict.py_func(R[i - 1], R[i - 2], R[i - 3], t[i - 1], t[i - 2], t[i - 3], R_next, t_next)
     return frames.vector_from_rotation(R[i] @ R_next.T), t[i] - t_next
 
 

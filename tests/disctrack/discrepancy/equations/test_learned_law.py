@@ -62,8 +62,8 @@ def test_a_law_of_one_variable_is_learned(name):
     variable, force = LAWS[name]
     answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force({"x": x, "v": v, "t": t}[variable]), seed=11))
     law = answer.law
-    assert answer.verdict == "found"
-    assert answer.found == (NAME,)
+    assert answer.verdict == ("unexplained" if variable == "t" else "found")  # of time, it describes any motion
+    assert answer.found == (() if variable == "t" else (NAME,))
     assert (law.along.equation, law.along.variable) == ("v", variable)
     truth = force(law.variable) + (DECLARED[variable] - TRUE[variable]) * law.variable
     pulls = (law.force - truth) / law.sigma
@@ -71,7 +71,8 @@ def test_a_law_of_one_variable_is_learned(name):
     assert np.sqrt(np.mean(pulls**2)) < 2.0
     assert np.sqrt(np.mean(law.sigma**2)) < 0.15 * np.ptp(truth)
     # known terms are told with their odds, and what is left is noise
-    assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
+    if variable != "t":
+        assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
 
 
 @pytest.mark.statistical

@@ -1,0 +1,98 @@
+"""Free runs of a fitted model over runs that it has not seen: what their sensors should show, and how sure that is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.kit.arrays import Array
+from disctrack.discrepancy.equations.declared import Samples
+from disctrack.discrepancy.equations.start import guessed
+from disctrack.discrepancy.equations.system import EquationSystem
+from disctrack.discrepancy.fit import Fit, fit
+
+WITHIN_95 = 1.96  # standard deviations
+OF_SIZE = 1e3  # scales of a state make up its size: as far as a guess from few samples may be off
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What the sensors should show at the instants of a run, by channel; NaN where the motion cannot be followed."""
+
+    time: Array  # (n,) [s] since the first sample
+    values: Mapping[str, Array]  # (n,)
+    sigmas: Mapping[str, Array]  # (n,) of a sample: numbers, initial state, and what the model leaves
+
+    def __getitem__(self, channel: str) -> Array:
+        """Values of a channel (n,)."""
+        return self.values[channel]
+
+
+@dataclass(frozen=True)
+class RunScore:
+    """How well a free run foretells one channel."""
+
+    rms: float  # of measured minus foretold, in the channel's unit
+    covered: float  # share of the samples within the 95 % band
+    n_samples: int
+
+
+def foretold(system: EquationSystem, fitted: Fit, samples: Samples, left: Array, window: float) -> Forecast:
+    """Run the model from the fitted numbers.
+
+    system : with formulas and sizes; its stretches are not used
+    left : (w,) what the model leaves of each channel
+    window : [s] of the run to which its initial state is fitted; 0: it begins as the fit or the run says
+    """
+    alone = system.with_(stretches=[replace(samples, sigma=np.broadcast_to(left, samples.data.shape))])
+    values, states = dict(fitted.values), [q for q in alone.base if q.is_initial]
+    numbers = [n for n in fitted.shared if n in alone.names_of(samples)]
+    covariance = _of(fitted, numbers)
+    by_state, spread, follows = [], np.zeros((0, 0)), np.zeros((0, len(numbers)))
+    if window > 0 and states:
+        n = int(np.searchsorted(samples.time, window, side="right"))
+        seen = alone.with_(stretches=[alone.stretches[0].part(0, n, 0)])
+        begun = guessed(seen)[0]
+        loose = [
+            replace(q, null=begun[q.name], prior_sigma=OF_SIZE * q.scale) if np.isinf(q.prior_sigma) else q
+            for q in states
+        ]
+        start = fit(seen, loose, values | begun)
+        values, spread, by_state = values | start.values, start.covariance, [q.name for q in states]
+        numbers = [n for n in numbers if n not in by_state]
+        covariance = _of(fitted, numbers)
+        _, J = seen.linearise(values, [*by_state, *numbers])
+        J = J.reshape(-1, J.shape[-1])
+        # other numbers would have led to another start
+        follows = -spread @ J[:, : len(by_state)].T @ J[:, len(by_state) :]
+    shape = samples.data.shape
+    found = alone.predict(values, alone.stretches[0], [*by_state, *numbers])
+    channels = alone.formulas.channels
+    if found is None:
+        nothing = dict(zip(channels, np.full(shape, np.nan).T, strict=True))
+        return Forecast(samples.time, nothing, nothing)
+    of_start, of_numbers = np.split(found.derivative, [len(by_state)], axis=2)
+    of_numbers = of_numbers + of_start @ follows
+    variance = np.broadcast_to(left**2, shape).copy()
+    for J, C in ((of_start, spread), (of_numbers, covariance)):
+        variance += np.einsum("nwi,ij,nwj->nw", J, C, J)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    return Forecast(
+        samples.time, dict(zip(channels, found.seen.T, strict=True)), dict(zip(channels, sigma.T, strict=True))
+    )
+
+
+def scored(found: Forecast, samples: Samples, channels: tuple[str, ...], since: float) -> dict[str, RunScore]:
+    """By channel, over the samples after `since` [s]."""
+    scores = {}
+    for c, name in enumerate(channels):
+        rows = np.isfinite(samples.data[:, c]) & (samples.time > since)
+        left = (samples.data[:, c] - found[name])[rows]
+        within = np.abs(left) <= WITHIN_95 * found.sigmas[name][rows]
+        scores[name] = RunScore(float(np.sqrt(np.mean(left**2))), float(np.mean(within)), int(rows.sum()))
+    return scores
+
+
+def _of(fitted: Fit, names: list[str]) -> Array:
+    index = [fitted.shared.index(n) for n in names]
+    return fitted.covariance[np.ix_(index, index)]
