@@ -43,7 +43,7 @@ class Prediction:
 class EquationSystem(System):
     """Samples of all stretches, one after the other, with a row without data between two of them."""
 
-    several_minima = True  # what users declare may bend anyhow
+    several_minima = frees_shapes = True  # what users declare may bend anyhow
 
     def __init__(
         self, formulas: Formulas, stretches: Sequence[Samples], sizes: Array, widths: Mapping[str, float],
