@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.whole import write_whole
+from disctrack.report.blocks import Markup, Report, Text
+from disctrack.report.html import page
 from disctrack.report.palette import RED
-from disctrack.report.parts import Markup, page, paragraph
 from disctrack.trajectory import FrameStatus
 
 Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
@@ -63,7 +64,8 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
         "part to zoom, double click for the whole.</p></section>"
         f'<script type="application/json" id="motion-data">{data}</script><script>{script}</script>'
     )
-    return page(f"{name}: the motion", [paragraph(_said(analysis)), body], head=f"<style>{_STYLE}</style>")
+    report = Report(f"{name}: the motion", "", _said(analysis), blocks=[Text(body)])
+    return page(report, {}, head=f"<style>{_STYLE}</style>")
 
 
 def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:

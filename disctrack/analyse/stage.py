@@ -9,15 +9,15 @@ from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
 from disctrack.analyse.derivatives import GROUP_NAMES, STATE
-from disctrack.analyse.power_laws import (
-    WINDOW,
-    Exponent,
-)
+from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.propagation import DerivedSeries, shared_sigma
+from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import euler_jacobian
+from disctrack.report.blocks import Report
+from disctrack.report.html import write_page
 from disctrack.trajectory.file import Group, read_provenance, read_setup, read_trajectory, trajectory_in, write_groups
 from disctrack.trajectory.reuse import refuse_other
 
@@ -30,33 +30,11 @@ class AnalyseOutcome(Brief):
     file: Path  # the trajectory, with the new groups
     report: Path  # report.html
     figures: tuple[Path, ...]
+    summary: Report
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
         return {**self.analysis.facts(), "report": str(self.report)}
-
-    def lines(self) -> list[str]:
-        """What was found, for the command line."""
-        analysis = self.analysis
-        motion, energy, laws, count = analysis.motion, analysis.energy, analysis.scaling.laws, analysis.scaling.count
-        sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
-        found = [
-            f"motion        {int(motion.known.sum())} of {len(motion)} frames; sigma of the velocity "
-            f"{1e3 * np.nanmedian(sigma[:, 6:9]):.3f} mm/s, of the angular velocity "
-            f"{1e3 * np.nanmedian(sigma[:, 9:12]):.2f} mrad/s (median)",
-            f"contact       {analysis.contact.onset.verdict}",
-            f"energy        {1e3 * energy.loss:.4f} mJ lost, sigma {1e3 * energy.loss_sigma:.4f} (noise) "
-            f"{1e3 * energy.loss_sigma_calibration:.4f} (calibration)",
-        ]
-        if laws.determined:
-            found.append(
-                f"exponents     theta {_in_words(laws.n_theta)}  psidot {_in_words(laws.n_psidot)}  energy "
-                f"{_in_words(laws.n_energy)}  t_f {laws.t_f:.5f} +- {laws.t_f_sigma:.5f} s"
-            )
-        if np.isfinite(count.slope):
-            found.append(f"nutation      {count.slope:.4f} +- {count.sigma:.4f} oscillations per turn of precession")
-        found += [f"note          {text}" for text in analysis.warnings]
-        return [*found, f"files         {self.file}", f"              {self.report}"]
 
 
 @one_blas_thread
@@ -74,7 +52,7 @@ def run_analyse(
     figures : also write every figure of the report as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, OutputError (also when there is a report and not `overwrite`).
     """
-    from disctrack.analyse.report import write_report  # matplotlib is wanted here only
+    from disctrack.analyse.figures import all_figures  # matplotlib is wanted here only
 
     path = trajectory_in(Path(path))
     keep(path)
@@ -86,12 +64,10 @@ def run_analyse(
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
-    report, written = write_report(folder, analysis, provenance, figures)
-    return AnalyseOutcome(analysis, path, report, written)
-
-
-def _in_words(exponent: Exponent) -> str:
-    return f"{exponent.value:.4f} +- {exponent.sigma:.4f}"
+    page = folder / "report.html"
+    summary = report_of(analysis, provenance, (), all_figures(analysis), (page, path))
+    written = write_page(page, summary, ("png", "pdf") if figures else ())
+    return AnalyseOutcome(analysis, path, page, tuple(written), summary)
 
 
 def write_analysis(path: Path, analysis: Analysis) -> None:

@@ -5,8 +5,9 @@ from urllib.parse import quote
 
 from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING, Row, copies
 from disctrack.batch.records import SKIPPED
-from disctrack.files.text import printable
-from disctrack.report.parts import Markup, page, paragraph, section, table, text, warning
+from disctrack.report.blocks import Listing, Markup, Report, Said, Section, Text
+from disctrack.report.html import page
+from disctrack.report.numbers import measured, rounded
 
 SAID = {SKIPPED: "measured before"}  # on a page, which is read long after the batch that found it done
 _FITTED = {
@@ -22,20 +23,29 @@ def index_page(rows: Sequence[Row], repeats: Sequence[Row] = (), together: str =
 
     repeats : as `repeats_of` gives them; together : page of the diagnosis of all, where there is one
     """
-    files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
-    problems = [
-        Markup(f"<b>{_shown(r['recording'])}</b> ({_shown(r['status'])}): {_shown(r['reason'])}")
-        for r in rows
-        if r["reason"]
-    ]
-    problems += [_shown(f"{names}: the same images, one recording for any mean") for names in copies(rows)]
+    problems = [f"{r['recording']} ({r['status']}): {r['reason']}" for r in rows if r["reason"]]
+    problems += [f"{names}: the same images, one recording for any mean" for names in copies(rows)]
     header = ("recording", "", "status", "pairs", *_FITTED.values(), "t_f (s)", "rms (px)", "χ²")
-    results = table("", header, [_cells(row) for row in rows], [row["status"].split()[0] for row in rows])
-    parts = [paragraph(_said(rows)), warning("Problems", problems), section("Results", [results, files])]
-    if together:
-        link = f'<p><a href="{together}">What the model lacks, all recordings together</a></p>'
-        parts.append(section("All recordings together", [link]))
-    return page("Batch of recordings", [*parts, _repeats(repeats) if repeats else ""])
+    classes = [row["status"].split()[0] for row in rows]
+    files = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
+    link = f'<p><a href="{together}">What the model lacks, all recordings together</a></p>'
+    return page(
+        Report(
+            "Batch of recordings",
+            _said(rows),
+            findings=[Said(problem, "warning") for problem in problems],
+            blocks=[
+                Section("Results", [Listing(header, [_cells(row) for row in rows], classes=classes), _html(files)]),
+                Section("All recordings together", [_html(link)] if together else ()),
+                Section("Repeats", _repeats(repeats) if repeats else ()),
+            ],
+        ),
+        {},
+    )
+
+
+def _html(content: str) -> Text:
+    return Text(Markup(content))
 
 
 def _said(rows: Sequence[Row]) -> str:
@@ -58,31 +68,30 @@ def _said(rows: Sequence[Row]) -> str:
     )
 
 
-def _repeats(repeats: Sequence[Row]) -> str:
-    said = paragraph(
+def _repeats(repeats: Sequence[Row]) -> list[Text | Listing]:
+    said = (
         "Mean and standard deviation over the recordings of one disc on one surface, from one case as declared. "
         "χ² is their squared spread over the stated variances, per degree of freedom: far above 1, with a small "
         "probability p, they disagree by more than the measurement explains."
     )
-    scales = {"k_m_m_s2": 1e8}
     cells = [
         (
-            printable(row["repeats"]),
+            row["repeats"],
             _FITTED[row["quantity"]],
             str(row["n"]),
-            _plus_minus(row["mean"], row["standard_deviation"], scales.get(row["quantity"], 1.0)),
-            f"{row['reduced_chi_square']:.3g}",
-            f"{row['p_value']:.2g}",
+            measured(*(_scale(row["quantity"]) * row[key] for key in ("mean", "standard_deviation"))),
+            rounded(row["reduced_chi_square"]),
+            rounded(row["p_value"], 2),
         )
         for row in repeats
     ]
     header = ("recordings", "", "n", "mean ± standard deviation", "χ²", "p")
     files = '<p>With weighted means: <a href="repeats.csv">repeats.csv</a>.</p>'
-    return section("Repeats", [said, table("", header, cells), files])
+    return [Text(said), Listing(header, cells), _html(files)]
 
 
-def _shown(said: str) -> Markup:
-    return text(printable(said))
+def _scale(quantity: str) -> float:
+    return 1e8 if quantity == "k_m_m_s2" else 1.0
 
 
 def _counted(n: int, what: str) -> str:
@@ -93,7 +102,7 @@ def _cells(row: Row) -> list[str]:
     rms = [row[f"reprojection_rms_{camera}_px"] for camera in ("left", "right")]
     pairs = "" if row["pairs"] is None else f"{row['pairs_measured']} / {row['pairs']}"
     return [
-        printable(row["recording"]),
+        row["recording"],
         Markup(
             " ".join(_link(row[key], name) for key, name in (("report", "report"), ("diagnosis_report", "diagnosis")))
         ),
@@ -101,8 +110,8 @@ def _cells(row: Row) -> list[str]:
         pairs,
         _friction(row),
         *(_plus_minus(row[n], row[f"{n}_sigma"]) for n in ("n_energy", "n_theta", "n_psidot")),
-        _plus_minus(row["t_f_s"], row["t_f_sigma_s"], digits=5),
-        "–" if None in rms else f"{max(rms):.4f}",
+        _plus_minus(row["t_f_s"], row["t_f_sigma_s"]),
+        "–" if None in rms else rounded(max(rms)),
         "–" if row["reduced_chi_square"] is None else f"{row['reduced_chi_square']:.2f}",
     ]
 
@@ -110,13 +119,11 @@ def _cells(row: Row) -> list[str]:
 def _friction(row: Row) -> str:
     """With the chi-square of its model where that says that the number is not the whole story."""
     shown, misfit = _plus_minus(row["k_m_m_s2"], row["k_m_sigma_m_s2"], 1e8), row["k_m_reduced_chi_square"]
-    return shown if misfit is None or misfit <= LACKS_SOMETHING else f"{shown} (model: χ² {misfit:.3g})"
+    return shown if misfit is None or misfit <= LACKS_SOMETHING else f"{shown} (model: χ² {rounded(misfit)})"
 
 
-def _plus_minus(value: float | None, sigma: float | None, factor: float = 1.0, digits: int = 4) -> str:
-    if value is None or sigma is None:
-        return "–"
-    return f"{factor * value:.{digits}f} ± {factor * sigma:.{digits}f}"
+def _plus_minus(value: float | None, sigma: float | None, factor: float = 1.0) -> str:
+    return "–" if value is None or sigma is None else measured(factor * value, factor * sigma)
 
 
 def _link(target: str | None, name: str) -> str:

@@ -39,7 +39,6 @@ from disctrack.files.whole import write_whole
 from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.measurement import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
-from disctrack.track.run_summary import file_lines
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
 from disctrack.trajectory.file import Provenance
@@ -194,7 +193,7 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
     if job.options.report:
         outcome = run_analyse(path, window=window, circle_duration=circle, overwrite=True)
         origin = origin_of(path, {"window": window, "circle": circle})  # as of the command, which may go on from here
-        remember(outcome.report.parent, origin, outcome.lines(), [outcome.report])
+        remember(outcome.report.parent, origin, outcome.summary, [outcome.report])
         return outcome.analysis, outcome.report
     analysis = analyse(trajectory, window, circle)
     write_analysis(path, analysis)
@@ -208,7 +207,7 @@ def _diagnose(path: Path) -> tuple[Path, Row]:
     outcome = run_diagnose(path, overwrite=True)
     pages = {file.name: file for file in outcome.files}
     origin = origin_of(path, {"model": PAPER})
-    remember(pages["diagnosis.html"].parent, origin, [*outcome.summary, *file_lines(outcome.files)], outcome.files)
+    remember(pages["diagnosis.html"].parent, origin, outcome.summary, outcome.files)
     return pages["diagnosis.html"], json.loads(pages["diagnosis.json"].read_text(encoding="utf-8"))
 
 

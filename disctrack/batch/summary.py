@@ -23,6 +23,7 @@ from disctrack.files.text import csv_cell, printable
 from disctrack.files.whole import write_whole
 from disctrack.recording.changed import changed_since
 from disctrack.recording.declaration import FILE_NAME
+from disctrack.report.numbers import measured, rounded
 from disctrack.trajectory.file import read_provenance
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
@@ -169,16 +170,16 @@ def line_of(row: Row, width: int) -> str:
         return printable(f"{head}  {row['reason']}")
     parts = [f"{row['pairs_measured']} of {row['pairs']} pairs"]
     if row["k_m_m_s2"] is not None:
-        parts.append(f"k_m {row['k_m_m_s2'] * 1e8:.4f} +- {row['k_m_sigma_m_s2'] * 1e8:.4f} e-8 m s2")
+        parts.append(f"k_m {measured(row['k_m_m_s2'], row['k_m_sigma_m_s2'], 'm s^2')}")
         if row["k_m_reduced_chi_square"] > LACKS_SOMETHING:
-            parts.append(f"but the model with it lacks something (chi-square {row['k_m_reduced_chi_square']:.3g})")
+            parts.append(f"but the model with it lacks something (chi-square {rounded(row['k_m_reduced_chi_square'])})")
     if row["n_theta"] is not None:
-        parts.append(f"n_theta {row['n_theta']:.4f} +- {row['n_theta_sigma']:.4f}")
+        parts.append(f"n_theta {measured(row['n_theta'], row['n_theta_sigma'])}")
     if row["t_f_s"] is not None:
-        parts.append(f"t_f {row['t_f_s']:.5f} s")
+        parts.append(f"t_f {measured(row['t_f_s'], row['t_f_sigma_s'])} s")
     rms = [row[f"reprojection_rms_{camera}_px"] for camera in ("left", "right")]
     if None not in rms:
-        parts.append(f"rms {max(rms):.4f} px")
+        parts.append(f"rms {rounded(max(rms))} px")
     if row["diagnosis"]:
         share = row["diagnosis_false_discovery"]
         doubt = "" if share is None or share < FALSE_DISCOVERY else f" (of as improbable ones {share:.0%} are chance)"

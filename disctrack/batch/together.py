@@ -5,6 +5,7 @@ from pathlib import Path
 
 from disctrack.batch.columns import Row
 from disctrack.batch.reasons import reason_of
+from disctrack.report.terminal import short
 
 FOLDER = "together"
 
@@ -23,4 +24,4 @@ def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> tuple[lis
         outcome = run_together(trajectories, folder / FOLDER, overwrite=True, reuse=True, processes=processes)
     except Exception as error:  # the single results are worth more than their combination
         return [], f"the recordings could not be diagnosed together: {reason_of(error)}"
-    return list(outcome.summary), ""
+    return short(outcome.summary), ""

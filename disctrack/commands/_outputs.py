@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,16 @@ from calibration import CalibrationSettings, StereoRig
 from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.errors import OutputError, RecordingError, TrajectoryFileError
-from disctrack.files.json_text import json_file
+from disctrack.files.json_text import json_file, json_text
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import write_whole
 from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
+from disctrack.report.blocks import Report, Said, document
+from disctrack.report.html import link_pages
+from disctrack.report.terminal import show
 from disctrack.track import run_summary as summary
 from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.measurement import ImagePairs, check_rig, measure, trajectory_provenance
@@ -31,6 +34,7 @@ from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
 from disctrack.trajectory.exchange.csv_table import write_csv
+from disctrack.trajectory.reuse import SUMMARY
 
 RESULTS = "results"
 
@@ -138,6 +142,38 @@ def shortcomings(findings: Mapping[str, Any]) -> list[str]:
         *([f"{unreadable} image(s) could not be read; their frames rest on one camera or none"] if unreadable else []),
         *([f"{doubts} warning(s) put the result in doubt"] if doubts else []),
     ]
+
+
+def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> int:
+    """Show a report as the options ask for it; returns the exit code of what is complete.
+
+    folder : where all of the report lies as summary.txt, if it does
+    """
+    if arguments.json:
+        print(json_text(document(report), indent=1))
+    elif not arguments.quiet:
+        said = [Said("reused: the complete result of the same input, settings and version", "note")] if reused else []
+        page = None if report.page is None else relative(report.page)
+        files = [relative(file) for file in report.files]
+        text = folder / SUMMARY
+        if reused and arguments.verbose and text.is_file():
+            print(text.read_text(encoding="utf-8"), end="")
+        else:
+            shown = replace(report, findings=[*report.findings, *said], files=files, page=page)
+            show(shown, verbose=arguments.verbose)
+    return DONE
+
+
+def link_pages_of(trajectory: Path) -> None:
+    """Let the pages that were made of a recording name each other."""
+    folder, stem = trajectory.parent, trajectory.stem
+    link_pages({
+        "measurement": folder / "measurement.html",
+        "analysis": folder / f"{stem}_analysis" / "report.html",
+        "motion": folder / f"{stem}_analysis" / "motion.html",
+        "diagnosis": folder / f"{stem}_diagnosis" / "diagnosis.html",
+        "video": folder / "overlay.mp4",
+    })  # fmt: skip
 
 
 def tell_shortcomings(found: Sequence[str]) -> int:

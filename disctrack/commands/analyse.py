@@ -1,6 +1,7 @@
 """`disctrack analyse`: from a trajectory file to the physics."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import NDArray
@@ -8,8 +9,7 @@ from numpy.typing import NDArray
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.motion_page import write_motion_page
 from disctrack.analyse.stage import run_analyse
-from disctrack.commands import DONE
-from disctrack.commands._outputs import pair_of, tell_stale, write_times
+from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
@@ -23,35 +23,29 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse, write, and say what was found; returns the exit code."""
     path = trajectory_in(arguments.trajectory)
     folder = arguments.output or path.parent / f"{path.stem}_analysis"
-    tell_stale(path)
+    outputs.tell_stale(path)
     origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
-    told = reusable(folder, origin)
+    known = reusable(folder, origin)
     page = folder / "motion.html"
     asked = [page, *([folder / "figures"] if arguments.figures else [])]
-    more = not all(place.exists() for place in asked)
-    if told is not None and not (arguments.overwrite or more):
-        print(
-            "\n".join([f"reused        {folder}: complete result of the same trajectory, settings and version", *told])
-        )
-        return DONE
-    again = arguments.overwrite or told is not None
+    if known is not None and not arguments.overwrite and all(place.exists() for place in asked):
+        return outputs.tell(known, arguments, folder, reused=True)
     with stage("analyse"):
         outcome = run_analyse(
             path,
             folder,
             window=arguments.window,
             circle_duration=arguments.circle,
-            overwrite=again,
+            overwrite=arguments.overwrite or known is not None,
             figures=arguments.figures,
         )
-    lines = outcome.lines()
     with stage("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
-    lines.append(f"              {page}")
-    lines += [f"              {file}" for file in write_times(folder, "analyse")]
-    remember(folder, origin, lines, (outcome.report, page, *outcome.figures))
-    print("\n".join(lines))
-    return DONE
+    files = (*outcome.summary.files, page, *outputs.write_times(folder, "analyse"))
+    report = replace(outcome.summary, files=files, then=f"disctrack diagnose {outputs.relative(path)}")
+    remember(folder, origin, report, (outcome.report, page, *outcome.figures))
+    outputs.link_pages_of(path)
+    return outputs.tell(report, arguments, folder)
 
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
@@ -76,7 +70,7 @@ def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recordi
 
     def drawn(row: int) -> NDArray:
         assert pairs is not None
-        images = pair_of(pairs, row)
+        images = outputs.pair_of(pairs, row)
         return draw_pair(images, analysis.trajectory, row)[: images.shape[1]]  # without the strip of numbers
 
     write_motion_page(page, analysis, read_provenance(trajectory).recording, None if pairs is None else drawn)

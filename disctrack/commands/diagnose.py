@@ -2,9 +2,9 @@
 
 import argparse
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
-from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.together.stage import run_together
@@ -12,7 +12,6 @@ from disctrack.errors import TrajectoryFileError
 from disctrack.progress import compiling, stage, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.rolling import _assembly as assembly
-from disctrack.track import run_summary as summary
 from disctrack.trajectory.file import trajectory_in
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
@@ -28,12 +27,10 @@ def run(arguments: argparse.Namespace) -> int:
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
     origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))
-    told = reusable(folder, origin)
+    known = reusable(folder, origin)
     more = arguments.figures and not (folder / "figures").is_dir()
-    if told is not None and not (arguments.overwrite or more):
-        reused = f"{'reused':<13} {folder}: complete result of the same trajectory, model and version"
-        print("\n".join([reused, *told]))
-        return DONE
+    if known is not None and not (arguments.overwrite or more):
+        return outputs.tell(known, arguments, folder, reused=True)
     with compiling("the simulation of motions", 30):
         assembly.prepare()
     with stage("diagnose"):
@@ -41,15 +38,16 @@ def run(arguments: argparse.Namespace) -> int:
             path,
             folder,
             model=arguments.model,
-            overwrite=arguments.overwrite or told is not None,
+            overwrite=arguments.overwrite or known is not None,
             settle=arguments.plan,
             figures=arguments.figures,
         )
-    files = [outputs.relative(file) for file in (path, *outcome.files, *outputs.write_times(folder, "diagnose"))]
-    lines = [*outcome.summary, *summary.file_lines(files)]
-    remember(folder, origin, lines, outcome.files)
-    print("\n".join(lines))
-    return DONE
+    then = f"disctrack diagnose {outputs.relative(path)} --model {outputs.relative(folder / 'model.toml')}"
+    files = (*outcome.summary.files, *outputs.write_times(folder, "diagnose"))
+    report = replace(outcome.summary, files=files, then=then if outcome.result.has_more else "")
+    remember(folder, origin, report, outcome.files)
+    outputs.link_pages_of(path)
+    return outputs.tell(report, arguments, folder)
 
 
 def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
@@ -70,7 +68,6 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
             processes=arguments.jobs or default_threads(),
             progress=step,
         )
-    files = [outputs.relative(file) for file in outcome.files]
-    print("\n".join([*outcome.summary, *summary.file_lines(files)]))
+    outputs.tell(outcome.summary, arguments, outcome.files[0].parent)
     unusable = [f"{len(outcome.unusable)} recording(s) could not be used"] if outcome.unusable else []
     return outputs.tell_shortcomings(unusable)

@@ -51,6 +51,7 @@ def add_print(parser: argparse.ArgumentParser) -> None:
 
 def add_check(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack check`."""
+    _output_options(parser)
     parser.add_argument("recording", type=Path, help="folder with a recording.toml")
     parser.add_argument("-o", "--output", type=Path, help="the picture (default: RECORDING/results/check.png)")
     parser.add_argument("--no-figures", action="store_true", help="no picture")
@@ -58,6 +59,7 @@ def add_check(parser: argparse.ArgumentParser) -> None:
 
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack run`."""
+    _output_options(parser)
     parser.add_argument("recording", type=Path, help="folder with a recording.toml")
     parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: RECORDING/results)")
     _tracking_options(parser)
@@ -66,6 +68,7 @@ def add_run(parser: argparse.ArgumentParser) -> None:
 
 def add_calibrate(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack calibrate`."""
+    _output_options(parser)
     parser.add_argument("recording", type=Path, nargs="?", help="folder with a recording.toml that names the views")
     parser.add_argument("-o", "--output", type=Path, help="rig file (default: RECORDING/results/rig.h5)")
     without = parser.add_argument_group("without a recording")
@@ -83,6 +86,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
 
 def add_track(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack track`."""
+    _output_options(parser)
     parser.add_argument("recording", type=Path, help="folder with a recording.toml")
     parser.add_argument("--rig", type=Path, help="rig file (default: the recording's own, or results/rig.h5)")
     parser.add_argument("-o", "--output", type=Path, help="trajectory file (default: RECORDING/results/trajectory.h5)")
@@ -91,6 +95,7 @@ def add_track(parser: argparse.ArgumentParser) -> None:
 
 def add_analyse(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack analyse`."""
+    _output_options(parser)
     what = "file written by disctrack track, or a recording's folder; the file gets four more groups"
     parser.add_argument("trajectory", type=Path, help=what)
     parser.add_argument(
@@ -124,6 +129,7 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
 
 def add_diagnose(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack diagnose`."""
+    _output_options(parser)
     files = "trajectory file, or a recording's folder; the group diagnosis is added to it. Several: one answer"
     parser.add_argument("trajectory", type=Path, nargs="+", help=files)
     models = "paper (rolling with its k_m; default), none (no losses), or a saved model (TOML)"
@@ -142,6 +148,7 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
 
 def add_batch(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack batch`."""
+    _output_options(parser)
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="recordings are sought at any depth")
     where = "folder for all results (default: RECORDING/results, and FOLDER/batch_results)"
     parser.add_argument("-o", "--output", type=Path, help=where)
@@ -292,6 +299,13 @@ def _positive_number(text: str) -> float:
     if value == 0:
         raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
     return value
+
+
+def _output_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("-v", "--verbose", action="store_true", help="all that was found, as in summary.txt")
+    group.add_argument("-q", "--quiet", action="store_true", help="nothing but errors")
+    group.add_argument("--json", action="store_true", help="one JSON document on stdout")
 
 
 def _tracking_options(parser: argparse.ArgumentParser) -> None:

@@ -6,6 +6,8 @@ from calibration.kit.brief import Brief
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import Errors
 from disctrack.diagnosis.form_misfit import LawCourse
+from disctrack.diagnosis.left_over import LeftOver
+from disctrack.diagnosis.pages.words import sentence
 from disctrack.diagnosis.plan import Plan, Proposed
 from disctrack.diagnosis.regimes import Regimes
 from disctrack.discrepancy.fit import Fit
@@ -34,7 +36,6 @@ class DiscDiagnosis(Brief):
     system: DiscSystem
     diagnosis: Diagnosis
     model: str
-    sentence: str
     before: Errors | None  # None where the base fit did not converge
     after: Errors | None
     energy: dict[str, float]  # [J]
@@ -43,12 +44,23 @@ class DiscDiagnosis(Brief):
     plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
     notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
     regimes: Regimes | None = None  # where a model that fails holds
+    left: LeftOver | None = None  # tests of the residual; None where too few rows are complete
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
         told = {"verdict": self.diagnosis.verdict, "says": self.sentence}
         chi = [fit.reduced_chi_square for fit in (self.diagnosis.before, self.after_fit)]
         return told | {"reduced chi-square": f"{chi[0]:.4g} before, {chi[1]:.4g} after"}
+
+    @property
+    def sentence(self) -> str:
+        """The answer in one or a few sentences."""
+        return sentence(self)
+
+    @property
+    def has_more(self) -> bool:
+        """Is the model after larger than that before?"""
+        return bool(self.diagnosis.found) or self.learned is not None
 
     @property
     def after_fit(self) -> Fit:

@@ -23,7 +23,7 @@ HALF_WINDOW = 0.01  # [s] over which the error at a horizon is averaged: some fr
 class Ahead:
     """Error of a free run at one instant ahead, and what the noise of the measurement alone would give."""
 
-    horizon: float  # [s]
+    horizon_s: float
     theta_deg: float
     psi_deg: float
     position_mm: float
@@ -39,8 +39,8 @@ class Errors:
     reduced_chi_square: float  # of the dots in all images
     reduced_chi_square_pose: float  # of the six numbers per frame that a pose can take
     rms_px: float  # per image coordinate
-    position_um: float  # rms of measured minus fitted position, per axis
-    theta_mdeg: float  # rms of measured minus fitted nutation angle
+    rms_position_um: float  # rms of measured minus fitted position, per axis
+    rms_theta_mdeg: float  # rms of measured minus fitted nutation angle
     ahead: tuple[Ahead, ...]
     ratio_to_floor: float  # free run: rms of the residual over what noise and the fit's own uncertainty allow
     whiteness: Whiteness
@@ -60,8 +60,8 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut) -> Errors:
         reduced_chi_square=fit_.reduced_chi_square,
         reduced_chi_square_pose=float(np.sum(pose[present] ** 2) / max(freedom, 1)),
         rms_px=rms,
-        position_um=float(1e6 * np.sqrt(np.mean(delta[present, :3] ** 2))),
-        theta_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(tilt[present] ** 2)))),
+        rms_position_um=float(1e6 * np.sqrt(np.mean(delta[present, :3] ** 2))),
+        rms_theta_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(tilt[present] ** 2)))),
         ahead=free_run(system, held),
         ratio_to_floor=held.ratio_to_floor,
         whiteness=whiteness(pose[present], _rate(system), frequencies(system, fit_.values)),

@@ -107,7 +107,7 @@ def force_of(system: DiscSystem, fit: Fit) -> Array:
 def _longer(result: DiscDiagnosis) -> tuple[tuple[Ahead, Ahead], ...]:
     """Free runs over the horizons that the part held out does not reach, each after a fit that ends in time for it."""
     system = result.system
-    reached = {a.horizon for a in result.after.ahead} if result.after else set()
+    reached = {a.horizon_s for a in result.after.ahead} if result.after else set()
     seen = system.time[system.weights > 0]
     found = []
     for horizon in HORIZONS:

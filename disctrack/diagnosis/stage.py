@@ -16,8 +16,8 @@ from disctrack.diagnosis.form_misfit import with_form
 from disctrack.diagnosis.left_over import LeftOver, left_over
 from disctrack.diagnosis.missing_force import what_is_missing
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
-from disctrack.diagnosis.pages.output import as_json, lines, write_diagnosis
-from disctrack.diagnosis.pages.words import sentence
+from disctrack.diagnosis.pages.output import as_json, write_diagnosis
+from disctrack.diagnosis.pages.report import report_of
 from disctrack.diagnosis.plan import open_questions, plan, separations
 from disctrack.diagnosis.regimes import regimes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
@@ -32,6 +32,8 @@ from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
+from disctrack.report.blocks import Report
+from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory, trajectory_in
 from disctrack.trajectory.reuse import refuse_other
@@ -43,7 +45,7 @@ class DiagnoseOutcome(Brief):
 
     result: DiscDiagnosis
     files: tuple[Path, ...]
-    summary: tuple[str, ...]
+    summary: Report
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
@@ -64,8 +66,7 @@ def diagnose(
     answer = diagnose_motion(trajectory, declared.model, declared.faults, settings)
     system, diagnosis = answer.system, answer.diagnosis
     if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
-        text = sentence(diagnosis, diagnosis.after, None, None)
-        return DiscDiagnosis(system, diagnosis, declared.name, text, None, None, {}, notes=answer.notes)
+        return DiscDiagnosis(system, diagnosis, declared.name, None, None, {}, notes=answer.notes)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
     found, diagnosis = _beyond_the_catalogue(system, diagnosis, left)
@@ -85,7 +86,6 @@ def diagnose(
     assert held_before is not None
     before = errors(system, diagnosis.before, held_before)
     after = errors(system, fit_, learned.held_out if learned else diagnosis.held_out_after or held_before)
-    text = sentence(diagnosis, fit_, after, learned.law if learned else None, system.systematic, left)
     energy = energy_balance(system, fit_.values)
     apart = {
         f.candidate.name: separations(system, fit_, f.candidate, [r.candidate for r in f.cannot_be_told_from])
@@ -94,7 +94,7 @@ def diagnose(
     }
     notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *notes) if note)
     return DiscDiagnosis(
-        system, diagnosis, declared.name, text, before, after, energy, learned, apart, notes=notes, regimes=parts
+        system, diagnosis, declared.name, before, after, energy, learned, apart, None, notes, parts, left
     )
 
 
@@ -220,7 +220,7 @@ def run_diagnose(
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
     from disctrack.diagnosis.free_runs import evidence
-    from disctrack.diagnosis.pages.report import write_report  # matplotlib is wanted here only
+    from disctrack.diagnosis.pages.figures import all_figures  # matplotlib is wanted here only
 
     path = trajectory_in(Path(path))
     keep(path)
@@ -244,6 +244,8 @@ def run_diagnose(
     toml = folder / "model.toml"
     text = model_toml(result.system, result.after_fit.values, provenance.recording)
     write_whole(toml, text.encode())
-    pages = write_report(folder, result, beside, provenance.recording, figures)
-    said = lines(result, beside)
-    return DiagnoseOutcome(result, (report, toml, *pages), tuple(said))
+    page = folder / "diagnosis.html"
+    drawn = all_figures(result, beside)
+    whole = report_of(result, beside, provenance.recording, drawn=drawn, files=(page, report, toml, path))
+    files = write_page(page, whole, ("png", "pdf") if figures else ())
+    return DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document))

@@ -1,4 +1,4 @@
-"""A diagnosis of any system, not of the disc alone, in the words and keys of diagnosis.json."""
+"""A diagnosis of any system, not of the disc alone: the keys of diagnosis.json, and the tables of its report."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -11,18 +11,16 @@ from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.search import Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.words import shown, together
+from disctrack.report.blocks import Listing, Section
+from disctrack.report.numbers import measured, rounded, score
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def parameters_json(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
     """Fitted numbers with their standard deviations."""
-    found = []
-    for q in quantities:
-        name, value, sigma = shown(q, fit)
-        amount = {"name": name, "value": value, "sigma": sigma}
-        found.append(amount | {"unit": q.unit, "meaning": q.meaning})
-    return found
+    named = [(q, *shown(q, fit)) for q in quantities]
+    return [{"name": name, **vars(size), "meaning": q.meaning} for q, name, size in named]
 
 
 def effect_json(found: Found, after: Fit, apart: Mapping[str, Any] = _NOTHING) -> dict[str, Any]:
@@ -125,15 +123,49 @@ def document(
     }
 
 
-def table(d: Diagnosis) -> list[str]:
-    """Chi-square before and after, fitted numbers, and what was tried, for people."""
-    chi = [f.reduced_chi_square / d.noise for f in (d.before, d.after)]
-    lines = [f"{'chi-square per degree':<30}{chi[0]:12.4g}{chi[1]:12.4g}{1:12}"]
-    lines += ["", f"{'fitted':<30}{'value':>14}{'sigma':>12}"]
-    for name in d.after.names:
-        if not name.startswith(("state.", "learned.")):  # a law is told by its course
-            lines.append(f"{name:<30}{d.after.values[name]:14.6g}{d.after.sigma(name):12.2g}")
-    lines += ["", f"{'tried':<30}{'gain':>12}  outcome"]
-    for t in d.tried:
-        lines.append(f"{t.candidate.name:<30}{t.score if t.gain is None else t.gain:12.4g}  {t.reason}")
-    return lines
+def tables(d: Diagnosis, hidden: tuple[str, ...] = ("state.", "learned.")) -> list[Section]:
+    """What competes with the answer, the fitted numbers before and after, and what was tried.
+
+    hidden : beginnings of the names of numbers that are not listed; a learned law is shown by its course
+    """
+    fitted = [q for q in d.after.quantities if not (q.name.startswith(hidden) or q.is_initial)]
+    sides = [
+        [measured(f.values[q.name], f.sigma(q.name), q.unit) if q.name in f.names else "" for f in (d.before, d.after)]
+        for q in fitted
+    ]
+    chi = [rounded(f.reduced_chi_square / d.noise, 4) for f in (d.before, d.after)]
+    rows = [("chi-square per degree of freedom", *chi), *((q.name, *s) for q, s in zip(fitted, sides, strict=True))]
+    return [
+        Section("Explanations that compete", [explanations_table(d)]),
+        Section("Fitted numbers", [Listing(("value ± 1 σ", "before", "after"), rows if fitted else ())]),
+        Section("What was tried", [tried_table(d)]),
+    ]
+
+
+def explanations_table(d: Diagnosis) -> Listing:
+    """Sets of effects whose lengths the data do not separate; empty where there is only one."""
+    sets = explanations_json(d)
+    rows = [
+        (", ".join(s["effects"]) or "nothing is missing", score(s["longer_by"]), rounded(s["odds"], 2)) for s in sets
+    ]
+    caption = (
+        "Longer by: -2 log evidence over that of the answer, which is chi-square, the price of the numbers and the "
+        "surprise of their values."
+    )
+    return Listing(("effects", "longer by", "odds against the answer"), rows if len(rows) > 1 else (), caption)
+
+
+def tried_table(d: Diagnosis) -> Listing:
+    """What became of every candidate; columns in which nothing stands are left out."""
+    rows = [
+        (t.candidate.title, t.candidate.name, score(t.score), score(t.gain), score(t.held_out_gain), t.reason)
+        for t in d.tried
+    ]
+    header = ("candidate", "name", "score", "gain, refitted", "gain, held out", "outcome")
+    filled = [i for i in range(len(header)) if any(row[i] for row in rows)]
+    caption = (
+        "Score: decrease of chi-square to first order if the candidate is added; gain: the decrease after a fit; held "
+        "out: over data that the fit has not seen."
+    )
+    shown = [[row[i] for i in filled] for row in rows]
+    return Listing([header[i] for i in filled], shown, caption, folded=f"All {len(rows)} candidates")

@@ -8,13 +8,12 @@ import numpy as np
 
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Found
-from disctrack.discrepancy.significance import TWO_SIDED
+from disctrack.discrepancy.significance import TWO_SIDED, as_sigmas
 from disctrack.discrepancy.system import Quantity
+from disctrack.report.numbers import Measured, measured, rounded, score
 
 STRONG = 0.9  # of a correlation, from which on a standard deviation alone misleads by more than twice
 SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
-_PREFIXES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
-_PREFIXED_UNITS = ("m", "s", "rad", "N", "Hz")
 
 
 @dataclass(frozen=True)
@@ -29,64 +28,54 @@ class Correlated:
     sigma: float
 
 
-def quantity_text(value: float, sigma: float, unit: str) -> str:
-    """Value and sigma with as many digits as the sigma deserves: "60.0(2) um" is written 60.0 +- 0.2 um."""
-    factor, prefix = 1.0, ""
-    if unit in _PREFIXED_UNITS and value:
-        for size, name in _PREFIXES:
-            factor, prefix = size, name
-            if abs(value) < 1000 * size:
-                break
-    value, sigma = value / factor, sigma / factor
-    unit = "" if unit == "1" else f" {prefix}{unit}"
-    if not sigma > 0:
-        return f"{value:.4g}{unit}"
-    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    if digits > 7 or abs(value) >= 1e6:
-        powers = [np.floor(np.log10(number)) for number in (max(abs(value), sigma), sigma)]
-        places = int(powers[0] - powers[1]) + 2  # down to sigma's second
-        return f"({value:.{places}g} +- {sigma:.2g}){unit}"
-    return f"{value:.{digits}f} +- {sigma:.{digits}f}{unit}"
-
-
-def shown(q: Quantity, fit: Fit) -> tuple[str, float, float]:
-    """Name, value and sigma of a fitted quantity as people know it: 1 / mu of a friction is fitted, and mu is shown."""
+def shown(q: Quantity, fit: Fit) -> tuple[str, Measured]:
+    """Name and size of a fitted quantity as people know it: 1 / mu of a friction is fitted, and mu is shown."""
     value, sigma = fit.values[q.name], fit.sigma(q.name)
     if q.reciprocal and value > 0:
-        return q.reciprocal, 1.0 / value, sigma / value**2
-    return q.part, value, sigma
+        return q.reciprocal, Measured(1.0 / value, sigma / value**2, q.unit)
+    return q.part, Measured(value, sigma, q.unit)
 
 
 def effect_text(found: Found, diagnosis: Diagnosis) -> str:
-    """One effect with its size and what it cannot be told from."""
+    """One effect with its size, and the alternatives that these data do not separate from it."""
     fit = diagnosis.after
     # a free velocity at the first instant says nothing to people that the remark on slip does not
-    amounts = [(*shown(q, fit), q.unit) for q in found.candidate.quantities if not q.is_initial]
-    sizes = ", ".join(f"{name} = {quantity_text(value, sigma, unit)}" for name, value, sigma, unit in amounts)
+    amounts = [shown(q, fit) for q in found.candidate.quantities if not q.is_initial]
+    sizes = ", ".join(f"{name} = {size}" for name, size in amounts)
     text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, diagnosis)}"
     text += "".join(f"; {bound}" for bound in bounds(found, fit))
     if found.cannot_be_told_from:
-        rivals = ", ".join(r.candidate.name for r in found.cannot_be_told_from)
-        text += f"; this recording cannot tell it from {rivals}"
+        text += f"; indistinguishable here: {', '.join(r.candidate.name for r in found.cannot_be_told_from)}"
     return text
 
 
+def significance_text(found: Found) -> str:
+    """What is lost without the effect."""
+    if not np.isfinite(found.gain):
+        return "Without it the model follows no part of the recording"  # so that there is no chi-square to compare
+    sigmas = as_sigmas(found.gain, len(found.candidate.quantities))
+    return (
+        f"Without it chi-square rises by {score(found.gain)}, {rounded(sigmas)} sigmas (noise alone: "
+        f"{score(found.threshold)}); on held-out data it gains {score(found.held_out_gain)}"
+    )
+
+
 def bounds(found: Found, fit: Fit) -> list[str]:
-    """Numbers of the effect that the data do not tell from nought: how large they may be, and what keeps them open."""
+    """Numbers of the effect that may be zero: how large they may be, and what keeps them open."""
     texts = []
     spread = np.array([fit.sigma(name) for name in fit.names])
     for q in found.candidate.quantities:
-        name, value, sigma = shown(q, fit)
+        name, size = shown(q, fit)
         if q.is_initial or q.reciprocal or q.null != 0.0:  # a limit is no size
             continue
-        if not sigma > 0 or abs(value) >= TWO_SIDED * sigma:
+        if not size.sigma > 0 or abs(size.value) >= TWO_SIDED * size.sigma:
             continue
         i = fit.names.index(q.name)
         shared = np.abs(fit.covariance_with(q.name)) / np.where(spread > 0, spread, np.inf) / spread[i]
         shared[i] = 0.0
         partner = int(np.argmax(shared))
         why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise"
-        most = quantity_text(abs(value) + TWO_SIDED * sigma, 0.0, q.unit)
+        most = measured(abs(size.value) + TWO_SIDED * size.sigma, unit=q.unit)
         texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
     return texts
 
@@ -107,8 +96,8 @@ def together_text(found: Found, diagnosis: Diagnosis) -> str:
     for pair in together(found, fit):
         if frozenset((pair.first, pair.second)) in named:
             continue
-        factor = f"{'+' if pair.factor >= 0 else '-'} {abs(pair.factor):.4g}"
-        known = quantity_text(pair.value, pair.sigma, units[pair.first])
+        factor = f"{'+' if pair.factor >= 0 else '-'} {rounded(abs(pair.factor), 4)}"
+        known = measured(pair.value, pair.sigma, units[pair.first])
         text += f" (correlation {pair.correlation:.4f}: better known is {pair.first} {factor} {pair.second} = {known})"
     return text
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from disctrack.discrepancy.document import document, table
+from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Values
 from disctrack.discrepancy.words import effect_text
@@ -23,6 +23,8 @@ from disctrack.examples._command import Outcome, command
 from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Toss, read_tosses
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import GROUPS, HELD_OUT, CubeTosses
+from disctrack.report.blocks import Report
+from disctrack.report.terminal import full
 
 # The covariance of the noise is that of the data already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
@@ -78,7 +80,7 @@ def report(answer: CubeAnswer) -> str:
         size, unit = (float(np.degrees(1e3)), "mdeg") if group == "turn" else (1e6, "um")
         numbers = (answer.before[group], answer.after[group], noise.white)
         lines.append(f"{f'rms {group} [{unit}]':<30}" + "".join(f"{size * x:12.1f}" for x in numbers))
-    return "\n".join([*lines, *table(answer.diagnosis)])
+    return "\n".join([*lines, *full(Report("", "", blocks=tables(answer.diagnosis)))])
 
 
 def example(folder: Path) -> Outcome:

@@ -17,13 +17,15 @@ from scipy import stats
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.published import PREDICTED
-from disctrack.discrepancy.document import document, table
+from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
-from disctrack.discrepancy.words import quantity_text
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_system import ExponentSystem, published_series
+from disctrack.report.blocks import Report
+from disctrack.report.numbers import measured
+from disctrack.report.terminal import full
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 ASKED = ("t_f", "air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # looked at, found or not
@@ -142,10 +144,10 @@ def report(answer: Answer) -> str:
     lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size; gain in 2 ln p of the later trials"]
     for e in answer.explanations:
         units = {q.name: q.unit for q in e.fit.quantities}
-        sizes = ", ".join(f"{n} = {quantity_text(e.fit.values[n], e.fit.sigma(n), units[n])}" for n in e.sizes)
+        sizes = ", ".join(f"{n} = {measured(e.fit.values[n], e.fit.sigma(n), units[n])}" for n in e.sizes)
         left = ", ".join(f"{m.surface} {m.joint_sigmas:.1f}" for m in e.misfits)
         lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes, f"{e.held_out_gain:.1f}") if x))
-    return "\n".join([*lines, "", *table(answer.diagnosis)])
+    return "\n".join([*lines, "", *full(Report("", "", blocks=tables(answer.diagnosis)))])
 
 
 def example() -> Outcome:

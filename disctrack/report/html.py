@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from disctrack.files.text import printable
 from disctrack.files.whole import write_whole
 from disctrack.report.blocks import (
     Cell,
@@ -47,7 +48,7 @@ def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
     """The whole page. pictures : a data URI per figure's name;  head : HTML for its head"""
     title = escape(report.title)
     findings = "".join(
-        f"<li class={severity(f)}><b>{severity(f)}</b>{escape(f.sentence)}</li>" for f in report.graver_first()
+        f"<li class={severity(f)}><b>{severity(f)}</b>{_text(f.sentence)}</li>" for f in report.graver_first()
     )
     tiles = "".join(
         f"<div class=tile><b>{_text(value)}</b><span>{escape(name)}</span></div>" for name, value in report.facts
@@ -87,7 +88,7 @@ NAV = "<nav>", "</nav>"
 
 
 def _text(said: Cell) -> str:
-    return said if isinstance(said, Markup) else escape(str(said))
+    return said if isinstance(said, Markup) else escape(printable(str(said)))
 
 
 def _html(block: Any, pictures: Mapping[str, str]) -> str:
@@ -98,7 +99,7 @@ def _html(block: Any, pictures: Mapping[str, str]) -> str:
         inner = "\n".join(html for b in block.blocks if (html := _html(b, pictures)))
         return f"<section><h2>{escape(block.title)}</h2>\n{inner}</section>"
     if isinstance(block, Text):
-        return block.said if isinstance(block.said, Markup) else f"<p>{escape(block.said)}</p>"
+        return block.said if isinstance(block.said, Markup) else f"<p>{_text(block.said)}</p>"
     if isinstance(block, Items):
         return f"<ul>{''.join(f'<li>{_text(said)}</li>' for said in block.said)}</ul>"
     if isinstance(block, Facts):
@@ -122,7 +123,7 @@ def _table(listing: Listing) -> str:
         f"<tr{kind}>" + "".join(f"<td{wide}>{_text(cell)}</td>" for wide, cell in zip(said, row, strict=True)) + "</tr>"
         for kind, row in zip(kinds, listing.rows, strict=True)
     )
-    above = f"<caption><span>{escape(listing.caption)}</span></caption>" if listing.caption else ""
+    above = f"<caption><span>{_text(listing.caption)}</span></caption>" if listing.caption else ""
     header = f"<thead><tr>{top}</tr></thead>" if any(listing.header) else ""
     made = f"<div class=scroll><table>{above}{header}<tbody>{body}</tbody></table></div>"
     return f"<details><summary>{escape(listing.folded)}</summary>{made}</details>" if listing.folded else made

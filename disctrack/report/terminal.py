@@ -19,9 +19,9 @@ _COLOURS = {"refusal": "31;1", "doubt": "31;1", "warning": "33", "verdict": "1"}
 
 def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[str]:
     """Verdict, accuracy, findings, page and next command, in at most MOST_LINES."""
-    first = _entry("verdict", report.verdict, width)[:_MOST_OF_ONE] + _entry("accuracy", report.accuracy, width)[:2]
+    first = _cut(_entry("verdict", report.verdict, width)) + _cut(_entry("accuracy", report.accuracy, width), 2)
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
-    entries = [_entry(severity(f), f.sentence, width)[:_MOST_OF_ONE] for f in report.graver_first()]
+    entries = [_cut(_entry(severity(f), f.sentence, width)) for f in report.graver_first()]
     room = MOST_LINES - len(first) - len(last)
     while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and entries:
         entries.pop()
@@ -53,6 +53,11 @@ def show(report: Report, stream: TextIO | None = None, *, verbose: bool = False)
     print("\n".join(lines), file=stream, flush=True)
 
 
+def _cut(lines: list[str], most: int = _MOST_OF_ONE) -> list[str]:
+    """No more lines than that; where there were more, the last one says so."""
+    return lines if len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1][:-2]} …"]
+
+
 def _coloured(line: str) -> str:
     head = line[:_HEAD].rstrip()
     return f"\x1b[{_COLOURS[head]}m{head}\x1b[0m{line[len(head) :]}" if head in _COLOURS else line
@@ -62,11 +67,13 @@ def _entry(head: str, said: str, width: int) -> list[str]:
     """A heading and what belongs to it, wrapped beside it; nothing where nothing is said."""
     if not said or isinstance(said, Markup):
         return []
-    indent = " " * (_HEAD + 1)
-    start = f"{head:<{_HEAD}} "
+    return _wrapped(said, max(width, 40), f"{head:<{_HEAD}} ", " " * (_HEAD + 1))
+
+
+def _wrapped(said: str, width: int, first: str = "", then: str = "") -> list[str]:
     return textwrap.wrap(
-        printable(said), max(width, 40), initial_indent=start, subsequent_indent=indent,
-        break_long_words=False, break_on_hyphens=False,
+        printable(said), width, initial_indent=first, subsequent_indent=then, break_long_words=False,
+        break_on_hyphens=False,
     )  # fmt: skip
 
 
@@ -79,14 +86,14 @@ def _blocks(blocks: Iterable[Any], width: int) -> list[str]:
             inner = _blocks(block.blocks, width)
             lines += ["", block.title, *inner] if inner else []
         elif isinstance(block, Text):
-            lines += [] if isinstance(block.said, Markup) else textwrap.wrap(printable(block.said), width)
+            lines += [] if isinstance(block.said, Markup) else _wrapped(block.said, width)
         elif isinstance(block, Items):
             for said in block.said:
-                lines += textwrap.wrap(printable(said), width, initial_indent="- ", subsequent_indent="  ")
+                lines += _wrapped(said, width, "- ", "  ")
         elif isinstance(block, Facts):
             lines += _facts(block.rows, width)
         elif isinstance(block, Listing):
-            lines += _table(block)
+            lines += _table(block, width)
     return lines
 
 
@@ -94,10 +101,9 @@ def _facts(rows: Iterable[tuple[str, Cell]], width: int) -> list[str]:
     return [line for name, value in rows for line in _entry(name, str(value), width)]
 
 
-def _table(listing: Listing) -> list[str]:
+def _table(listing: Listing, width: int) -> list[str]:
     """Columns as wide as what stands in them; the last one, which may hold sentences, as long as it is."""
     rows: list[Sequence[str]] = [listing.header, *([printable(str(cell)) for cell in row] for row in listing.rows)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(listing.header))]
     lines = ["  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip() for row in rows]
-    title = listing.caption or listing.folded
-    return [*([title] if title else []), *lines]
+    return [*_wrapped(listing.caption or listing.folded, width), *lines]

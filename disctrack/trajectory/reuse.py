@@ -7,11 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from disctrack.files.json_text import json_file
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.report.blocks import Report, document, restored
+from disctrack.report.terminal import full
 from disctrack.trajectory.file import read_setup
 
-FILE_NAME = "made_from.json"
+FILE_NAME, SUMMARY = "made_from.json", "summary.txt"
 
 
 def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:
@@ -24,19 +27,20 @@ def hash_of(content: Any) -> str:
     return hashlib.sha256(json.dumps([content, software_version()], sort_keys=True).encode()).hexdigest()
 
 
-def remember(folder: Path, origin: str, lines: Sequence[str], files: Sequence[Path]) -> None:
-    """Keep beside the results what they were made from, and what was said of them. Raises OutputError."""
+def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -> None:
+    """Keep beside the results what they were made from, their report, and all of it as summary.txt. OutputError."""
     names = [file.relative_to(folder).as_posix() for file in files if file.is_relative_to(folder)]
-    content = {"origin": origin, "version": software_version(), "summary": list(lines), "files": names}
-    write_whole(folder / FILE_NAME, (json.dumps(content, indent=1) + "\n").encode())
+    content = {"origin": origin, "version": software_version(), "report": document(report), "files": names}
+    write_whole(folder / FILE_NAME, json_file(content))
+    write_whole(folder / SUMMARY, ("\n".join(full(report)) + "\n").encode())
 
 
-def reusable(folder: Path, origin: str) -> list[str] | None:
-    """What was said of the results in the folder, if they are all there and of this origin; None otherwise."""
+def reusable(folder: Path, origin: str) -> Report | None:
+    """The report of the results in the folder, if they are all there and of this origin; None otherwise."""
     try:
         content = _content(folder)
         whole = content["origin"] == origin and all((folder / name).is_file() for name in content["files"])
-        return [str(line) for line in content["summary"]] if whole else None
+        return restored(content["report"]) if whole else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

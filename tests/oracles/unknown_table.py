@@ -39,7 +39,7 @@ def trial(name: str, seed: int) -> dict:
     seconds = time.process_time() - began
     left = left_over(result.system, result.after_fit, result.diagnosis.noise) if result.after else None
     said = result.sentence
-    as_noise = ("is left is noise" in said or "Nothing is missing" in said) and "not noise" not in said
+    as_noise = ("Residuals: noise" in said or "Nothing is missing" in said) and "not noise" not in said
     answer = {
         "name": name,
         "seed": seed,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from disctrack.analyse.stage import run_analyse
+from disctrack.report.numbers import measured
 from disctrack.report.palette import BLUE
 from disctrack.trajectory.file import Provenance, write_trajectory
 
@@ -34,7 +35,7 @@ def test_report_needs_nothing_else(reported):
     page = reported.report.read_text()
     references = re.findall(r'(?:src|href)="([^"]{0,40})', page)
     assert references
-    assert all(text.startswith("data:image/") for text in references)
+    assert all(text.startswith("data:image/") for text in references)  # the links of pages are another matter
     assert "http://" not in page
     assert "https://" not in page
     assert "<script" not in page
@@ -44,7 +45,10 @@ def test_report_needs_nothing_else(reported):
 def test_report_says_what_was_found(reported):
     page = reported.report.read_text()
     laws = reported.analysis.scaling.laws
-    assert f"{laws.n_theta.value:.4f} ± {laws.n_theta.sigma:.4f}" in page
+    half = (laws.n_theta.high - laws.n_theta.low) / 2
+    assert "exponent of θ (95 %)" in page
+    assert measured(laws.n_theta.value, half) in page  # 4.3 sigmas, Student's t: what a reader takes for it
+    assert measured(laws.n_theta.value, laws.n_theta.sigma) in page
     assert "rolls without slip from the first frame" in page
     assert "6 of 1200 frames have no pose" in page
     assert "rolling &lt;down&gt;" in page  # names are not taken for markup

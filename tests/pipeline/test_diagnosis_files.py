@@ -85,16 +85,9 @@ def test_what_was_found_supplies_the_missing_force(diagnosed):
 def test_table_holds_every_error_before_and_after(diagnosed):
     page = (diagnosed[1] / "diagnosis.html").read_text()
     for row in (
-        "reduced chi-square of the dots",
-        "rms of the dots [px]",
-        "Ljung-Box",
-        "highest line of the spectrum",
-        "free run 0.1 s ahead: nutation",
-        "free run 0.1 s ahead: precession",
-        "free run 0.1 s ahead: position",
-        "change of km.k_m",
-        "energy lost [mJ]",
-        "sigmas",
+        *("reduced chi-square of the dots", "rms of the dots [px]", "Ljung-Box", "highest line of the spectrum"),
+        *(f"free run 0.1 s ahead: {what}" for what in ("nutation", "precession", "position")),
+        *("change of km.k_m", "energy lost [mJ]", "sigmas"),
     ):
         assert row in page, row
     assert "too short for free runs of 0.3 and 0.5 s" in page  # 0.3 s of film
@@ -129,7 +122,7 @@ def test_against_the_enlarged_model_nothing_is_missing(diagnosed, tmp_path):
 
 def test_errors_are_one_line(diagnosed, tmp_path, capsys):
     assert main(["diagnose", str(diagnosed[0])]) == 0
-    assert capsys.readouterr().out.startswith("reused")
+    assert "reused" in capsys.readouterr().out
     assert main(["diagnose", str(diagnosed[0]), "--model", "none"]) == 1  # another result: kept unless told otherwise
     assert "--overwrite" in capsys.readouterr().err
     assert main(["diagnose", str(diagnosed[0]), "-o", str(tmp_path / "x"), "--model", "no-such-model"]) == 1

@@ -15,12 +15,24 @@ from disctrack.diagnosis.errors import frequencies, simulated
 from disctrack.diagnosis.form_misfit import LawCourse, moment_about_contact
 from disctrack.diagnosis.free_runs import ModelFreeEvidence, ModelFreeForces, force_of
 from disctrack.diagnosis.missing_force import MissingMoment
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.frames import nodal_axes_world
 from disctrack.report.figures import NO_TITLE, Drawn, dress, panels, plain_powers
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
+
+
+Side = tuple[Fit, str, str]  # the fit of a model, its name, its colour
+
+
+def _sides(result: DiscDiagnosis) -> list[Side]:
+    """The models that are shown: before and after, or the only one where nothing was added to it."""
+    after = result.after_fit
+    if not result.has_more:
+        return [(after, "model", BLUE)]
+    return [(result.diagnosis.before, "model before", RED), (after, "model after", BLUE)]
 
 
 def all_figures(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> tuple[Drawn, ...]:
@@ -41,7 +53,7 @@ def all_figures(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> tupl
 
 def superposed(result: DiscDiagnosis, beside: ModelFreeEvidence) -> Drawn:
     """Nutation, precession rate and path: measurement, model before, model after (figures 17 and 18 of the paper)."""
-    system, diagnosis = result.system, result.diagnosis
+    system = result.system
     figure = Figure(figsize=(9.5, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
     theta, rate = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
@@ -52,13 +64,8 @@ def superposed(result: DiscDiagnosis, beside: ModelFreeEvidence) -> Drawn:
     path.plot(1e3 * q[:, 0], 1e3 * q[:, 1], **dots)
     if beside.measured is not None:
         rate.plot(time, beside.measured.psidot, **dots)
-    styles: tuple[dict[str, Any], ...] = (
-        {"ls": "--", "lw": 1.3, "color": RED, "label": "model before"},
-        {"ls": "-", "lw": 1.0, "color": BLUE, "label": "model after"},
-    )
-    for fit, style in zip((diagnosis.before, result.after_fit), styles, strict=True):
-        if fit is diagnosis.before and fit is result.after_fit:  # nothing was added
-            continue
+    for (fit, name, colour), line in zip(_sides(result), ("--", "-"), strict=False):
+        style: dict[str, Any] = {"ls": line, "lw": 1.2, "color": colour, "label": name}
         motion = simulated(system, fit.values)
         instants = time[: len(motion)]
         theta.plot(instants, np.degrees(motion.q[:, 4]), **style)
@@ -91,26 +98,25 @@ def _frame(axes: Axes, values: Array) -> None:
 
 
 def residuals(result: DiscDiagnosis) -> Drawn:
-    """Measured minus fitted pose, before and after, with the band of the noise."""
-    system, diagnosis = result.system, result.diagnosis
-    figure, grid = panels(9.5, 6.2, 4, 2, (0.95, 0.15, 0.55, 0.3), sharex=True)
+    """Measured minus fitted pose, a column per model, with the band of the noise."""
+    system, sides = result.system, _sides(result)
+    n = len(sides)
+    figure, grid = panels(9.5, 6.2, 4, n, (0.95, 0.15, 0.55, 0.3), sharex=True)
     rows = [("x", 1e6, "µm"), ("y", 1e6, "µm"), ("z", 1e6, "µm"), ("θ", 1e3 * np.degrees(1), "mdeg")]
-    for column, (fit, name, colour) in enumerate(
-        ((diagnosis.before, "before", RED), (result.after_fit, "after", BLUE))
-    ):
+    for column, (fit, name, colour) in enumerate(sides):
         delta, sigma = system.pose_difference(fit.values)
         e1 = nodal_axes_world(*system.poses(fit.values)[:, 3:5].T)[0]
         theta = np.sum(e1 * delta[:, 3:], axis=1), np.sqrt(np.sum((e1 * sigma[:, 3:]) ** 2, axis=1))
         series = [*((delta[:, i], sigma[:, i]) for i in range(3)), theta]
         for row, ((label, scale, unit), (value, noise)) in enumerate(zip(rows, series, strict=True)):
-            axes = grid[2 * row + column]
+            axes = grid[n * row + column]
             axes.fill_between(system.time, -2 * scale * noise, 2 * scale * noise, color=GRID, lw=0)
             axes.plot(system.time, scale * value, lw=0.7, color=colour)
             axes.set_ylabel(f"{label} ({unit})")
         grid[column].set_title(name, fontsize=10, color=INK)
-        grid[column - 2].set_xlabel("time (s)")
-    caption = "Measured minus fitted pose. The grey band is two standard deviations of a frame's noise."
-    return Drawn("residuals", "Residual before and after", caption, figure)
+        grid[column - n].set_xlabel("time (s)")
+    caption = "Measured minus fitted pose. The grey band is ± 2 σ of a frame's noise."
+    return Drawn("residuals", "Residuals of the poses", caption, figure)
 
 
 def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
@@ -118,23 +124,22 @@ def free_run(result: DiscDiagnosis, before: HeldOut, after: HeldOut) -> Drawn:
     system = result.system
     figure, (left, right) = panels(9.5, 3.4, 1, 2, NO_TITLE)
     last = system.time[~before.test_rows & (system.weights > 0)].max()
-    for held, colour, name in ((before, RED, "before"), (after, BLUE, "after")):
+    runs = (before, after)[-len(_sides(result)) :]
+    for held, (_, name, colour) in zip(runs, _sides(result), strict=True):
         delta, sigma = system.pose_difference(held.train.values)
         e1 = nodal_axes_world(*system.poses(held.train.values)[:, 3:5].T)[0]
         theta = np.abs(np.sum(e1 * delta[:, 3:], axis=1))
         left.semilogy(system.time, 1e3 * np.linalg.norm(delta[:, :3], axis=1), lw=0.8, color=colour, label=name)
         right.semilogy(system.time, np.degrees(theta), lw=0.8, color=colour, label=name)
     noise = np.sqrt(np.sum(e1**2 * sigma[:, 3:] ** 2, axis=1))
-    left.semilogy(system.time, 1e3 * np.linalg.norm(sigma[:, :3], axis=1), lw=1, color=MUTED, label="noise")
-    right.semilogy(system.time, np.degrees(noise), lw=1, color=MUTED, label="noise")
+    left.semilogy(system.time, 1e3 * np.linalg.norm(sigma[:, :3], axis=1), lw=1, color=MUTED, label="noise, 1 σ")
+    right.semilogy(system.time, np.degrees(noise), lw=1, color=MUTED, label="noise, 1 σ")
     for axes, label in ((left, "error of the position (mm)"), (right, "error of the nutation (deg)")):
         axes.axvline(last, color=AMBER, lw=1)
         axes.set_xlabel("time (s)")
         axes.set_ylabel(label)
     left.legend(frameon=False, fontsize=9)
-    caption = (
-        "Fitted up to the vertical line, left alone after it: the free run's error before and after, and the noise."
-    )
+    caption = "Error of the free run: the model is fitted up to the vertical line and continues alone after it."
     return Drawn("free_run", "Free run over held-out data", caption, figure)
 
 
@@ -156,90 +161,88 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     level = diagnosis.settings.false_alarm / max(len(result.system.candidates), 1)
     axes.axvline(float(chi2.isf(level, 1)), color=RED, lw=1)
     plain_powers(axes.xaxis)
-    axes.set_xlabel("decrease of chi-square when it is added to the model (red: what noise can do with one number)")
+    axes.set_xlabel(
+        "decrease of chi-square when it is added to the model (red line: what noise alone can reach with one number)"
+    )
     for row in np.flatnonzero(beyond):
         axes.annotate("without it nothing fits", (gains[row], row), (-4, 0), textcoords="offset points", fontsize=8,
                       ha="right", va="center", color="white")  # fmt: skip
-    caption = "The candidates that gain most. Blue: chosen; amber: cannot be told from it."
+    caption = "The candidates that gain most. Blue: found; amber: indistinguishable alternatives."
     return Drawn("candidates", "What was tried", caption, figure)
+
+
+Along = tuple[Array, Array] | None  # time (k,), values along n0, m0 and k (k, 3)
+
+
+def _along_the_contact(known: Along, sigma: Array, added: Along, scale: float, unit: str, name: str) -> Figure:
+    """What is missing along n0, m0 and k with its band of two sigmas, and what was found adds to it."""
+    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
+    assert known is not None
+    time, values = known[0], scale * known[1]
+    for i, (axes, axis) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
+        value, band = values[:, i], 2 * scale * sigma[:, i]
+        axes.fill_between(time, value - band, value + band, color=GRID, lw=0)
+        axes.plot(time, value, lw=1.2, color=RED, label=name)
+        # the band but for its ends, where derivatives are poor and splines of short moments run away
+        edge = len(value) // 20 if len(value) > 100 else 0
+        inner = slice(edge, -edge or None)
+        shown = [(value - band)[inner], (value + band)[inner]]
+        if added is not None:
+            law, cut = scale * added[1][:, i], len(added[0]) // 20
+            axes.plot(added[0], law, lw=1.0, color=BLUE, label="added by what was found")
+            shown.append(law[cut : -cut or None])
+        _frame(axes, np.concatenate(shown))
+        axes.axhline(0.0, color=MUTED, lw=0.7)
+        axes.set_ylabel(f"along {axis} ({unit})")
+    grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
+    grid[-1].set_xlabel("time (s)")
+    return figure
 
 
 def moment(result: DiscDiagnosis, missing: MissingMoment, of_law: MissingMoment | None) -> Drawn:
     """Moment that the model fails to supply, with its two-sigma band, and what the effects found add to it."""
-    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
     law = None if of_law is None or not result.diagnosis.found else (of_law.time, of_law.moment)
     if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
         system, values = result.system, result.learned.fit.values
         own = {result.learned.law.candidate.effect}
         law = system.time, moment_about_contact(system, values, simulated(system, values), own)
-    for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        value, sigma = 1e6 * missing.moment[:, i], 1e6 * missing.sigma[:, i]
-        axes.fill_between(missing.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
-        axes.plot(missing.time, value, lw=1.3, color=RED, label="missing")
-        if law is not None:
-            axes.plot(law[0], 1e6 * law[1][:, i], lw=1.0, color=BLUE, label="added by what was found")
-        # the band, and all of the law that is not a spike at the ends, where splines of short moments run away
-        inner = np.empty(0) if law is None else 1e6 * law[1][len(law[1]) // 20 : -(len(law[1]) // 20) or None, i]
-        _frame(axes, np.concatenate([value - 2 * sigma, value + 2 * sigma, inner]))
-        axes.axhline(0.0, color=MUTED, lw=0.7)
-        axes.set_ylabel(f"along {name} (µN m)")
-    grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
-    grid[-1].set_xlabel("time (s)")
+    known = missing.time, missing.moment
+    figure = _along_the_contact(known, missing.sigma, law, 1e6, "µN m", "missing, ± 2 σ")
     caption = (
-        "Contact moment M_n, M_m, M_z that the model before fails to supply, with two standard deviations: what short "
-        "moments would have to be for the dots to fall where they did. A missing force, inertia or an error of the "
-        "measurement shows as the moment that does the same."
-        + (
-            " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the "
-            "other fitted numbers cannot take up, so that a steady part, along n0 above all, is smaller in red."
-            if result.learned is not None
-            else " Blue is what was found, read in the same way: within the band it is what was missing."
-            if law is not None
-            else ""
-        )
+        "Contact moment M_n, M_m, M_z that the model before fails to supply: what short moments would have to be for "
+        "the dots to lie where they did. A missing force, inertia or an error of the measurement shows as the moment "
+        "that does the same."
     )
+    if result.learned is not None:
+        caption += (
+            " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the "
+            "other fitted numbers cannot absorb, so that a steady part, along n0 above all, is smaller in red."
+        )
+    elif law is not None:
+        caption += " Blue is what was found, computed in the same way: within the band it is what was missing."
     return Drawn("missing_moment", "The missing moment", caption, figure)
 
 
 def course(known: LawCourse) -> Drawn:
     """Moment about the contact of all laws, with the band of the learned law's coefficients and form."""
-    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
-    for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        value, sigma = 1e6 * known.moment[:, i], 1e6 * known.sigma[:, i]
-        axes.fill_between(known.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
-        axes.plot(known.time, value, lw=0.8, marker=".", ms=5, color=BLUE)
-        axes.axhline(0.0, color=MUTED, lw=0.7)
-        axes.set_ylabel(f"along {name} (µN m)")
-    grid[-1].set_xlabel("time (s)")
+    figure = _along_the_contact((known.time, known.moment), known.sigma, None, 1e6, "µN m", "all laws, ± 2 σ")
     caption = (
         "Moment about the contact of all laws of the model and of the law outside the catalogue, a force at the centre "
-        "included as the moment that it has about the contact, at the points shown. The band is two standard "
-        f"deviations, with what the law's form may be off by ({100 * known.misfit:.2g} % of the law) and the other "
-        "laws that fit as well."
+        "included as the moment that it has about the contact. The band holds what the law's form may be off by "
+        f"({100 * known.misfit:.2g} % of the law) and the other laws that fit as well."
     )
     return Drawn("course_of_the_laws", "How well the laws are known along the recording", caption, figure)
 
 
 def force(result: DiscDiagnosis, measured: ModelFreeForces) -> Drawn:
     """Force on the disc that the model fails to supply, from the accelerations alone, and what was found adds to it."""
-    system = result.system
-    before, after = force_of(system, result.diagnosis.before), force_of(system, result.after_fit)
-    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
-    for i, (axes, name) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        value, sigma = 1e3 * (measured.force - before)[:, i], 1e3 * measured.force_sigma[:, i]
-        axes.fill_between(system.time, value - 2 * sigma, value + 2 * sigma, color=GRID, lw=0)
-        axes.plot(system.time, value, lw=1.1, color=RED, label="missing")
-        if result.diagnosis.found or result.learned is not None:
-            axes.plot(system.time, 1e3 * (after - before)[:, i], lw=1.0, color=BLUE, label="added by what was found")
-        axes.axhline(0.0, color=MUTED, lw=0.7)
-        axes.set_ylabel(f"along {name} (mN)")
-        inner = slice(len(value) // 20, -(len(value) // 20) or None)  # derivatives at the ends of a film are poor
-        _frame(axes, np.concatenate([value[inner], 1e3 * (after - before)[:, i]]))
-    grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
-    grid[-1].set_xlabel("time (s)")
+    time, before = result.system.time, force_of(result.system, result.diagnosis.before)
+    added = (time, force_of(result.system, result.after_fit) - before) if result.has_more else None
+    known = time, measured.force - before
+    figure = _along_the_contact(known, measured.force_sigma, added, 1e3, "mN", "missing, ± 2 σ")
     caption = (
-        "Force on the disc, measured minus that of the model before, with two standard deviations: mass times the "
-        "acceleration of the centre, from the poses alone."
+        "Force on the disc, measured minus that of the model before: mass times the acceleration of the centre, from "
+        "the poses alone."
     )
     return Drawn("missing_force", "The missing force", caption, figure)
 
@@ -250,7 +253,7 @@ def spectrum(result: DiscDiagnosis) -> Drawn:
     present = system.weights >= 6
     rate = float(1.0 / np.median(np.diff(system.time)))
     figure, (axes,) = panels(9.5, 3.2, margins=NO_TITLE)
-    for fit, colour, name in ((result.diagnosis.before, RED, "before"), (result.after_fit, BLUE, "after")):
+    for fit, name, colour in _sides(result):
         residual = system.pose_residual(fit.values)[present]
         if np.isfinite(residual).all():
             frequency, power = periodogram(residual, rate, axis=0)

@@ -1,4 +1,4 @@
-"""What would settle it, in words: recordings that would answer what one leaves open."""
+"""Recordings that would answer what one leaves open, for the report and for diagnosis.json."""
 
 from typing import Any
 
@@ -6,86 +6,59 @@ import numpy as np
 
 from disctrack.diagnosis.plan import ENOUGH, Plan, Question
 from disctrack.discrepancy.significance import TWO_SIDED
-from disctrack.discrepancy.words import quantity_text
-from disctrack.report.parts import bullets, details, paragraph, table
+from disctrack.report.blocks import Items, Listing, Section, Text
+from disctrack.report.numbers import in_unit, measured, rounded
 
 SAID = (
-    "Computed from the fitted model: each recording is simulated with the same cameras and noise, and put beside "
+    "Computed from the fitted model: each recording is simulated with the same cameras and noise, and added to "
     "what there is; laws, cameras and dots are shared, the initial state is its own. Another disc has a k_m of its "
     "own, laws in question keep their coefficient; air drag goes with the density as its law says. More dots and a "
     "third view count as numbers of the same kind."
 )
 
 
-def question_text(q: Question) -> str:
-    """What is open."""
-    if q.rival is not None:
-        return f"{q.effect.name} or {q.rival.name}"
-    return f"size of {q.effect.name}"
-
-
-def _answer(q: Question, value: float) -> str:
-    if q.rival is not None:
-        return f"{value:.3g} sigmas"
-    size = q.effect.quantities[0]
-    return f"sigma {quantity_text(value, 0.0, size.unit)}" if np.isfinite(value) else "unseen"
-
-
-def lines(plan: Plan) -> list[str]:
-    """For the terminal: of every question, what this recording says, and the one that would say most."""
-    said = []
-    for i, q in enumerate(plan.questions):
-        best = plan.best(i)
-        text = f"{question_text(q)}: now {_answer(q, plan.now[i])}"
-        if best is not None:
-            text += f"; {best.proposal.text}: {_answer(q, best.answers[i])}"
-            if q.rival is not None and best.answers[i] < ENOUGH:
-                text += " (not enough: no recording looked at tells them apart)"
-        said.append(f"{'plan':<13} {text}")
-    return said
-
-
-def html(plan: Plan | None) -> list[str]:
-    """For the page."""
+def section(plan: Plan | None) -> Section:
+    """What is open, the recording that would say most on each question, and all others."""
+    title = "Recordings that would settle what is open"
     if plan is None or not plan.questions:
-        return []
+        return Section(title, ())
     best = {id(plan.best(i)) for i in range(len(plan.questions))}
     different = {r.answers: r for r in reversed(plan.rows)}.values()  # a disc at rest is filmed to no purpose
-    rows = [(id(r) in best, (r.proposal.text, f"{r.duration:.2g}", *map(_cell, r.answers))) for r in different]
+    rows = [(id(r) in best, (r.proposal.text, rounded(r.duration, 2), *map(_cell, r.answers))) for r in different]
     header = ("one more recording", "lasts [s]", *map(_heading, plan.questions))
     now = ("none: what there is", "", *map(_cell, plan.now))
-    first = table("", header, [now, *(cells for is_best, cells in rows if is_best)])
-    others = table("", header, [cells for is_best, cells in rows[::-1] if not is_best])
     said = [_sentence(plan, i) for i in range(len(plan.questions))]
-    return [bullets(said), paragraph(SAID), first, details("All other recordings that were looked at", [others])]
+    others = [cells for is_best, cells in rows[::-1] if not is_best]
+    shown = Listing(header, [now, *(cells for is_best, cells in rows if is_best)])
+    return Section(title, [Items(said), Text(SAID), shown, Listing(header, others, folded="All other recordings")])
 
 
 def _heading(q: Question) -> str:
     if q.rival is not None:
-        return f"{question_text(q)} [sigmas]"
-    unit = q.effect.quantities[0].unit
-    return f"sigma of {q.effect.name}" + (f" [{unit}]" if unit != "1" else "")
+        return f"{q.effect.name} or {q.rival.name} [sigmas]"
+    return in_unit(f"σ of {q.effect.name}", q.effect.quantities[0].unit)
 
 
 def _cell(value: float) -> str:
-    return f"{value:.2g}" if np.isfinite(value) else "unseen"
+    return rounded(value, 2) if np.isfinite(value) else "not seen"
 
 
 def _sentence(plan: Plan, i: int) -> str:
     q, best = plan.questions[i], plan.best(i)
+    open_ = f"{q.effect.name} or {q.rival.name}" if q.rival else f"size of {q.effect.name}"
     if best is None:
-        return f"For {question_text(q)} no recording looked at can be made."
+        return f"For {open_} no recording that was tried can be made."
     if q.rival is None:
         unit = q.effect.quantities[0].unit
         limit, now = (_limit(x, unit) for x in (best.answers[i], plan.now[i]))
-        return f"The {question_text(q)} is known to {now} (95 %), and would be to {limit}: {best.proposal.text}."
+        return f"The {open_} is known to {now} (95 %), and would be to {limit}: {best.proposal.text}."
     if best.answers[i] < ENOUGH:
-        return f"No recording looked at tells {q.effect.name} from {q.rival.name}."
-    return f"To tell {q.effect.name} from {q.rival.name}: {best.proposal.text} ({best.answers[i]:.3g} sigmas)."
+        return f"No recording that was tried separates {q.effect.name} from {q.rival.name}."
+    return f"To separate {q.effect.name} from {q.rival.name}: {best.proposal.text} ({rounded(best.answers[i])} sigmas)."
 
 
 def _limit(sigma: float, unit: str) -> str:
-    return quantity_text(float(f"{TWO_SIDED * sigma:.2g}"), 0.0, unit) if np.isfinite(sigma) else "nothing"
+    return measured(TWO_SIDED * sigma, unit=unit) if np.isfinite(sigma) else "nothing"
 
 
 def as_json(plan: Plan | None) -> dict[str, Any] | None:

@@ -1,6 +1,5 @@
 """The stage: trajectory files in; one page, one diagnosis.json and one sentence out."""
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +12,8 @@ from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
+from disctrack.report.blocks import Report
+from disctrack.report.html import write_page
 from disctrack.trajectory.file import read_setup
 from disctrack.trajectory.reuse import hash_of, refuse_other, remember, reusable
 
@@ -25,7 +26,7 @@ class TogetherOutcome:
 
     result: DiscsTogether | None  # None where an earlier result of the same files was complete
     files: tuple[Path, ...]
-    summary: tuple[str, ...]
+    summary: Report
     unusable: tuple[str, ...] = ()  # recordings that could not be read, or not be fitted with the others
 
 
@@ -48,9 +49,7 @@ def run_together(
     reuse : an earlier result that is complete and of the same files, model and version
     Raises TrajectoryFileError where there is no such file, AnalysisError, SceneError, ModelError, OutputError.
     """
-    from disctrack.diagnosis.together.output import as_json, figures, lines, whole_page
-    from disctrack.report.figures import draw  # matplotlib is wanted here only
-    from disctrack.report.parts import gallery
+    from disctrack.diagnosis.together.output import as_json, figures, report_of
 
     paths = [Path(p) for p in paths]
     for p in paths:
@@ -67,23 +66,20 @@ def run_together(
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
     made_from = {"model": known, "plan": settle, "files": [read_setup(p).fingerprint for p in read], "unread": unread}
     origin = hash_of(made_from)
-    told = reusable(folder, origin) if reuse else None
-    if told is not None:
-        document = json.loads(report.read_text(encoding="utf-8"))
-        pages = (report, folder / "diagnosis.html")
-        return TogetherOutcome(None, pages, tuple(told), tuple(document["unusable"]))
+    known_report = reusable(folder, origin) if reuse else None
+    if known_report is not None:
+        return TogetherOutcome(None, (report, folder / "diagnosis.html"), known_report, known_report.data["unusable"])
     refuse_other(report, overwrite)
     refuse_input(report)
     recordings = _told_apart(list(read.values()), list(read))
     result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle, unread=unread)
-    drawn = figures(result)
-    files, pictures = draw(folder, drawn, ["png"])
     html = folder / "diagnosis.html"
-    write_whole(html, whole_page(result, gallery(drawn, pictures)).encode())
-    write_whole(report, json_file({"files": [str(p) for p in paths], **as_json(result)}))
-    said = lines(result)
-    remember(folder, origin, said, (report, html, *files))
-    return TogetherOutcome(result, (report, html, *files), tuple(said), result.unusable)
+    document = {"files": [str(p) for p in paths], **as_json(result)}
+    whole = replace(report_of(result, figures(result), (html, report)), data=document)
+    files = write_page(html, whole, ["png"])
+    write_whole(report, json_file(document))
+    remember(folder, origin, whole, (report, html, *files))
+    return TogetherOutcome(result, (report, html, *files), whole, result.unusable)
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:

@@ -13,7 +13,7 @@ from scipy import stats
 
 from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
-from disctrack.discrepancy.document import document, table
+from disctrack.discrepancy.document import document
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.forecast import Forecast, RunScore, foretold, scored
 from disctrack.discrepancy.equations.law import LearnedForce
@@ -27,6 +27,7 @@ from disctrack.discrepancy.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
+from disctrack.report.terminal import full
 
 OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
 HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
@@ -305,13 +306,9 @@ class Answer:
 
     def __str__(self) -> str:
         """The answer, before and after, and remarks."""
-        lines = [self.sentence, *(f"Note: {note}." for note in self.notes), ""]
-        lines.append(f"{'':<30}{'before':>12}{'after':>12}{'noise':>12}")
-        for c in self.system.formulas.channels:
-            b, a = self.before[c], self.after[c]
-            lines.append(f"{f'rms of {c} [{self._unit(c)}]':<30}{b.rms:12.4g}{a.rms:12.4g}{a.noise:12.4g}")
-            lines.append(f"{'  free run, held out':<30}{b.held_out:12.4g}{a.held_out:12.4g}")
-        return "\n".join([*lines, *table(self.diagnosis)])
+        from disctrack.discrepancy.equations.page import report_of
+
+        return "\n".join(full(report_of(self)))
 
     def document(self) -> dict[str, Any]:
         """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
@@ -328,14 +325,14 @@ class Answer:
 
     def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
         """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
-        from disctrack.discrepancy.equations.page import written_page
+        from disctrack.discrepancy.equations.page import write_answer
 
         paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
         for path in paths:
             if path.exists() and not overwrite:
                 raise OutputError(f"{path}: exists. Choose another folder, or say overwrite=True.")
         write_whole(paths[0], json_file(self.document()))
-        write_whole(paths[1], written_page(self, Path(folder))[0].encode())
+        write_answer(self, paths[1])
         return paths
 
 

@@ -1,98 +1,68 @@
-"""The answer on one HTML page that needs nothing else."""
+"""The answer as a report, and the figures of its page."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import signal
 
+from disctrack.discrepancy.document import tables
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
-from disctrack.report.figures import Drawn, draw, panels
+from disctrack.report.blocks import Figures, Items, Listing, Report, Said, Section
+from disctrack.report.html import write_page
+from disctrack.report.numbers import in_unit, probability, rounded
 from disctrack.report.palette import BLUE, MUTED, RED
-from disctrack.report.parts import Markup, as_typed, bullets, gallery, page, paragraph, section, table
 
 if TYPE_CHECKING:
     from disctrack.discrepancy.equations.answer import Answer
+    from disctrack.report.figures import Drawn
 
 _MOST_POINTS = 6000  # of a curve: a page shows no more
 _MOST_STRETCHES = 6
 
 
-def written_page(answer: Answer, folder: Path) -> tuple[str, list[Path]]:
-    """The whole page, and the figures that were written beside it. Raises OutputError."""
-    d = answer.diagnosis
-    drawings = [_drawn(answer, c, name) for c, name in enumerate(answer.system.formulas.channels)]
-    if answer.law is not None:
-        drawings.insert(0, _law(answer, answer.law))
-    files, pictures = draw(folder, drawings, ("png",))
-    equations = [as_typed(f"d{k}/dt = {v}") for k, v in answer.equations.rates.items()]
-    parts = [
-        paragraph(answer.sentence, "lead"),
-        paragraph(f"Verdict: {d.verdict}. {_sentence(d.reason)}"),
-        bullets(equations),
-        *(paragraph(_sentence(n, _named(answer))) for n in answer.notes),
-        section("Before and after", [_before_after(answer)]),
-        section("Fitted numbers", [_fitted(answer)]),
-        section("In pictures", [gallery(drawings, pictures)]),
-        section("What was tried", [_tried(answer)]),
-    ]
-    return page(f"{answer.equations.name}: what is missing?", parts), files
+def report_of(answer: Answer, drawn: tuple[Drawn, ...] = ()) -> Report:
+    """The whole answer, for every writer."""
+    equations = [f"d{k}/dt = {v}" for k, v in answer.equations.rates.items()]
+    return Report(
+        f"{answer.equations.name}: what is missing?",
+        f"Verdict: {answer.verdict}. {answer.sentence}",
+        findings=[Said(f"{note}.") for note in answer.notes],
+        blocks=[
+            Section("Equations", [Items(equations)]),
+            Section("Before and after", [_before_after(answer)]),
+            Section("In pictures", [Figures(drawn)]),
+            *tables(answer.diagnosis, ("state.", f"{NAME}.")),
+        ],
+    )
 
 
-def _named(answer: Answer) -> set[str]:
-    """What the user's equations call by names, of which c is not C."""
-    e = answer.equations
-    return {*e.rates, *e.parameters, *e.constants, *e.inputs, *answer.system.formulas.channels}
+def write_answer(answer: Answer, path: Path) -> list[Path]:
+    """Write the page; returns the figures that were written beside it. Raises OutputError."""
+    drawn = [_drawn(answer, c, name) for c, name in enumerate(answer.system.formulas.channels)]
+    law = [] if answer.law is None else [_law(answer, answer.law)]
+    return write_page(path, report_of(answer, (*law, *drawn)), ("png",))
 
 
-def _sentence(said: str, names: Collection[str] = ()) -> str:
-    first = said.partition(" ")[0]
-    return f"{said}." if first in names or not first.isalpha() else f"{said[:1].upper()}{said[1:]}."
-
-
-def _before_after(answer: Answer) -> Markup:
-    d = answer.diagnosis
+def _before_after(answer: Answer) -> Listing:
     rows = []
     for c in answer.system.formulas.channels:
         b, a = answer.before[c], answer.after[c]
         unit = answer.equations.units.get(c, "1")
-        rows.append([f"rms of {c} [{unit}]", f"{b.rms:.4g}", f"{a.rms:.4g}", f"{a.noise:.4g}"])
-        rows.append([f"free run of {c}, held out [{unit}]", f"{b.held_out:.4g}", f"{a.held_out:.4g}", ""])
-    chi = [f"{f.reduced_chi_square / d.noise:.4g}" for f in (d.before, d.after)]
-    rows.append(["chi-square per degree of freedom", *chi, "1"])
-    rows.append(["Ljung-Box: probability of so much memory in noise", "", f"{answer.whiteness:.2g}", ""])
-    return table("", ["", "before", "after", "noise"], rows)
-
-
-def _fitted(answer: Answer) -> Markup:
-    d = answer.diagnosis
-    rows = []
-    for q in d.after.quantities:
-        if not q.name.startswith(("state.", f"{NAME}.")):  # a law is shown by its course
-            old = f"{d.before.values[q.name]:.6g} +- {d.before.sigma(q.name):.2g}" if q.name in d.before.names else ""
-            new = f"{d.after.values[q.name]:.6g} +- {d.after.sigma(q.name):.2g}"
-            rows.append([as_typed(q.name), old, new, "" if q.unit == "1" else q.unit])
-    return table("", ["", "before", "after", "unit"], rows)
-
-
-def _tried(answer: Answer) -> Markup:
-    rows = []
-    for t in answer.diagnosis.tried:
-        numbers = (_number(x) for x in (t.score, t.gain, t.held_out_gain))
-        rows.append([as_typed(t.candidate.name), t.candidate.title, *numbers, t.reason])
-    return table("", ["term", "", "score", "refitted", "held out", "outcome"], rows)
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4g}"
+        rows.append((in_unit(f"rms of {c}", unit), *(rounded(x, 4) for x in (b.rms, a.rms, a.noise))))
+        rows.append((in_unit(f"free run of {c}, held out", unit), rounded(b.held_out, 4), rounded(a.held_out, 4), ""))
+    memory = f"p {probability(answer.whiteness)}"
+    rows.append(("Ljung-Box: probability of this autocorrelation in white noise", "", memory, ""))
+    return Listing(("", "before", "after", "noise"), rows)
 
 
 def _law(answer: Answer, law: LearnedForce) -> Drawn:
     """The law that was learned with its band, and what known terms make at the same places."""
     units = answer.equations.units
+    from disctrack.report.figures import Drawn, panels  # matplotlib is wanted on pages only
+
     picture, (axes,) = panels(9, 3.5)
     axes.fill_between(law.variable, law.force - 2 * law.sigma, law.force + 2 * law.sigma, color=BLUE, alpha=0.25, lw=0)
     axes.plot(law.variable, law.force, color=BLUE, lw=1.2, label="learned, 95 %")
@@ -109,6 +79,8 @@ def _law(answer: Answer, law: LearnedForce) -> Drawn:
 
 def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
     """Data and model, and what is left in time and frequency: the first stretches."""
+    from disctrack.report.figures import Drawn, panels
+
     unit = answer.equations.units.get(name, "")
     picture, (top, middle, bottom) = panels(9, 7, 3)
     sides = [answer.predicted(f)[:_MOST_STRETCHES] for f in (answer.diagnosis.before, answer.diagnosis.after)]

@@ -28,7 +28,7 @@ def test_a_number_that_is_told_from_nought_has_no_bound():
 
 def test_a_number_within_its_sigma_is_bounded_by_the_noise():
     (text,) = told((5e-6, 1e-6, 1.0), (1e-6, 1e-6, 0.1))
-    assert text == "tilt_y is only bounded, |tilt_y| < 2.96 urad (95 %), by the noise"
+    assert text == "tilt_y is only bounded, |tilt_y| < 2.96 µrad (95 %), by the noise"
 
 
 def test_a_number_that_another_keeps_open_names_it():

@@ -1,7 +1,9 @@
 """Pages and JSON: what stands in them is what was given, whatever it is."""
 
+import io
 import json
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,8 +13,23 @@ from matplotlib.figure import Figure
 from disctrack.diagnosis.pages.figures import candidates
 from disctrack.files.json_text import json_file, json_text, plain
 from disctrack.report import palette
+from disctrack.report.blocks import (
+    Facts,
+    Figures,
+    Items,
+    Listing,
+    Markup,
+    Report,
+    Said,
+    Section,
+    Text,
+    document,
+    restored,
+)
 from disctrack.report.figures import Drawn, draw, plain_powers
-from disctrack.report.parts import Markup, as_typed, bullets, gallery, page, paragraph, section, table, typeset, warning
+from disctrack.report.html import link_pages, page, write_page
+from disctrack.report.numbers import Measured, measured, probability, rounded, score
+from disctrack.report.terminal import full, short, show
 
 
 class Tree(HTMLParser):
@@ -39,26 +56,120 @@ class Tree(HTMLParser):
             self.cells.append(data)
 
 
-def test_a_page_is_whole_and_shows_text_as_text():
-    nasty = "<script>alert('ψ & 1 < 2')</script>"
-    parts = [
-        paragraph(nasty, "lead"),
-        warning(nasty, [nasty]),
-        section(nasty, [table(nasty, ["a", nasty], [(nasty, "1"), (Markup("<b>2</b>"), "3")], ["done", "failed"])]),
+NASTY = "<script>alert('ψ & 1 < 2')</script>"
+CHANGED = Measured(6.004e-5, 2.1e-7, "m")
+
+
+def report(**more):
+    blocks = [
+        Text("All of it."),
+        Section("Numbers", [Listing(("a", "b"), [("x", CHANGED)], "A table"), Facts([("length", CHANGED)])]),
+        Section("Nothing", [Listing(("a",), ()), Items([])]),
     ]
-    tree = Tree(page(nasty, parts))
+    return Report(**{"title": "t", "verdict": "Something is missing.", "accuracy": "σ 1 µm", "blocks": blocks} | more)
+
+
+def test_a_page_is_whole_and_shows_text_as_text():
+    table = Listing(["a", NASTY], [(NASTY, "1"), (Markup("<b>2</b>"), "3")], NASTY, classes=["done", "failed"])
+    found = report(title=NASTY, verdict=NASTY, findings=[Said(NASTY, "doubt")], blocks=[Section(NASTY, [table])])
+    tree = Tree(page(found, {}))
     assert tree.open == []
     assert "script" not in tree.seen
-    assert nasty in tree.cells
-    assert tree.seen.count("b") == 2  # the warning's title, and what was said to be HTML
+    assert NASTY in tree.cells
+    assert tree.seen.count("b") == 2  # the finding's severity, and what was said to be HTML
 
 
 def test_nothing_to_show_leaves_no_empty_frame():
-    assert not warning("mind", [])
-    assert not bullets([])
-    assert not section("empty", ["", paragraph("")])
+    made = page(report(), {})
+    assert "Nothing" not in made
+    assert "class=findings" not in made
+    assert made.count("<section>") == 1
+    assert "Nothing" not in "".join(full(report()))
     with pytest.raises(ValueError, match="zip"):
-        table("", ["a"], [("1",), ("2",)], ["done"])
+        page(report(blocks=[Listing(["a"], [("1",), ("2",)], classes=["done"])]), {})
+
+
+def test_every_writer_shows_the_same_number():
+    kept = json.loads(json_text(document(report())))
+    assert kept["blocks"][1]["blocks"][0]["rows"] == [["x", {"value": 6.004e-5, "sigma": 2.1e-7, "unit": "m"}]]
+    assert "60.04 ± 0.21 µm" in page(report(), {})
+    assert any(line.split() == ["x", "60.04", "±", "0.21", "µm"] for line in full(report()))
+
+
+def test_a_terminal_gets_ten_lines_the_gravest_first_and_is_told_of_the_rest():
+    said = [Said(f"note {i} " + "word " * 30, "note") for i in range(9)] + [Said("doubtful", "doubt")]
+    found = report(verdict="long " * 200, findings=said, page=Path("a page.html"), then="disctrack next")
+    lines = short(found, 80)
+    assert 8 <= len(lines) <= 10
+    assert lines[3].endswith("…")  # of a long verdict
+    assert max(map(len, lines)) <= 80
+    doubt = next(i for i, line in enumerate(lines) if line.startswith("doubt"))
+    assert not any(line.startswith("note") for line in lines[:doubt])
+    assert any("more: -v shows them" in line for line in lines)
+    assert lines[-2].split(maxsplit=1) == ["page", "a page.html"]
+    everything = " ".join(" ".join(full(found, 80)).split())
+    assert all(f"note {i} word" in everything for i in range(9))
+    again = restored(json.loads(json_text(document(found))))
+    assert short(again, 80) == lines
+
+
+def test_colour_is_for_terminals_without_no_color(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    shown = {}
+    for no_color, stream in (("", Terminal()), ("1", Terminal()), ("", io.StringIO())):
+        monkeypatch.setenv("NO_COLOR", no_color)
+        show(report(findings=[Said("wrong", "doubt")]), stream)
+        shown[no_color, stream.isatty()] = "\x1b[31" in stream.getvalue()
+    assert shown == {("", True): True, ("1", True): False, ("", False): False}
+
+
+def test_pages_of_one_recording_name_those_that_are_there(tmp_path):
+    places = {"analysis": tmp_path / "a b" / "report.html", "motion": tmp_path / "a b" / "motion.html",
+              "diagnosis": tmp_path / "d" / "diagnosis.html", "video": tmp_path / "overlay.mp4"}  # fmt: skip
+    for name in ("analysis", "diagnosis"):
+        write_page(places[name], report())
+    for _ in range(2):  # again: the same
+        link_pages(places)
+        assert 'href="../d/diagnosis.html"' in places["analysis"].read_text()
+        assert places["diagnosis"].read_text().count('href="../a%20b/report.html"') == 1
+        assert "motion" not in places["diagnosis"].read_text()
+
+
+@pytest.mark.parametrize(
+    ("number", "shown"),
+    [
+        ((6.004e-5, 2.1e-7, "m"), "60.04 ± 0.21 µm"),
+        ((3.812e-3, 1.25e-5, "J"), "3.812 ± 0.013 mJ"),  # value and sigma alike
+        ((0.675, 0.00996), "0.675 ± 0.010"),  # 9.96 has three digits once rounded
+        ((-1e-9, 2e-7, "m"), "0 ± 200 nm"),  # no -0
+        ((86227.6, 221.0), "86230 ± 220"),
+        ((4.193e-8, 1.2e-12, "m s^2"), "(4.19300 ± 0.00012) × 10⁻⁸ m s²"),
+        ((1.5, 0.0, "rad s-1"), "1.5 rad/s"),
+        ((2.6e-7, float("nan"), "m s^2"), "2.6 × 10⁻⁷ m s²"),
+        ((float("nan"), 1.0), "unknown"),
+    ],
+)
+def test_value_and_sigma_have_two_digits_of_sigma(number, shown):
+    assert measured(*number) == str(Measured(*number)) == shown
+
+
+def test_rounding_loses_less_than_a_twentieth_of_sigma(rng):
+    for value, sigma in zip(
+        rng.normal(size=200) * 10 ** rng.uniform(-3, 3, 200), 10 ** rng.uniform(-4, 2, 200), strict=True
+    ):
+        shown, spread = (float(text) for text in measured(value, sigma).split(" ± "))
+        assert abs(shown - value) <= 0.0501 * sigma
+        assert abs(spread - sigma) <= 0.0501 * sigma
+
+
+def test_statistics_are_set_as_people_write_them():
+    assert [score(x) for x in (1.239e-8, 9.04, 12345.6, np.inf, None)] == ["0.0", "9.0", "12350", "∞", ""]
+    assert [probability(p) for p in (0.0, 0.571, 3e-9)] == ["< 10⁻³⁰⁰", "= 0.57", "= 3 × 10⁻⁹"]
+    assert [rounded(x) for x in (-0.0, 1.5e-9, 0.04567)] == ["0", "1.5 × 10⁻⁹", "0.0457"]
 
 
 def test_a_figure_is_written_whole_and_shown(tmp_path):
@@ -71,7 +182,7 @@ def test_a_figure_is_written_whole_and_shown(tmp_path):
     files, pictures = draw(tmp_path / "page alone", [drawn], ())
     assert files == []
     assert not (tmp_path / "page alone").exists()
-    shown = gallery([drawn], pictures)
+    shown = page(report(blocks=[Figures([drawn])]), pictures)
     assert "data:image/svg+xml;base64," in shown
     assert "rises &amp; falls" in shown
 
@@ -102,22 +213,12 @@ def test_json_holds_no_number_that_json_does_not_know():
     assert json_file(document).endswith(b"}\n")
 
 
-def test_numbers_and_angles_are_set_as_people_write_them():
-    assert typeset("k < 2.6e-07 m s, -5e+10, 3e5").replace("\xa0", " ") == "k < 2.6 × 10⁻⁷ m s, -5 × 10¹⁰, 3 × 10⁵"
-    small = "x < 2.6e-07 m, y < 1.25e-05 rad; t < 3e-08 s (95 %)"
-    assert typeset(small) == "x < 0.26 µm, y < 12.5 µrad; t < 30 ns (95 %)"
-    assert typeset("c < 5e-13 m, k 2e-08 m^2").replace("\xa0", " ") == "c < 5 × 10⁻¹³ m, k 2 × 10⁻⁸ m²"
-    assert typeset("M = k psidot / sin theta, phi") == "M = k ψ̇ / sin θ, φ"
-    assert typeset("psi + phi. Then theta.") == "ψ + φ. Then θ."
-    for kept in ("state.theta", "theta_deg", "figures/theta.png", "theta.png", "1e", "case1e5", "0.2.0+1e5", "12e45…"):
-        assert typeset(kept) == kept
-
-
-def test_sentences_in_cells_wrap_and_numbers_do_not():
+def test_sentences_in_cells_wrap_and_long_tables_fold():
     said = "gains 4.57, noise alone reaches 21.6; only bounded: translation_x"
-    made = table("", ["a", "b"], [("1.234 ± 0.001", said), ("2", "short")])
-    assert made.count("class=said") == 2  # all of its column
+    made = page(report(blocks=[Listing(["a", "b"], [("1.234 ± 0.001", said), ("2", "short")], folded="All")]), {})
+    assert made.count("<td class=said>") == 2  # all of its column
     assert f"<td class=said>{said}" in made
+    assert "<details><summary>All</summary>" in made
 
 
 def test_a_logarithmic_axis_shows_plain_numbers():
@@ -152,9 +253,3 @@ def test_a_candidate_without_which_nothing_fits_has_the_longest_bar():
     assert np.isfinite(lengths[0])
     assert lengths[0] > 5 * max(lengths[1:])
     assert "without it nothing fits" in [text.get_text() for text in axes.texts]
-
-
-def test_formulas_of_the_reader_stay_as_they_were_typed():
-    assert bullets([as_typed("dtheta/dt = omega - sin(theta) < 1e-3")]) == (
-        "<ul><li>dtheta/dt = omega - sin(theta) &lt; 1e-3</li></ul>"
-    )
