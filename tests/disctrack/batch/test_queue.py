@@ -369,7 +369,7 @@ def test_repeats_are_of_one_group_determined_and_no_copies():
     assert found["mean"] == pytest.approx(0.67)
     assert set(COMPARED) <= set(COLUMNS)
     page = index_page(rows, [found])
-    assert "0.6700 ± 0.0100" in page
+    assert "0.670 ± 0.010" in page
     assert "Repeats" not in index_page(rows)
 
 
