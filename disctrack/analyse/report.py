@@ -58,7 +58,7 @@ def report_of(
         blocks=[
             Text(_what_was_filmed(analysis)),
             section("Quality of the measurement", ("03",), Text(_lab_frame(analysis)), _status_table(analysis)),
-            section("Motion", ("04", "06", "07", "10", "11"), _instants_table(analysis)),
+            section("Motion", ("04", "05", "06", "07", "10", "11"), _instants_table(analysis)),
             section("Contact", ("08", "09")),
             section("Energy", ("12", "13")),
             section("Scaling laws of the last stage", ("14", "15", "16"), *_exponents(analysis), *_published_tables()),

@@ -149,13 +149,13 @@ def document(report: Report) -> dict[str, Any]:
     return dict(plain(found))
 
 
-def restored(kept: Mapping[str, Any]) -> Report:
-    """A report from its document: what a terminal shows, and the document as data."""
+def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
+    """A report from its document, made without the stage's own data, and these."""
     findings = [Said(f["sentence"], f["severity"]) for f in kept["findings"]]
     files = [Path(file) for file in kept["files"]]
     page = Path(kept["page"]) if kept["page"] else None
     head = kept["title"], kept["verdict"], kept["accuracy"]
-    return Report(*head, findings, files=files, page=page, then=kept["next"], data=kept)
+    return Report(*head, findings, files=files, page=page, then=kept["next"], data={**kept, **data})
 
 
 def _cell(cell: Cell) -> Any:

@@ -4,10 +4,11 @@ import contextlib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from disctrack.files.json_text import json_file
+from disctrack.files.json_text import json_file, plain
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.report.blocks import Report, document, restored
@@ -30,7 +31,13 @@ def hash_of(content: Any) -> str:
 def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -> None:
     """Keep beside the results what they were made from, their report, and all of it as summary.txt. OutputError."""
     names = [file.relative_to(folder).as_posix() for file in files if file.is_relative_to(folder)]
-    content = {"origin": origin, "version": software_version(), "report": document(report), "files": names}
+    content = {
+        "origin": origin,
+        "version": software_version(),
+        "report": document(replace(report, data={})),
+        "data": plain(report.data),
+        "files": names,
+    }
     write_whole(folder / FILE_NAME, json_file(content))
     write_whole(folder / SUMMARY, ("\n".join(full(report)) + "\n").encode())
 
@@ -40,7 +47,7 @@ def reusable(folder: Path, origin: str) -> Report | None:
     try:
         content = _content(folder)
         whole = content["origin"] == origin and all((folder / name).is_file() for name in content["files"])
-        return restored(content["report"]) if whole else None
+        return restored(content["report"], content["data"]) if whole else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
