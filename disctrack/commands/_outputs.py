@@ -152,12 +152,13 @@ def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused:
     if arguments.json:
         print(json_text(document(report), indent=1))
     elif not arguments.quiet:
-        said = [Said("reused: the complete result of the same input, settings and version", "note")] if reused else []
+        again = "reused: the complete result of the same input, settings and version"
+        said = [Said(again, "note")] if reused else []
         page = None if report.page is None else relative(report.page)
         files = [relative(file) for file in report.files]
         text = folder / SUMMARY
         if reused and arguments.verbose and text.is_file():
-            print(text.read_text(encoding="utf-8"), end="")
+            print(again, text.read_text(encoding="utf-8"), sep="\n\n", end="")
         else:
             shown = replace(report, findings=[*report.findings, *said], files=files, page=page)
             show(shown, verbose=arguments.verbose)

@@ -121,7 +121,7 @@ def test_against_the_enlarged_model_nothing_is_missing(diagnosed, tmp_path):
 
 
 def test_errors_are_one_line(diagnosed, tmp_path, capsys):
-    assert main(["diagnose", str(diagnosed[0])]) == 0
+    assert main(["diagnose", str(diagnosed[0]), "--verbose"]) == 0
     assert "reused" in capsys.readouterr().out
     assert main(["diagnose", str(diagnosed[0]), "--model", "none"]) == 1  # another result: kept unless told otherwise
     assert "--overwrite" in capsys.readouterr().err

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
-from disctrack.discrepancy.document import document
+from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.forecast import Forecast, RunScore, foretold, scored
-from disctrack.discrepancy.equations.law import LearnedForce
+from disctrack.discrepancy.equations.law import NAME, LearnedForce
 from disctrack.discrepancy.equations.loop import Answered, ask
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
@@ -27,7 +27,12 @@ from disctrack.discrepancy.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
+from disctrack.report.blocks import Figures, Items, Listing, Report, Said, Section
+from disctrack.report.numbers import in_unit, probability, rounded
 from disctrack.report.terminal import full
+
+if TYPE_CHECKING:
+    from disctrack.report.figures import Drawn
 
 OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
 HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
@@ -306,9 +311,22 @@ class Answer:
 
     def __str__(self) -> str:
         """The answer, before and after, and remarks."""
-        from disctrack.discrepancy.equations.page import report_of
+        return "\n".join(full(self.report()))
 
-        return "\n".join(full(report_of(self)))
+    def report(self, drawn: Sequence[Drawn] = ()) -> Report:
+        """The whole self, for every writer."""
+        equations = [f"d{k}/dt = {v}" for k, v in self.equations.rates.items()]
+        return Report(
+            f"{self.equations.name}: what is missing?",
+            f"Verdict: {self.verdict}. {self.sentence}",
+            findings=[Said(f"{note}.") for note in self.notes],
+            blocks=[
+                Section("Equations", [Items(equations)]),
+                Section("Before and after", [_before_after(self)]),
+                Section("In pictures", [Figures(drawn)]),
+                *tables(self.diagnosis, ("state.", f"{NAME}.")),
+            ],
+        )
 
     def document(self) -> dict[str, Any]:
         """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
@@ -325,7 +343,7 @@ class Answer:
 
     def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
         """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
-        from disctrack.discrepancy.equations.page import write_answer
+        from disctrack.discrepancy.equations.page import write_answer  # matplotlib is wanted on pages only
 
         paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
         for path in paths:
@@ -346,3 +364,15 @@ def _whiteness(judged: System, system: EquationSystem, fit: Fit) -> float:
             if lags >= FEWEST_LAGS:
                 p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
     return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
+
+
+def _before_after(answer: Answer) -> Listing:
+    rows = []
+    for c in answer.system.formulas.channels:
+        b, a = answer.before[c], answer.after[c]
+        unit = answer.equations.units.get(c, "1")
+        rows.append((in_unit(f"rms of {c}", unit), *(rounded(x, 4) for x in (b.rms, a.rms, a.noise))))
+        rows.append((in_unit(f"free run of {c}, held out", unit), rounded(b.held_out, 4), rounded(a.held_out, 4), ""))
+    memory = f"p {probability(answer.whiteness)}"
+    rows.append(("Ljung-Box: probability of this autocorrelation in white noise", "", memory, ""))
+    return Listing(("", "before", "after", "noise"), rows)

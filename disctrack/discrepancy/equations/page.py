@@ -1,4 +1,4 @@
-"""The answer as a report, and the figures of its page."""
+"""The page of an answer: its report with figures."""
 
 from __future__ import annotations
 
@@ -8,61 +8,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import signal
 
-from disctrack.discrepancy.document import tables
-from disctrack.discrepancy.equations.law import NAME, LearnedForce
-from disctrack.report.blocks import Figures, Items, Listing, Report, Said, Section
+from disctrack.discrepancy.equations.law import LearnedForce
+from disctrack.report.figures import Drawn, panels
 from disctrack.report.html import write_page
-from disctrack.report.numbers import in_unit, probability, rounded
 from disctrack.report.palette import BLUE, MUTED, RED
 
 if TYPE_CHECKING:
     from disctrack.discrepancy.equations.answer import Answer
-    from disctrack.report.figures import Drawn
 
 _MOST_POINTS = 6000  # of a curve: a page shows no more
 _MOST_STRETCHES = 6
-
-
-def report_of(answer: Answer, drawn: tuple[Drawn, ...] = ()) -> Report:
-    """The whole answer, for every writer."""
-    equations = [f"d{k}/dt = {v}" for k, v in answer.equations.rates.items()]
-    return Report(
-        f"{answer.equations.name}: what is missing?",
-        f"Verdict: {answer.verdict}. {answer.sentence}",
-        findings=[Said(f"{note}.") for note in answer.notes],
-        blocks=[
-            Section("Equations", [Items(equations)]),
-            Section("Before and after", [_before_after(answer)]),
-            Section("In pictures", [Figures(drawn)]),
-            *tables(answer.diagnosis, ("state.", f"{NAME}.")),
-        ],
-    )
 
 
 def write_answer(answer: Answer, path: Path) -> list[Path]:
     """Write the page; returns the figures that were written beside it. Raises OutputError."""
     drawn = [_drawn(answer, c, name) for c, name in enumerate(answer.system.formulas.channels)]
     law = [] if answer.law is None else [_law(answer, answer.law)]
-    return write_page(path, report_of(answer, (*law, *drawn)), ("png",))
-
-
-def _before_after(answer: Answer) -> Listing:
-    rows = []
-    for c in answer.system.formulas.channels:
-        b, a = answer.before[c], answer.after[c]
-        unit = answer.equations.units.get(c, "1")
-        rows.append((in_unit(f"rms of {c}", unit), *(rounded(x, 4) for x in (b.rms, a.rms, a.noise))))
-        rows.append((in_unit(f"free run of {c}, held out", unit), rounded(b.held_out, 4), rounded(a.held_out, 4), ""))
-    memory = f"p {probability(answer.whiteness)}"
-    rows.append(("Ljung-Box: probability of this autocorrelation in white noise", "", memory, ""))
-    return Listing(("", "before", "after", "noise"), rows)
+    return write_page(path, answer.report((*law, *drawn)), ("png",))
 
 
 def _law(answer: Answer, law: LearnedForce) -> Drawn:
     """The law that was learned with its band, and what known terms make at the same places."""
     units = answer.equations.units
-    from disctrack.report.figures import Drawn, panels  # matplotlib is wanted on pages only
-
     picture, (axes,) = panels(9, 3.5)
     axes.fill_between(law.variable, law.force - 2 * law.sigma, law.force + 2 * law.sigma, color=BLUE, alpha=0.25, lw=0)
     axes.plot(law.variable, law.force, color=BLUE, lw=1.2, label="learned, 95 %")
@@ -79,8 +46,6 @@ def _law(answer: Answer, law: LearnedForce) -> Drawn:
 
 def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
     """Data and model, and what is left in time and frequency: the first stretches."""
-    from disctrack.report.figures import Drawn, panels
-
     unit = answer.equations.units.get(name, "")
     picture, (top, middle, bottom) = panels(9, 7, 3)
     sides = [answer.predicted(f)[:_MOST_STRETCHES] for f in (answer.diagnosis.before, answer.diagnosis.after)]

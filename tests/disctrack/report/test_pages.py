@@ -109,7 +109,7 @@ def test_a_terminal_gets_ten_lines_the_gravest_first_and_is_told_of_the_rest():
     assert lines[-2].split(maxsplit=1) == ["page", "a page.html"]
     everything = " ".join(" ".join(full(found, 80)).split())
     assert all(f"note {i} word" in everything for i in range(9))
-    again = restored(json.loads(json_text(document(found))))
+    again = restored(json.loads(json_text(document(found))), {})
     assert short(again, 80) == lines
 
 
