@@ -15,10 +15,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from warnings import catch_warnings, simplefilter
 
 from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE, options
 from disctrack.files.software import __version__
 from disctrack.files.text import printable
+from disctrack.findings import DoubtWarning
 
 # The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
 # save. It must stand before numpy is loaded; a user's own setting is kept.
@@ -67,7 +69,8 @@ def _answer(words: Sequence[str], received: Sequence[int]) -> int:
         from disctrack.progress import recorded_times
 
         command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
-        with inputs_kept(), recorded_times():
+        with inputs_kept(), recorded_times(), catch_warnings():
+            simplefilter("ignore", DoubtWarning)  # reports say it
             return int(command.run(arguments))
     except KeyboardInterrupt:
         return _say_interrupted(received)

@@ -1,5 +1,7 @@
 """The errors that disctrack raises on purpose; `cli` alone turns them into a line and an exit code."""
 
+from typing import Any
+
 from calibration.kit.errors import CalibrationError, DiscTrackError, RigFileError
 
 __all__ = [
@@ -33,7 +35,11 @@ class SceneError(DiscTrackError):
 
 
 class TrackingError(DiscTrackError):
-    """The disc cannot be found or followed in the images."""
+    """The disc cannot be found or followed in the images. findings : why, as far as that was seen"""
+
+    def __init__(self, text: str, findings: tuple[Any, ...] = ()) -> None:
+        super().__init__(text)
+        self.findings = findings  # of Finding
 
 
 class OutputError(DiscTrackError):

@@ -80,6 +80,19 @@ class Kind(Enum):
     OTHER = "other"  # of a file that a later version wrote
 
 
+# What else is noticed where two images that are not of one instant, or places that are not the dots', make a pose;
+MISFITS = (
+    Kind.DOTS_MISFIT, Kind.DOTS_SCATTER, Kind.POSES_SCATTER, Kind.CAMERAS_CONTRADICT, Kind.ONE_SIDED,
+    Kind.OFF_THE_TABLE, Kind.TABLE_DISAGREES, Kind.ACCURACY,
+)  # fmt: skip
+# and where the images are not those of the declared cameras at all, so that no pose is right
+NONSENSE = (
+    *MISFITS, Kind.SQUARE, Kind.LENGTHS, Kind.DIAMETER, Kind.RADIUS, Kind.THICKNESS, Kind.GRAVITY_OR_RATE,
+    Kind.REVERSED, Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN, Kind.TABLE_VIEW, Kind.BOARD_THICKNESS, Kind.DELAY,
+    Kind.DROPPED_FRAMES, Kind.CLOCK_JUMP, Kind.CAMERA_MOVED, Kind.FRAMES_LOST, Kind.DISC_NOT_FOUND,
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Number:
     """A value with its standard deviation, where that is known."""
@@ -99,7 +112,7 @@ class Remedy:
     key: str = ""  # as in recording.toml
     fits: str = ""  # what the key would have to be, in its unit
     declared: str = ""
-    action: str = ""
+    action: str = ""  # or a remark on the number
 
     def __str__(self) -> str:
         declared = f" (declared {self.declared})" if self.declared else ""
@@ -152,6 +165,11 @@ class Finding:
         return {**asdict(self), **words, "explains": [kind.value for kind in self.explains]}
 
 
+def of_kind(kind: Kind, severity: Severity, texts: Iterable[str]) -> tuple[Finding, ...]:
+    """Findings of which no more is known than their sentences."""
+    return tuple(Finding(kind, severity, text) for text in texts)
+
+
 def finding_from_json(document: Mapping[str, Any]) -> Finding:
     """The finding that `as_json` wrote; a kind that this version does not know is OTHER."""
     subject = dict(document["subject"])
@@ -200,20 +218,29 @@ def _explains(one: Finding, other: Finding) -> bool:
     return one.kind != other.kind and other.kind in one.explains
 
 
+def leading(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The causes alone, gravest first: one line each."""
+    return tuple(cause.finding for cause in causes(findings))
+
+
+def doubts(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The causes that put a result in doubt."""
+    return tuple(finding for finding in leading(findings) if finding.doubtful)
+
+
 def in_doubt(findings: Iterable[Finding]) -> bool:
     """True where a result with these findings may be wrong by more than its sigmas."""
     return any(finding.doubtful for finding in findings)
 
 
 class DoubtWarning(UserWarning):
-    """A result that may be wrong by more than its sigmas."""
+    """A result that may be wrong by more than its sigmas; for Python, as commands have words of their own."""
 
 
 def warn_of_doubts(findings: Iterable[Finding], stacklevel: int = 3) -> None:
     """A Python warning for each cause that puts the result in doubt."""
-    for cause in causes(findings):
-        if cause.finding.doubtful:
-            warnings.warn(cause.finding.sentence, DoubtWarning, stacklevel=stacklevel)
+    for finding in doubts(findings):
+        warnings.warn(finding.sentence, DoubtWarning, stacklevel=stacklevel)
 
 
 def with_sigma(value: float, sigma: float | None = None, unit: str = "") -> str:

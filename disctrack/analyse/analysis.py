@@ -6,7 +6,6 @@ import numpy as np
 
 from calibration.kit.brief import Brief, Outline
 from disctrack.analyse.contact import Contact, analyse_contact
-from disctrack.analyse.declaration import contradictions
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
 from disctrack.analyse.energy import Energy, analyse_energy
 from disctrack.analyse.power_laws import (
@@ -132,7 +131,7 @@ def _end_of_rolling(motion: MeasuredMotion) -> tuple[float, float]:
 
 def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
     """What an experimenter should know before using the numbers, in plain words."""
-    found = [f"{finding.sentence}." for finding in contradictions(trajectory)]
+    found = []
     asked = trajectory.looked_for
     n, missing, unknown = (int(rows.sum()) for rows in (asked, asked & ~motion.measured, asked & ~motion.known))
     if missing:

@@ -12,14 +12,14 @@ Three laws hold whatever the friction is, and each contains declared numbers:
 A mirrored world obeys all three. It is told by what has a left and a right: dots without an axis of symmetry, which are
 not found in it; and the cameras, of which the left one stands on the left.
 
-A finding names what was seen, what was expected, and the declared numbers that could be wrong, best explanation first.
+A finding names the declared numbers that could be wrong, likeliest first, what was seen, and what was expected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from disctrack.analyse.propagation import state_of
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
+from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject, with_sigma
 from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
@@ -61,41 +62,16 @@ SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
 ALIKE = 0.2  # radii by the rates and by the rim: the balance of moments is not quite in proportion to the radius
 DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
+MOST_HEIGHT = 3e-3  # [m] of the rim's plane from the foot of a board that lies on it, its thickness wrong or not
+OFF = (Kind.TABLE_DISAGREES, Kind.OFF_THE_TABLE)  # a wrong number is seen so
 
 
-@dataclass(frozen=True)
-class Suspect:
-    """A declared number that could be wrong, and what it would have to be."""
+class Boards(NamedTuple):
+    """Where the board was in the calibration's views, as the left camera's axes have it."""
 
-    key: str  # as in recording.toml
-    declared: str
-    would_be: str
-    misfit: float  # how far from an ordinary value that is, natural logarithm; the smaller, the better explained
-
-
-@dataclass(frozen=True)
-class Contradiction:
-    """A contradiction between what was declared and what was seen."""
-
-    check: str  # "gravity and rate", "energy", "scale", "radius", "dot", "board", "handedness", "density"
-    observed: str
-    expected: str
-    suspects: tuple[Suspect, ...]  # best explanation first
-    spoils: bool  # True where numbers of the result are wrong, not only fewer
-
-    @property
-    def sentence(self) -> str:
-        """For a summary."""
-        listed = "; ".join(
-            f"{s.key} = {s.declared} would be {s.would_be}" if s.would_be else f"{s.key} = {s.declared}"
-            for s in self.suspects
-        )
-        told = f"{self.observed}; expected {self.expected}"
-        return f"{told}. Could be wrong, likeliest first: {listed}" if listed else told
-
-    def as_dict(self) -> dict[str, Any]:
-        """Of JSON's types, with the sentence."""
-        return {**asdict(self), "suspects": [asdict(s) for s in self.suspects], "sentence": self.sentence}
+    places: Mapping[int, tuple[Array, Array]]  # number of the view: R_left_board (3, 3), t_left_board (3,) [m]
+    table_view: int | None
+    thickness: float  # [m] of the board on the table
 
 
 @dataclass(frozen=True)
@@ -110,12 +86,12 @@ class Balance:
 
 
 def contradictions(
-    trajectory: Trajectory, declared: Disc | None = None, square: float | None = None
-) -> tuple[Contradiction, ...]:
+    trajectory: Trajectory, declared: Disc | None = None, square: float | None = None, boards: Boards | None = None
+) -> tuple[Finding, ...]:
     """Every check that this trajectory allows.
 
     declared : the disc as declared, before its dots were refined
-    square : [m] of the chessboard as declared, where it is known
+    square : [m] of the chessboard as declared; boards : in the views, where they are at hand
     """
     declared = declared or trajectory.disc
     found = [*density(declared), *scale_of_dots(trajectory, declared, square), *unseen_dots(trajectory, declared)]
@@ -123,44 +99,60 @@ def contradictions(
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, declared)
         # on another plane than the declared one neither heights nor the direction of gravity mean anything
-        found += another_plane(trajectory) or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
+        found += another_plane(trajectory, boards) or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
     return tuple(found)
 
 
-def contradictions_of(recording: Recording, trajectory: Trajectory) -> tuple[Contradiction, ...]:
-    """Every check that a recording and its trajectory allow."""
-    board = recording.chessboard
-    if board is None:
-        return contradictions(trajectory, recording.disc)
-    return (*contradictions(trajectory, recording.disc, board.square), *turned_board(board.inner_corners))
+def contradictions_of(
+    recording: Recording, trajectory: Trajectory, noticed: Iterable[Finding] = (), boards: Boards | None = None
+) -> tuple[Finding, ...]:
+    """Every check that a recording and its trajectory allow. noticed : by the tracking;  boards : in the views"""
+    board, table = recording.chessboard, recording.table
+    found = contradictions(trajectory, recording.disc, None if board is None else board.square, boards)
+    if table is not None and all(finding.kind != Kind.TABLE_VIEW for finding in found):
+        found += thickness(recording.disc, table.board_thickness, noticed)
+    return found if board is None else (*found, *turned_board(board.inner_corners))
 
 
-def told(findings: Mapping[str, Any], found: Sequence[Contradiction]) -> dict[str, Any]:
-    """The findings of a run with these before its warnings; what spoils the result is in doubt, too (exit code 3)."""
-    sentences = [finding.sentence for finding in found]
-    doubts = [finding.sentence for finding in found if finding.spoils]
-    return {
-        **findings,
-        "declaration": [finding.as_dict() for finding in found],
-        "warnings": [*sentences, *findings.get("warnings", [])],
-        "doubts": [*doubts, *findings.get("doubts", [])],
-    }
+def thickness(disc: Disc, board: float, noticed: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Thickness of the board, or of the disc, that puts the rim on the table. board : [m] as declared"""
+    height = next((f.numbers["height"].value for f in noticed if f.doubtful and f.kind in OFF), None)
+    if height is None:
+        return ()
+    fits, whole = board - 1e-6 * height, 2 * disc.half_thickness
+    likely: list[tuple[float, Kind, Remedy]] = []
+    if fits > 0:
+        # nobody measures a thickness of nothing: it was forgotten
+        misfit = abs(float(np.log(fits / board))) if board else 0.0
+        remedy = Remedy("[table] board_thickness_mm", f"{1e3 * fits:.2f}", f"{1e3 * board:g}")
+        likely.append((misfit, Kind.BOARD_THICKNESS, remedy))
+    if (other := whole + 1e-6 * height) > 0:
+        remedy = Remedy("[disc] thickness_mm", f"{1e3 * other:.2f}", f"{1e3 * whole:g}")
+        likely.append((abs(float(np.log(other / whole))), Kind.THICKNESS, remedy))
+    if not likely:
+        return ()
+    likely.sort(key=lambda one: one[0])
+    text = f"the disc's rim rolls {1e-3 * height:+.2f} mm from the table that the board gives"
+    remedies = tuple(remedy for *_, remedy in likely)
+    return (Finding(likely[0][1], Severity.DOUBT, text, remedies=remedies, explains=OFF),)
 
 
-def lost_pairs(trajectory: Trajectory) -> Iterator[Contradiction]:
+def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
     """Pairs that both cameras lost while the files were numbered on."""
     for jump in clock_jumps(trajectory):
         frame = int(trajectory.frame[jump.row])
-        yield Contradiction(
-            "clock",
+        yield Finding(
+            Kind.CLOCK_JUMP,
+            Severity.DOUBT,
             f"frame {frame}: {jump.words}; all later times are wrong",
-            "frames that follow each other at the declared rate",
-            (Suspect("numbers of the files", f"{frame} and on", f"higher by {jump.frames}", 0.0),),
-            spoils=True,
+            Subject(frames=((frame, frame),)),
+            {"pairs": Number(jump.frames)},
+            (Remedy(action=f"number the files from {frame} on higher by {jump.frames}"),),
+            (Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER),
         )
 
 
-def motion_against_gravity(trajectory: Trajectory) -> tuple[Contradiction, ...]:
+def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     """Gravity and frame rate, and an energy that grows, on some stretches of the recording."""
     seen = balance(trajectory)
     g = trajectory.gravity
@@ -168,73 +160,68 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Contradiction, ...]:
         return ()
     ratio = seen.gravity / g
     if abs(np.log(ratio)) > np.log1p(BALANCE) and abs(seen.gravity - g) > SIGMAS * seen.sigma:
-        return (
-            Contradiction(
-                "gravity and rate",
-                f"the motion satisfies the balance of moments with a gravity of {seen.gravity:.4g} +- {seen.sigma:.1g} "
-                f"m/s^2 ({seen.n_blocks} stretches of {BLOCK} frames)",
-                f"{g:.4g} m/s^2 at {trajectory.frame_rate:g} frames a second, nothing but the table touching the disc",
-                _of_gravity(trajectory, ratio),
-                spoils=True,
-            ),
+        text = (
+            f"the motion satisfies the balance of moments with a gravity of {with_sigma(seen.gravity, seen.sigma)} "
+            f"m/s^2 ({seen.n_blocks} stretches of {BLOCK} frames); expected {g:.4g} m/s^2 at {trajectory.frame_rate:g} "
+            "frames a second, nothing but the table touching the disc"
         )
+        found = {"gravity": Number(seen.gravity, "m/s^2", seen.sigma)}
+        remedies, kind = _of_gravity(trajectory, ratio), Kind.GRAVITY_OR_RATE
+        return (Finding(kind, Severity.DOUBT, text, numbers=found, remedies=remedies, explains=(Kind.REVERSED,)),)
     times = np.arange(seen.n_blocks)
     slope, start = np.polyfit(times, seen.energy, 1)
     sigma = _robust(seen.energy - slope * times - start) / (np.std(times) * np.sqrt(len(times)))
     end = start + slope * times[-1]
     steady = np.mean(np.diff(seen.energy) > 0) > STEADY
     if end - start > GROWTH * start and slope > SIGMAS * sigma and steady:
-        return (
-            Contradiction(
-                "energy",
-                f"the mechanical energy grows from {1e3 * start:.4g} to {1e3 * end:.4g} mJ though no force but the "
-                "table's acts",
-                "a loss: the frames may be in reverse order",
-                (Suspect("[cameras] left, right", "the order of the files", "reversed", 0.0),),
-                spoils=True,
-            ),
+        text = (
+            f"the mechanical energy grows from {1e3 * start:.4g} to {1e3 * end:.4g} mJ though no force but the table's "
+            "acts; expected a loss"
         )
+        remedy = Remedy("[cameras] left, right", action="give the files in the order of time")
+        return (Finding(Kind.REVERSED, Severity.DOUBT, text, remedies=(remedy,)),)
     return ()
 
 
-def _of_gravity(trajectory: Trajectory, ratio: float) -> tuple[Suspect, ...]:
+def _of_gravity(trajectory: Trajectory, ratio: float) -> tuple[Remedy, ...]:
     """Which declared number would explain that the balance holds with `ratio` times the declared gravity."""
     g, rate = trajectory.gravity, trajectory.frame_rate
     true_rate = rate / np.sqrt(ratio)
     departures = np.abs(np.log(true_rate / USUAL_RATES))
     nearest = int(np.argmin(departures))
-    usual = f" ({USUAL_RATES[nearest]:g} is usual)" if departures[nearest] < 0.05 else ""
-    unit = ", if it was given in mm/s^2" if abs(np.log(1e3 * ratio)) < 0.1 else ""
-    found = (
-        Suspect("[gravity] g_m_s2", f"{g:g}", f"{g * ratio:.4g}{unit}", abs(np.log(g * ratio / STANDARD_GRAVITY))),
-        Suspect("[cameras] frame_rate_hz", f"{rate:g}", f"{true_rate:.4g}{usual}", float(departures[nearest])),
+    usual = f"{USUAL_RATES[nearest]:g} is usual" if departures[nearest] < 0.05 else ""
+    unit = "if it was given in mm/s^2" if abs(np.log(1e3 * ratio)) < 0.1 else ""
+    # how far from an ordinary value each would be, natural logarithm: the nearest is the likeliest
+    found = [
+        (abs(np.log(g * ratio / STANDARD_GRAVITY)), Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)),
+        (departures[nearest], Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", usual)),
         _radius_suspected(trajectory, ratio),
-    )
-    return tuple(sorted(found, key=lambda s: s.misfit))
+    ]
+    return tuple(remedy for _, remedy in sorted(found, key=lambda one: one[0]))
 
 
-def _radius_suspected(trajectory: Trajectory, ratio: float) -> Suspect:
+def _radius_suspected(trajectory: Trajectory, ratio: float) -> tuple[float, Remedy]:
     """First of all where the rim is on the table with about the radius that the rates ask for."""
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
     disc, would_be, misfit = trajectory.disc, trajectory.disc.radius / ratio, abs(float(np.log(ratio)))
     by_rim = float(np.median((z - disc.half_thickness * np.abs(np.cos(theta))) / np.sin(theta)))
     if trajectory.rig.world_is_table and by_rim > 0 and abs(np.log(by_rim / would_be)) < min(ALIKE, 0.5 * misfit):
         would_be, misfit = by_rim, 0.0
-    return Suspect("[disc] radius_mm", f"{1e3 * disc.radius:g}", f"{1e3 * would_be:.4g}", misfit)
+    return misfit, Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
 
 
-def density(disc: Disc) -> tuple[Contradiction, ...]:
+def density(disc: Disc) -> tuple[Finding, ...]:
     """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in another unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
     if DENSITIES[0] < found < DENSITIES[1]:
         return ()
-    suspects = (
-        Suspect("[disc] mass_g", f"{1e3 * disc.mass:g}", "", 0.0),
-        Suspect("[disc] radius_mm", f"{1e3 * disc.radius:g}", "", 0.0),
-        Suspect("[disc] thickness_mm", f"{2e3 * disc.half_thickness:g}", "", 0.0),
+    sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
+    remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
+    text = (
+        f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm^3; expected 0.05 (foam) to 23 "
+        "(osmium)"
     )
-    seen = f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm^3"
-    return (Contradiction("density", seen, "0.05 (foam) to 23 (osmium)", suspects, spoils=False),)
+    return (Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies),)
 
 
 def balance(trajectory: Trajectory) -> Balance:
@@ -305,7 +292,7 @@ def _robust(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def another_plane(trajectory: Trajectory) -> tuple[Contradiction, ...]:
+def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple[Finding, ...]:
     """Whether the rim rolls on a plane far from z = 0: the board of the table view did not lie on the table."""
     rows, disc = trajectory.measured, trajectory.disc
     centre, e3 = trajectory.q[rows, :3], rotation_from_quaternion(trajectory.quaternion[rows])[:, :, 2]
@@ -327,12 +314,34 @@ def another_plane(trajectory: Trajectory) -> tuple[Contradiction, ...]:
     rolls = precessed > MIN_ROUND and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
     if not (rolls and turned > MIN_LEAN and _robust(gap) < FLAT * disc.radius * turned):
         return ()
-    suspect = Suspect("[table] view", "as declared", "that in which the board lies flat on the table", 0.0)
-    seen = f"the rim rolls on a plane that is turned by {np.degrees(turned):.1f} deg from the table's"
-    return (Contradiction("table view", seen, "the plane under the board of the table view", (suspect,), spoils=True),)
+    lies = None if boards is None else _view_on_plane(trajectory.rig, boards, normal, middle)
+    declared = None if boards is None else boards.table_view
+    named = "the table view" if declared is None else f"view {declared}"
+    does = "" if lies is None else f"; view {lies} does"
+    text = (
+        f"{named} does not lie on the table{does}: the rim rolls on a plane that is turned by "
+        f"{np.degrees(turned):.1f} deg from that of its board"
+    )
+    action = "name the view in which the board lies flat on the table" if lies is None else ""
+    told = ["" if view is None else str(view) for view in (lies, declared)]
+    remedy = Remedy("[table] view", told[0], told[1], action)
+    of = Subject(view=declared)
+    return (Finding(Kind.TABLE_VIEW, Severity.DOUBT, text, of, remedies=(remedy,), explains=OFF),)
 
 
-def rise_of_centre(trajectory: Trajectory) -> tuple[Contradiction, ...]:
+def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array) -> int | None:
+    """The view whose board lies on the plane in the world; None where none does."""
+    found = []
+    for view, (R_left_board, t_left_board) in boards.places.items():
+        axis = rig.R_left_world.T @ R_left_board[:, 2]
+        corner = rig.R_left_world.T @ (t_left_board - rig.t_left_world)
+        height = abs(float((corner - middle) @ normal) - boards.thickness)
+        found.append((float(np.arccos(min(abs(float(axis @ normal)), 1.0))), height, view))
+    lean, height, view = min(found, default=(np.inf, np.inf, 0))
+    return view if lean < MIN_LEAN and height < MOST_HEIGHT else None
+
+
+def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     """The radius from height against sin(theta), where the nutation varies enough."""
     q = trajectory.q[trajectory.measured]
     theta, disc = q[:, 4], trajectory.disc
@@ -350,15 +359,16 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Contradiction, ...]:
     ratio = float(slope / disc.radius)
     if not (abs(ratio - 1) > RISE and abs(slope - disc.radius) > SIGMAS * sigma and scatter < RISE * disc.radius):
         return ()
-    suspects = (
-        Suspect("[disc] radius_mm", f"{1e3 * disc.radius:g}", f"{1e3 * slope:.4g}", abs(np.log(abs(ratio)))),
-        Suspect("[calibration] square_mm", "as declared", f"{1 / ratio:.4g} times that", 2 * abs(np.log(abs(ratio)))),
+    remedies = (
+        Remedy("[disc] radius_mm", f"{1e3 * slope:.4g}", f"{1e3 * disc.radius:g}"),
+        Remedy("[calibration] square_mm", action=f"times {1 / ratio:.4g}"),
     )
-    seen = f"the centre rises by {1e3 * slope:.2f} +- {1e3 * sigma:.2f} mm per unit of sin(theta)"
-    return (Contradiction("radius", seen, f"the radius, {1e3 * disc.radius:.2f} mm", suspects, spoils=True),)
+    rise = Number(1e3 * float(slope), "mm", 1e3 * float(sigma))
+    text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
+    return (Finding(Kind.RADIUS, Severity.DOUBT, text, numbers={"rise": rise}, remedies=remedies, explains=OFF),)
 
 
-def handedness(rig: StereoRig, disc: Disc) -> tuple[Contradiction, ...]:
+def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     """Whether the left camera stands on the left as both look at the table, where the dots do not tell left from right.
 
     In a mirrored world it stands on the right. No verdict where the cameras stand one behind the other, or face each
@@ -372,22 +382,19 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Contradiction, ...]:
     along = baseline @ to_the_right / max(float(np.linalg.norm(baseline) * np.linalg.norm(to_the_right)), 1e-12)
     if along > -SIDEWAYS or np.linalg.norm(to_the_right) < SIDEWAYS:
         return ()
-    suspects = (
-        Suspect("[cameras] left, right (and [calibration])", "so named", "exchanged, and all is well", 0.0),
-        Suspect("[cameras] left, right (and [calibration])", "as stored", "mirrored: then psi and phi turn round", 0.0),
+    cameras = "[cameras] left, right (and [calibration])"
+    remedies = (
+        Remedy(cameras, action="exchanged if they are named wrongly: all is well then"),
+        Remedy(cameras, action="mirrored if they were stored so: psi and phi turn round"),
     )
-    return (
-        Contradiction(
-            "handedness",
-            f"the left camera stands {1e3 * rig.baseline:.0f} mm to the right of the right one, as they look at it",
-            "the left camera on the left; the dots do not tell, as their layout looks the same in a mirror",
-            suspects,
-            spoils=True,
-        ),
+    text = (
+        f"the left camera stands {1e3 * rig.baseline:.0f} mm to the right of the right one, as they look at it; "
+        "expected on the left. The dots do not tell, as their layout looks the same in a mirror"
     )
+    return (Finding(Kind.HANDEDNESS, Severity.DOUBT, text, remedies=remedies),)
 
 
-def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Contradiction, ...]:
+def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
     """Distances of the dots, by both cameras alone, over those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 50)).astype(int)] if len(rows) else rows
@@ -411,18 +418,20 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     if not (abs(scale - 1) > SCALE and abs(scale - 1) > SIGMAS * sigma):
         return ()
     off = abs(float(np.log(scale)))
-    board = Suspect("[calibration] square_mm", "as declared", f"{1 / scale:.4f} times that", off)
+    board = off, Remedy("[calibration] square_mm", action=f"times {1 / scale:.4f}")
     if square is not None:
         side = 1e3 * square / scale
         usual = abs(float(np.log(side / (max(round(2 * side), 1) / 2))))  # boards have squares of whole or half mm
-        board = Suspect("[calibration] square_mm", f"{1e3 * square:g}", f"{side:.4g}", min(usual, off))
-    dots_off = Suspect("[markers] centres_mm", "as declared", f"{scale:.4f} times those", off)
-    suspects = tuple(sorted((board, dots_off), key=lambda s: s.misfit))
-    seen_text = f"by both cameras the dots are {scale:.4f} +- {max(sigma, 1e-4):.1g} times as far apart as declared"
-    return (Contradiction("scale", seen_text, "1 (chessboard and dots on one scale)", suspects, spoils=True),)
+        board = min(usual, off), Remedy("[calibration] square_mm", f"{side:.2f}", f"{1e3 * square:g}")
+    dots_off = off, Remedy("[markers] centres_mm", action=f"times {scale:.4f}")
+    remedies = tuple(remedy for _, remedy in sorted((board, dots_off), key=lambda one: one[0]))
+    found = Number(scale, "", max(sigma, 1e-4))
+    text = f"by both cameras the dots are {found} times as far apart as declared"
+    explains = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.GRAVITY_OR_RATE, *MISFITS)
+    return (Finding(Kind.SQUARE, Severity.DOUBT, text, Subject(), {"scale": found}, remedies, explains),)
 
 
-def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Contradiction, ...]:
+def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
     """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
     status = trajectory.marker_status[trajectory.measured]
     if not len(status):
@@ -436,29 +445,21 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Contradiction, 
         kinds, counts = np.unique(status[:, :, dot], return_counts=True)
         reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")
         x, y = 1e3 * declared.marker_centres_body[dot, :2]
-        found.append(
-            Contradiction(
-                "dot",
-                f"dot {dot} of [markers] centres_mm is measured in {100 * share[dot]:.0f} % of the images ({reason})",
-                "a dot there, as round and dark as the others (numbers count from 0)",
-                (Suspect(f"[markers] centres_mm, entry {dot}", f"[{x:g}, {y:g}]", "", 0.0),),
-                spoils=spoils,
-            )
+        text = (
+            f"dot {dot} of [markers] centres_mm is measured in {100 * share[dot]:.0f} % of the images ({reason}); "
+            "expected a dot there, as round and dark as the others (numbers count from 0)"
         )
+        severity = Severity.DOUBT if spoils else Severity.WARNING
+        remedy = Remedy(f"[markers] centres_mm, entry {dot}", declared=f"[{x:g}, {y:g}]")
+        found.append(Finding(Kind.DOT_UNSEEN, severity, text, Subject(dot=int(dot)), remedies=(remedy,)))
     return tuple(found)
 
 
-def turned_board(inner_corners: Sequence[int]) -> tuple[Contradiction, ...]:
+def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
     """Corners counted along the short side first turn the axes of the table by 90 deg."""
     first, second = inner_corners
     if first >= second:
         return ()
-    return (
-        Contradiction(
-            "board",
-            f"inner_corners = [{first}, {second}] counts along the short side first: x runs along the short side",
-            "the long side first, so that x runs along it",
-            (Suspect("[calibration] inner_corners", f"[{first}, {second}]", f"[{second}, {first}]", 0.0),),
-            spoils=True,
-        ),
-    )
+    remedy = Remedy("[calibration] inner_corners", f"[{second}, {first}]", f"[{first}, {second}]")
+    text = "corners are counted along the short side first, so that x runs along it; expected the long side first"
+    return (Finding(Kind.CORNERS, Severity.DOUBT, text, remedies=(remedy,)),)

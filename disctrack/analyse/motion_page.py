@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.whole import write_whole
+from disctrack.findings import doubts
 from disctrack.report.blocks import Markup, Report, Text
 from disctrack.report.html import page
 from disctrack.report.palette import RED
@@ -64,7 +65,9 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
         "part to zoom, double click for the whole.</p></section>"
         f'<script type="application/json" id="motion-data">{data}</script><script>{script}</script>'
     )
-    report = Report(f"{name}: the motion", "", _said(analysis), blocks=[Text(body)])
+    report = Report(
+        f"{name}: the motion", "", _said(analysis), doubts(analysis.trajectory.findings), blocks=[Text(body)]
+    )
     return page(report, {}, head=f"<style>{_STYLE}</style>")
 
 

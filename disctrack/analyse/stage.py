@@ -15,6 +15,7 @@ from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
+from disctrack.findings import doubts
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
@@ -65,7 +66,7 @@ def run_analyse(
         raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
     page = folder / "report.html"
-    summary = report_of(analysis, provenance, (), all_figures(analysis), (page, path))
+    summary = report_of(analysis, provenance, doubts(trajectory.findings), all_figures(analysis), (page, path))
     written = write_page(page, summary, ("png", "pdf") if figures else ())
     return AnalyseOutcome(analysis, path, page, tuple(written), summary)
 

@@ -20,6 +20,8 @@ COLUMNS: dict[str, str] = {
     "repeats": "what recordings that repeat one experiment have in common: case, surface and disc as declared",
     "status": "measured, skipped (done already), failed, or not measured",
     "reason": "why it failed, or what is missing although it was measured",
+    "severity": "of the gravest finding: note, warning, or doubt, where numbers may be wrong beyond their sigmas",
+    "finding": "its kind",
     "pairs": "image pairs that were to be measured, without the rest before and after the motion",
     "pairs_measured": "pairs with a pose",
     "duration_s": "from the first of them to the last",

@@ -7,12 +7,10 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from calibration.cameras.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
-from disctrack.analyse.declaration import contradictions_of, told
 from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.batch.columns import Row
 from disctrack.batch.locks import Busy, locked
@@ -33,9 +31,11 @@ from disctrack.batch.records import (
     write_record,
 )
 from disctrack.batch.repeats import group_of
-from disctrack.calibrate.stage import calibrate_into, is_rig_of, source_of
+from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
+from disctrack.diagnosis.stage import first_to_mend
 from disctrack.errors import AnalysisError, DiscTrackError, OutputError
 from disctrack.files.whole import write_whole
+from disctrack.findings import Kind, leading
 from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.measurement import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
@@ -103,13 +103,13 @@ def _make_recording(job: Job, results: Path, progress: Progress) -> Result:
         record = read_record(results)
         if record is not None and record.fingerprint == provenance.fingerprint and is_done(results, record, asked):
             return Result(SKIPPED, record)
-        trajectory, findings = storage.read_trajectory(path), storage.read_findings(path)
+        trajectory = storage.read_trajectory(path)
     else:
         with recorded_times() as tracking, timed("track"):
-            trajectory, findings, provenance = _track(path, recording, rig, pairs, job, progress)
+            trajectory, provenance = _track(path, recording, rig, pairs, job, progress)
     progress(_TRACKED)
     with recorded_times() as times:
-        record = _after_tracking(results, path, trajectory, findings, provenance, job, asked)
+        record = _after_tracking(results, path, trajectory, provenance, job, asked)
     numbers = record.numbers | _origin(recording, provenance)
     numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
     numbers |= {"processor_seconds": round(time.process_time() - used, 3)}
@@ -136,7 +136,7 @@ def _reusable(path: Path, recording: Recording, rig: StereoRig, pairs: ImagePair
 
 def _track(
     path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs, job: Job, progress: Progress
-) -> tuple[Trajectory, dict[str, Any], Provenance]:
+) -> tuple[Trajectory, Provenance]:
     done = 0  # read and added to by several threads: a lost update spoils the bar for a moment, no more
 
     def advance(n: int) -> None:
@@ -144,25 +144,26 @@ def _track(
         done += n
         progress(_TRACKED * done / len(pairs))
 
-    measurement = measure(recording, rig, pairs, threads=job.threads, progress=advance)
+    boards = boards_in(Path(job.rig), recording)
+    found = measure(recording, rig, pairs, threads=job.threads, progress=advance, boards=boards)
     provenance = trajectory_provenance(recording, rig, pairs, None)
-    findings = told(measurement.findings, contradictions_of(recording, measurement.trajectory))
-    storage.write_trajectory(path, measurement.trajectory, provenance, overwrite=True, findings=findings)
-    return measurement.trajectory, findings, provenance
+    storage.write_trajectory(path, found.trajectory, provenance, overwrite=True, details=found.details)
+    return found.trajectory, provenance
 
 
 def _after_tracking(
     results: Path,
     path: Path,
     trajectory: Trajectory,
-    findings: dict[str, Any],
     provenance: Provenance,
     job: Job,
     asked: Stages,
 ) -> Record:
     """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
     files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
-    missing = _shortcomings(findings)
+    noticed = leading(trajectory.findings)
+    missing = [f.sentence for f in noticed if f.doubtful or f.kind == Kind.UNREADABLE]
+    numbers |= {"severity": noticed[0].severity.name.lower(), "finding": noticed[0].kind.value} if noticed else {}
     try:
         with timed("analyse"):
             analysis, report = _analyse(path, trajectory, job)
@@ -172,7 +173,10 @@ def _after_tracking(
         missing.append(f"not analysed: {reason_of(error)}")
     numbers |= friction_numbers(trajectory)
     if job.options.diagnose:
+        wrong = first_to_mend(trajectory.findings)
         try:
+            if wrong:
+                raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
             with timed("diagnose"):
                 page, document = _diagnose(path)
             numbers |= diagnosed_numbers(document)
@@ -180,12 +184,6 @@ def _after_tracking(
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
     return Record(MEASURED, "; ".join(missing), provenance.fingerprint, asked, files, numbers)
-
-
-def _shortcomings(findings: dict[str, Any]) -> list[str]:
-    reasons = findings.get("unreadable", [])
-    unreadable = [f"{len(reasons)} images could not be read, the first: {reasons[0]}"] if reasons else []
-    return [*unreadable, *findings.get("doubts", [])]
 
 
 def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Path | None]:

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from calibration.board import corner_fit
 from calibration.board.search import Progress
 from calibration.board.target import Board, Target
 from calibration.fit import normal_equations
-from calibration.rig_file import read_rig, write_rig
+from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
+from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
@@ -96,6 +98,24 @@ def calibrate_recording(
 
 def _calibrated(s: CalibrationSource, progress: Progress | None) -> tuple[StereoCalibration, tuple[str, ...]]:
     return calibrate_views(s.views, s.board, s.table_view, s.board_thickness, s.settings, progress)
+
+
+def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
+    """Where the board was in the views of a rig file; None where that does not say. Raises RigFileError."""
+    record = read_rig_file(rig_file).record
+    if record is None:
+        return None
+    return boards_of(record, None if recording.views is None else declared_views(recording, recording.views))
+
+
+def boards_of(record: CalibrationRecord, views: TargetImages | None, numbers: Sequence[int] = ()) -> Boards:
+    """Where the board was in views; their numbers count those, too, that could not be read. numbers : of `views`"""
+    known = {} if views is None else {str(view): i for i, view in enumerate(views.left)}
+    found = [known.get(left, i) for i, (left, _) in enumerate(record.view_names)]
+    found = [numbers[i] for i in found] if numbers else found
+    places = dict(zip(found, zip(record.R_left_board, record.t_left_board, strict=True), strict=False))
+    view = None if record.table_view is None else found[record.table_view]
+    return Boards(places, view, record.board_thickness)
 
 
 def given_rig(file: Path) -> CalibrationResult:

@@ -5,7 +5,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoRig
-from disctrack.analyse.declaration import contradictions_of, told
+from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.errors import OutputError, RecordingError, TrajectoryFileError
 from disctrack.files.json_text import json_file, json_text
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import write_whole
+from disctrack.findings import Finding, Kind, in_doubt
 from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
@@ -71,38 +72,38 @@ def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
 
 
 def track_into(
-    path: Path, recording: Recording, rig: StereoRig, rig_name: str, pairs: ImagePairs, options: TrackOptions
-) -> tuple[list[str], list[Path], list[str]]:
+    path: Path, recording: Recording, rig: StereoRig, rig_file: Path, pairs: ImagePairs, options: TrackOptions
+) -> tuple[list[str], list[Path], tuple[Finding, ...]]:
     """Track, or reuse what is there; write trajectory, table, pictures, video.
 
-    returns : lines of the summary, files, and what of the input could not be used, or had to be assumed
+    returns : lines of the summary, files, and what was noticed
     Raises OutputError if `path` holds something else and may not be replaced.
     """
-    check_rig(rig, pairs, rig_name)
+    check_rig(rig, pairs, str(rig_file))
     lines = [f"{'recording':<13} {recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz"]
-    trajectory, findings = None, {}
+    trajectory, details = None, {}
     if path.exists() and not options.overwrite:
         if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, options.settings)):
             raise OutputError(
                 f"{path}: exists, and is not the complete result of these images, settings and version"
                 f"{_why(path, recording)}. Keep it and choose another place with -o, or replace it with --overwrite."
             )
-        trajectory, findings = storage.read_trajectory(path), storage.read_findings(path)
+        trajectory, details = storage.read_trajectory(path), storage.read_details(path)
         lines.append(f"{'reused':<13} {path}: complete result of the same images, settings and version")
     if trajectory is None:
         with progress_bar("track", len(pairs), "pair") as advance:
-            measurement = measure(recording, rig, pairs, options.settings, options.threads, advance)
-        trajectory = measurement.trajectory
-        findings = told(measurement.findings, contradictions_of(recording, trajectory))
+            boards = boards_in(rig_file, recording)
+            measurement = measure(recording, rig, pairs, options.settings, options.threads, advance, boards)
+        trajectory, details = measurement.trajectory, measurement.details
         provenance = trajectory_provenance(recording, rig, pairs, options.settings)
-        storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, findings=findings)
+        storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, details=details)
         lines.append(summary.speed_line(len(pairs), measurement.seconds))
         fresh = True
     else:
         fresh = False
-    lines += summary.trajectory_lines(trajectory, findings)
+    lines += summary.trajectory_lines(trajectory, details)
     files = [path, *_companions(path, trajectory, pairs, options, fresh)]
-    return lines, files, shortcomings(findings)
+    return lines, files, trajectory.findings
 
 
 def _why(path: Path, recording: Recording) -> str:
@@ -135,19 +136,27 @@ def tell_stale(trajectory: Path) -> None:
         )
 
 
-def shortcomings(findings: Mapping[str, Any]) -> list[str]:
-    """What makes a result incomplete (exit code 3): images that could not be read, what had to be assumed."""
-    unreadable, doubts = len(findings.get("unreadable", [])), len(findings.get("doubts", []))
-    return [
-        *([f"{unreadable} image(s) could not be read; their frames rest on one camera or none"] if unreadable else []),
-        *([f"{doubts} warning(s) put the result in doubt"] if doubts else []),
-    ]
+def exit_code(findings: Iterable[Finding]) -> int:
+    """INCOMPLETE where images could not be read, or the result is in doubt; said on stderr."""
+    spoilt = [finding for finding in findings if finding.doubtful or finding.kind == Kind.UNREADABLE]
+    if not spoilt:
+        return DONE
+    said = "the result is in doubt" if in_doubt(spoilt) else "some images could not be read"
+    print(f"disctrack: {said} (see above).", file=sys.stderr)
+    return INCOMPLETE
 
 
-def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> int:
-    """Show a report as the options ask for it; returns the exit code of what is complete.
+def tell(
+    report: Report,
+    arguments: argparse.Namespace,
+    folder: Path,
+    findings: Iterable[Finding] = (),
+    *,
+    reused: bool = False,
+) -> int:
+    """Show a report as the options ask for it; returns the exit code.
 
-    folder : where all of the report lies as summary.txt, if it does
+    folder : where all of the report lies as summary.txt, if it does;  findings : of the measurement
     """
     if arguments.json:
         print(json_text(document(report), indent=1))
@@ -162,7 +171,7 @@ def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused:
         else:
             shown = replace(report, findings=[*report.findings, *said], files=files, page=page)
             show(shown, verbose=arguments.verbose)
-    return DONE
+    return exit_code(f for f in findings if f.doubtful)
 
 
 def link_pages_of(trajectory: Path) -> None:
@@ -175,13 +184,6 @@ def link_pages_of(trajectory: Path) -> None:
         "diagnosis": folder / f"{stem}_diagnosis" / "diagnosis.html",
         "video": folder / "overlay.mp4",
     })  # fmt: skip
-
-
-def tell_shortcomings(found: Sequence[str]) -> int:
-    """Say on stderr what makes the result incomplete; returns the exit code."""
-    if found:
-        print(f"disctrack: {'; '.join(found)} (see above).", file=sys.stderr)
-    return INCOMPLETE if found else DONE
 
 
 def _companions(

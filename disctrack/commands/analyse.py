@@ -15,7 +15,7 @@ from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
 from disctrack.track.measurement import open_pairs
 from disctrack.track.video_overlay import draw_pair
-from disctrack.trajectory.file import read_provenance, trajectory_in
+from disctrack.trajectory.file import read_findings, read_provenance, trajectory_in
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     page = folder / "motion.html"
     asked = [page, *([folder / "figures"] if arguments.figures else [])]
     if known is not None and not arguments.overwrite and all(place.exists() for place in asked):
-        return outputs.tell(known, arguments, folder, reused=True)
+        return outputs.tell(known, arguments, folder, read_findings(path), reused=True)
     with stage("analyse"):
         outcome = run_analyse(
             path,
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = replace(outcome.summary, files=files, then=f"disctrack diagnose {outputs.relative(path)}")
     remember(folder, origin, report, (outcome.report, page, *outcome.figures))
     outputs.link_pages_of(path)
-    return outputs.tell(report, arguments, folder)
+    return outputs.tell(report, arguments, folder, outcome.analysis.trajectory.findings)
 
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:

@@ -2,17 +2,21 @@
 
 import argparse
 import contextlib
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+from disctrack.commands import INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
+from disctrack.diagnosis.stage import first_to_mend
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
 from disctrack.progress import compiling, stage, steps
 from disctrack.recording.readers.blocks import default_threads
+from disctrack.report.blocks import Report
 from disctrack.rolling import _assembly as assembly
-from disctrack.trajectory.file import trajectory_in
+from disctrack.trajectory.file import read_findings, trajectory_in
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
 
@@ -24,13 +28,19 @@ def run(arguments: argparse.Namespace) -> int:
     path = paths[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     outputs.tell_stale(path)
+    findings = read_findings(path)
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
     origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))
     known = reusable(folder, origin)
     more = arguments.figures and not (folder / "figures").is_dir()
     if known is not None and not (arguments.overwrite or more):
-        return outputs.tell(known, arguments, folder, reused=True)
+        return outputs.tell(known, arguments, folder, findings, reused=True)
+    wrong = first_to_mend(findings)
+    if wrong and not arguments.anyway:
+        said = "Not diagnosed: a number is declared wrong, and a missing effect would be read into it."
+        then = f"mend it and run again; or `disctrack diagnose {outputs.relative(path)} --anyway`"
+        return outputs.tell(Report("", said, findings=wrong, then=then), arguments, folder, findings)
     with compiling("the simulation of motions", 30):
         assembly.prepare()
     with stage("diagnose"):
@@ -47,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = replace(outcome.summary, files=files, then=then if outcome.result.has_more else "")
     remember(folder, origin, report, outcome.files)
     outputs.link_pages_of(path)
-    return outputs.tell(report, arguments, folder)
+    return outputs.tell(report, arguments, folder, findings)
 
 
 def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
@@ -68,6 +78,7 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
             processes=arguments.jobs or default_threads(),
             progress=step,
         )
-    outputs.tell(outcome.summary, arguments, outcome.files[0].parent)
-    unusable = [f"{len(outcome.unusable)} recording(s) could not be used"] if outcome.unusable else []
-    return outputs.tell_shortcomings(unusable)
+    code = outputs.tell(outcome.summary, arguments, outcome.files[0].parent)
+    if outcome.unusable:
+        print(f"disctrack: {len(outcome.unusable)} recording(s) could not be used (see above).", file=sys.stderr)
+    return INCOMPLETE if outcome.unusable else code

@@ -143,6 +143,7 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plan", action="store_true", help=plan)
     jobs = "processes for several files (default: cores)"
     parser.add_argument("-j", "--jobs", type=_positive, metavar="N", help=jobs)
+    parser.add_argument("--anyway", action="store_true", help="even where a number is declared wrong")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier diagnosis")
 
 

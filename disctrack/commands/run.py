@@ -21,17 +21,17 @@ def run(arguments: argparse.Namespace) -> int:
         refuse_input(folder / name)
     outputs.check_writable(folder)
     if recording.rig_file is not None:
-        rig_name = str(recording.rig_file)
-        calibrated = given_rig(recording.rig_file)
+        rig_file = recording.rig_file
+        calibrated = given_rig(rig_file)
     else:
-        rig_name = "the rig from this recording's own calibration views"
+        rig_file = folder / "rig.h5"
         source = source_of(recording, outputs.calibration_settings(arguments))
-        calibrated = calibrate_into(folder / "rig.h5", source, options.overwrite, options.figures)
-    lines, files, shortcomings = outputs.track_into(
-        folder / "trajectory.h5", recording, calibrated.rig, rig_name, pairs, options
+        calibrated = calibrate_into(rig_file, source, options.overwrite, options.figures)
+    lines, files, findings = outputs.track_into(
+        folder / "trajectory.h5", recording, calibrated.rig, rig_file, pairs, options
     )
     text = [*calibrated.lines, *lines]
     write_whole(folder / "summary.txt", ("\n".join(text) + "\n").encode())
     files = [*calibrated.files, *files, folder / "summary.txt", *outputs.write_times(folder, "run")]
     print("\n".join([*text, *summary.file_lines([outputs.relative(file) for file in files])]))
-    return outputs.tell_shortcomings(shortcomings)
+    return outputs.exit_code(findings)

@@ -32,10 +32,11 @@ from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
+from disctrack.findings import Finding, Kind, doubts
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory, trajectory_in
+from disctrack.trajectory.file import read_details, read_provenance, read_trajectory, trajectory_in
 from disctrack.trajectory.reuse import refuse_other
 
 
@@ -95,6 +96,13 @@ def diagnose(
     notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *notes) if note)
     return DiscDiagnosis(
         system, diagnosis, declared.name, before, after, energy, learned, apart, None, notes, parts, left
+    )
+
+
+def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """What is declared wrongly: a missing effect would be read into it. Dots are measured where they are."""
+    return tuple(
+        f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(remedy.key for remedy in f.remedies)
     )
 
 
@@ -231,7 +239,7 @@ def run_diagnose(
     for name in (report.name, "model.toml"):
         refuse_input(folder / name)
     provenance = read_provenance(path)
-    trajectory = with_declared_dots(read_trajectory(path), read_findings(path))
+    trajectory = with_declared_dots(read_trajectory(path), read_details(path))
     try:
         result = diagnose(trajectory, model)
     except AnalysisError as error:
@@ -246,6 +254,9 @@ def run_diagnose(
     write_whole(toml, text.encode())
     page = folder / "diagnosis.html"
     drawn = all_figures(result, beside)
-    whole = report_of(result, beside, provenance.recording, drawn=drawn, files=(page, report, toml, path))
+    wrong = doubts(trajectory.findings)
+    whole = report_of(
+        result, beside, provenance.recording, findings=wrong, drawn=drawn, files=(page, report, toml, path)
+    )
     files = write_page(page, whole, ("png", "pdf") if figures else ())
     return DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document))

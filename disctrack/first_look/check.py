@@ -1,11 +1,10 @@
-"""What a run would trip over, found on a few views and a few frames in seconds.
+"""Problems that a run would meet, found on a few views and a few frames in seconds.
 
-Each step looks at one thing and adds remarks: `fix` would stop a run or spoil its result, `look` deserves a look,
-`fine` tells what was seen. A step that cannot be made because an earlier one failed is left out and named.
+Each step looks at one thing, says what was seen and adds findings. A step that cannot be made because an earlier one
+failed is left out and named.
 """
 
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,29 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.board.search import evenly
 from calibration.kit.grey_levels import saturation_level
-from calibration.rig_file import read_rig
-from disctrack.analyse.declaration import contradictions, turned_board
+from calibration.rig_file import read_rig, record_of
+from disctrack.analyse.declaration import Boards, contradictions_of, turned_board
+from disctrack.calibrate.stage import boards_in, boards_of
 from disctrack.calibrate.views import calibrate_views, declared_views
 from disctrack.errors import DiscTrackError, RecordingError
+from disctrack.findings import (
+    MISFITS,
+    Finding,
+    Kind,
+    Number,
+    Remedy,
+    Severity,
+    Subject,
+    in_doubt,
+    leading,
+    of_kind,
+)
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import PairBlock, iter_pair_blocks
+from disctrack.report.blocks import Facts, Report, Section
 from disctrack.track.dots.template import locate_on_disc
 from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
-from disctrack.track.judge.doubts import LIE_OFF, LOWEST_POINT, MISFIT
 from disctrack.track.measurement import ImagePairs, check_rig, open_pairs
 from disctrack.track.refine.intrinsic_scatter import without_shared_faults
 from disctrack.track.run_summary import left_out
@@ -35,7 +47,6 @@ KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
 PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
 FRAMES_AT_EACH = 40  # twice what the free refinement of the clock needs
-OF_A_LAG = (MISFIT, LOWEST_POINT)  # what a check also sees of images paired wrongly
 SLIPS = (-3, -2, -1, 1, 2, 3)  # frames that one camera may be ahead of the other
 SLIP_FRAMES = 12
 CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
@@ -44,44 +55,41 @@ NARROW_PX = 6.0  # a dot's shorter width; below, the blur of one edge reaches th
 CLIPPED_SHARE = 0.002  # of an image's pixels that may be clipped: glints on the rim are
 
 
-@dataclass(frozen=True)
-class Remark:
-    """One thing that was looked at."""
-
-    level: str  # "fine", "look" or "fix"
-    what: str  # heading of one word
-    found: str
-    advice: str = ""
-
-
 @dataclass
 class Check:
     """What was seen; pictures for the page."""
 
     recording: Recording | None = None
-    remarks: list[Remark] = field(default_factory=list)
+    seen: list[tuple[str, str]] = field(default_factory=list)  # headings, and what was seen
+    findings: list[Finding] = field(default_factory=list)
     calibration: StereoCalibration | None = None
+    boards: Boards | None = None
     shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
     raw: NDArray | None = None  # (2, h, w) a pair in which the disc was not found
 
-    def say(self, level: str, what: str, found: str, advice: str = "") -> None:
-        """Add a remark."""
-        self.remarks.append(Remark(level, what, found, advice))
+    def warn(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.WARNING) -> None:
+        """Add a finding, by default one that deserves a look."""
+        remedies = (Remedy(action=advice),) if advice else ()
+        self.findings.append(Finding(kind, severity, text, Subject("check"), remedies=remedies))
 
-    @property
-    def worst(self) -> str:
-        """The gravest level among the remarks."""
-        levels = {remark.level for remark in self.remarks}
-        return next((level for level in ("fix", "look") if level in levels), "fine")
+    def refuse(self, kind: Kind, text: str, advice: str = "") -> None:
+        """Add what a run would end with."""
+        self.warn(kind, text, advice, Severity.REFUSAL)
 
-    def lines(self) -> list[str]:
-        """For the command line: level, heading, finding; the advice on a line of its own."""
-        result = []
-        for remark in self.remarks:
-            result.append(f"{remark.level:<5} {remark.what:<12} {remark.found}")
-            if remark.advice:
-                result.append(f"{'':<5} {'':<12} -> {remark.advice}")
-        return result
+    def report(self, files: Sequence[Path] = ()) -> Report:
+        """The causes, and with `-v` what was seen."""
+        findings = leading(self.findings)
+        verdict = "A run would meet no problem."
+        if in_doubt(findings):
+            verdict = "Something has to be put right before a run."
+        elif findings and findings[0].severity == Severity.WARNING:
+            verdict = "A run would work; look at the warnings."
+        place = "" if self.recording is None else self.recording.folder
+        then = "" if in_doubt(findings) else f"disctrack run {place}"
+        blocks = [Section("What was seen", [Facts(self.seen)])]
+        data = {"problems": [finding.as_json() for finding in findings]}
+        name = "check" if self.recording is None else f"{self.recording.name}: check"
+        return Report(name, verdict, findings=findings, blocks=blocks, files=files, then=then, data=data)
 
 
 def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None) -> Check:
@@ -94,12 +102,9 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
     try:
         recording = seen.recording = read_recording(folder)
     except RecordingError as error:
-        seen.say("fix", "declaration", str(error), f"every key: {KEYS_EXPLAINED}")
+        seen.refuse(Kind.DECLARATION, str(error), f"every key: {KEYS_EXPLAINED}")
         return seen
-    seen.say("fine", "declaration", f"{recording.file} is complete")
-    if recording.chessboard is not None:
-        for finding in turned_board(recording.chessboard.inner_corners):
-            seen.say("fix", "declaration", finding.sentence)
+    seen.seen.append(("declaration", f"{recording.file} is complete"))
     pairs = _frames(seen, recording)
     progress("chessboard")
     rig = _rig(seen, recording)
@@ -108,12 +113,14 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
     progress("light")
     _light(seen, recording, pairs)
     if rig is None:
-        seen.say("look", "dots", "not looked for: that needs the cameras' calibration")
+        if recording.chessboard is not None:
+            seen.findings += turned_board(recording.chessboard.inner_corners)
+        seen.warn(Kind.DISC_NOT_FOUND, "the dots were not looked for: that needs the cameras' calibration")
         return seen
     try:
         check_rig(rig, pairs, "the calibration")
     except RecordingError as error:
-        seen.say("fix", "size", str(error))
+        seen.refuse(Kind.CALIBRATION, str(error))
         return seen
     progress("dots")
     _motion(seen, recording, rig, pairs)
@@ -124,16 +131,12 @@ def _frames(seen: Check, recording: Recording) -> ImagePairs | None:
     try:
         pairs = open_pairs(recording)
     except RecordingError as error:
-        seen.say("fix", "frames", str(error))
+        seen.refuse(Kind.READING, str(error))
         return None
     width, height = pairs.left.image_size
-    seen.say(
-        "fine", "frames",
-        f"{len(pairs)} pairs of {width} x {height} px, {pairs.left.bit_depth} bit, "
-        f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz",
-    )  # fmt: skip
-    for text in (*pairs.notes, *pairs.warnings, *pairs.doubts):
-        seen.say("look", "frames", text)
+    lasts = f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz"
+    seen.seen.append(("frames", f"{len(pairs)} pairs of {width} x {height} px, {pairs.left.bit_depth} bit, {lasts}"))
+    seen.findings += pairs.findings
     return pairs
 
 
@@ -142,9 +145,10 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
         try:
             rig = read_rig(recording.rig_file)
         except DiscTrackError as error:
-            seen.say("fix", "rig", str(error))
+            seen.refuse(Kind.CALIBRATION, str(error))
             return None
-        seen.say("fine", "rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.1f} mm")
+        seen.seen.append(("rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.1f} mm"))
+        seen.boards = boards_in(recording.rig_file, recording)
         return rig
     declared, table = recording.views, recording.table
     assert declared is not None
@@ -160,23 +164,25 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
             some, declared.target, chosen.index(table.view), table.board_thickness, settings
         )
     except DiscTrackError as error:
-        seen.say("fix", "chessboard", str(error))
+        seen.refuse(Kind.CALIBRATION, str(error))
         return None
-    seen.calibration = found
+    seen.calibration, seen.boards = found, boards_of(record_of(found), some, chosen)
     used = len(chosen) - len(problems) - len(found.rejected_views)
-    level = "fine" if used >= 0.7 * len(chosen) else "look"
-    advice = "" if level == "fine" else "the whole board must be in view of both cameras, with a light rim round it"
-    seen.say(level, "chessboard", f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all), "
-             f"rms {found.rms_px:.3f} px, baseline {1e3 * found.rig.baseline:.1f} mm", advice)  # fmt: skip
-    for text in (*left_out(found.rejected_views), *problems, *found.warnings):
-        seen.say("look", "chessboard", text)
+    text = f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all)"
+    seen.seen.append(("chessboard", f"{text}, {found.assessment.verdict}, baseline {1e3 * found.rig.baseline:.1f} mm"))
+    if used < 0.7 * len(chosen):
+        advice = "the whole board must be in view of both cameras, with a light rim round it"
+        seen.warn(Kind.CALIBRATION_VIEWS, f"the chessboard was {text}", advice)
+    left = (*left_out(found.rejected_views), *problems)
+    seen.findings += of_kind(Kind.CALIBRATION_VIEWS, Severity.WARNING, left)
+    seen.findings += of_kind(Kind.CALIBRATION, Severity.WARNING, found.warnings)
     return found.rig
 
 
 def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:
     images = _pairs_at(pairs, [round(place * (len(pairs) - 1)) for place in PLACES])
     if not len(images):
-        seen.say("fix", "light", "none of the frames looked at can be read", "copy the frames again")
+        seen.refuse(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
         return
     for camera, name in enumerate(CAMERAS):
         side = images[:, camera]
@@ -185,16 +191,18 @@ def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:
         low, high = np.percentile(side, [1.0, 99.0])
         text = f"{name}: grey values {low:.0f} to {high:.0f}"
         if clipped > CLIPPED_SHARE:
-            seen.say("look", "light", f"{text}, {100 * clipped:.1f} % of the pixels clipped at {saturation}",
-                     "expose for a shorter time, or close the aperture: clipped edges shift")  # fmt: skip
+            share = f"{100 * clipped:.1f} % of the pixels clipped at {saturation}"
+            seen.warn(
+                Kind.LIGHT, f"{text}, {share}", "expose for a shorter time, or close the aperture: clipped edges shift"
+            )
         elif high - low < 1:
-            seen.say("fix", "light", f"{text}: the images are of one grey", "is the lens cap on, is the lamp lit?")
-        else:
-            seen.say("fine", "light", text)
+            seen.refuse(Kind.LIGHT, f"{text}: the images are of one grey", "is the lens cap on, is the lamp lit?")
+        seen.seen.append(("light", text))
 
 
 def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> None:
     done: list[tuple[range, Tracking]] = []
+    lost: list[Finding] = []
     for place in PLACES:
         n = min(FRAMES_AT_EACH, len(pairs))
         first = pairs.start + min(max(round(place * len(pairs)) - n // 2, 0), len(pairs) - n)
@@ -204,11 +212,12 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         try:
             done.append((frames, _track(recording, rig, pairs, frames)))
         except DiscTrackError as error:
-            seen.say("look", "dots", f"frames {frames.start}-{frames.stop - 1}: {error}")
+            lost.append(Finding(Kind.DISC_NOT_FOUND, Severity.WARNING, str(error), Subject("check")))
+            lost += getattr(error, "findings", ())
             seen.raw = seen.raw if seen.raw is not None else _first(_pairs_at(pairs, [frames.start]))
+    seen.findings += _once(lost)
     if not done:
-        last = seen.remarks.pop()
-        seen.say("fix", "dots", f"the disc was found nowhere. {last.found}", "compare [markers] with the picture")
+        seen.refuse(Kind.DISC_NOT_FOUND, "the disc was found nowhere", "compare [markers] with the picture")
         return
     for frames, tracking in done:
         row = len(frames) // 2
@@ -217,32 +226,26 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             seen.shown.append((tracking.trajectory, row, images))
     measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     total = sum(len(frames) for frames, _ in done)
-    seen.say(
-        "fine" if measured == total else "look", "dots", f"disc measured in {measured} of {total} frames looked at"
-    )
+    seen.seen.append(("dots", f"disc measured in {measured} of {total} frames looked at"))
+    if measured < total:
+        seen.warn(Kind.FRAMES_LOST, f"the disc was measured in {measured} of {total} frames looked at")
     _dots(seen, [tracking for _, tracking in done])
     whole = _together([tracking.trajectory for _, tracking in done])
-    square = None if recording.chessboard is None else recording.chessboard.square
-    for finding in contradictions(whole, recording.disc, square):
-        level = "fix" if finding.spoils or finding.check == "dot" else "look"
-        seen.say(level, "declaration", finding.sentence)
+    noticed = _once(finding for _, tracking in done for finding in tracking.findings)
+    for finding in contradictions_of(recording, whole, noticed, seen.boards):
+        graver = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
+        seen.findings.append(replace(finding, severity=graver))
     _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
-    out_of_step = _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
-    doubts, told = (
-        {_without_numbers(text): text for _, tracking in done for text in texts(tracking)}
-        for texts in (lambda tracking: tracking.doubts, lambda tracking: tracking.warnings)
-    )
-    for kind, text in (told | doubts).items():
-        if not (out_of_step and text.startswith(OF_A_LAG)):
-            declared = text.startswith((LIE_OFF, LOWEST_POINT))
-            seen.say(
-                *(("fix", "declaration" if declared else "cameras") if kind in doubts else ("look", "physics")), text
-            )
+    _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
+    seen.findings += noticed
 
 
-def _without_numbers(text: str) -> str:
-    """What the text says, the same of every place looked at."""
-    return re.sub(r"[-+]?\d[\d.]*", "#", text)
+def _once(findings: Iterable[Finding]) -> list[Finding]:
+    """Of the places looked at, one finding for each kind and camera: the gravest."""
+    first: dict[tuple[Kind, str], Finding] = {}
+    for finding in sorted(findings, key=lambda f: -f.severity):
+        first.setdefault((finding.kind, finding.subject.camera), finding)
+    return list(first.values())
 
 
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:
@@ -255,7 +258,7 @@ def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: rang
         images = _pairs_at(pairs, list(range(start, stop)), slip)
         yield PairBlock(np.arange(start, start + len(images)), images)
 
-    settings = TrackingSettings(refine_markers=False, first_pass=False)
+    settings = TrackingSettings(refine_markers=False, first_pass=False, table="board")
     return track(read_blocks, frames, rig, recording.disc, recording.frame_rate, gravity=recording.gravity,
                  settings=settings)  # fmt: skip
 
@@ -275,8 +278,8 @@ def _dots(seen: Check, tracks: list[Tracking]) -> None:
     seen_share = np.mean(status[with_pose] == MarkerStatus.MEASURED, axis=0) if with_pose.any() else np.zeros((2, 1))
     for camera, name in enumerate(CAMERAS):
         if seen_share[camera].max() < 0.1:
-            seen.say("fix", "dots", f"the {name} camera measures no dot",
-                     "are left and right exchanged, does it see the upper face?")  # fmt: skip
+            text = f"the {name} camera measures no dot"
+            seen.warn(Kind.ONE_SIDED, text, "are left and right exchanged, does it see the upper face?", Severity.DOUBT)
 
 
 def _sharpness(
@@ -307,45 +310,51 @@ def _sharpness(
             f"{name}: dots {width:.0f} px wide, blur {tracking.blur_px[camera]:.2f} px (sigma), contrast "
             f"{100 * abs(contrast):.0f} %, {level * abs(contrast) / noise:.0f} times the noise"
         )
+        seen.seen.append(("sharpness", text))
         if width * tilt < NARROW_PX:
-            seen.say("look", "sharpness", f"{text}; only {width * tilt:.1f} px across",
-                     "larger dots, a longer lens, or cameras that look more steeply")  # fmt: skip
+            advice = "larger dots, a longer lens, or cameras that look more steeply"
+            seen.warn(Kind.SHARPNESS, f"{text}; only {width * tilt:.1f} px across", advice)
         elif 3 * tracking.blur_px[camera] > 0.5 * width * tilt:
-            seen.say("look", "sharpness", f"{text}: the blur of opposite edges overlaps",
-                     "focus on the disc, close the aperture, expose for a shorter time")  # fmt: skip
-        else:
-            seen.say("fine", "sharpness", text)
+            advice = "focus on the disc, close the aperture, expose for a shorter time"
+            seen.warn(Kind.SHARPNESS, f"{text}: the blur of opposite edges overlaps", advice)
     sigma = np.nanmedian(trajectory.coordinate_sigma[:, :3], axis=0)
     shared = np.nanmedian(trajectory.calibration_sigma[:, :3], axis=0)
     text = (
         f"expected of a frame: {1e6 * sigma.max():.2g} um by noise, {1e6 * shared.max():.2g} um that all frames share "
         "(sigma of the worst of x, y, z; the run's own calibration uses all views)"
     )
+    seen.seen.append(("accuracy", text))
     if sigma.max() > CLAIM:
-        seen.say("look", "accuracy", text, "more light, sharper or larger dots")
+        seen.warn(Kind.ACCURACY, text, "more light, sharper or larger dots")
     elif shared.max() > LAB_FRAME:
-        seen.say("look", "accuracy", text, "more views of the board, tilted and all over; a board that is known better")
-    else:
-        seen.say("fine", "accuracy", text)
+        seen.warn(Kind.ACCURACY, text, "more views of the board, tilted and all over; a board that is known better")
 
 
 def _synchronisation(
     seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, tracking: Tracking
-) -> bool:
+) -> None:
     trajectory = tracking.trajectory
     rms = float(np.sqrt(np.nanmean(trajectory.reprojection_rms_px**2)))
     motion = np.linalg.norm(np.diff(trajectory.markers_px, axis=0), axis=-1)
     if not np.isfinite(motion).any():
-        return False
+        return
     speed = float(np.nanmedian(motion))
     if tracking.variance_factor > 4.0:  # dots disagree with every pose by more than twice their noise
         better = _slip(recording, rig, pairs, frames, rms)
         if better is not None:
             slip, its_rms = better
-            seen.say("fix", "clock", f"left frame i and right frame i{slip:+d} show the same instant: that leaves "
-                     f"{its_rms:.3f} px, the declared pairing {rms:.3f} px",
-                     "export the same instants of both cameras")  # fmt: skip
-            return True
+            text = (
+                f"left frame i and right frame i{slip:+d} show the same instant: that leaves {its_rms:.3f} px, the "
+                f"declared pairing {rms:.3f} px"
+            )
+            camera = CAMERAS[slip > 0]
+            advice = (Remedy(action="export the same instants of both cameras"),)
+            explains = (Kind.DELAY, Kind.DROPPED_FRAMES, *MISFITS)
+            of = Subject("check", camera)
+            seen.findings.append(
+                Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, {"images": Number(slip)}, advice, explains)
+            )
+            return
     moving = trajectory.rig.world_is_table and speed > 0.2
     faults = None
     if moving:
@@ -353,17 +362,16 @@ def _synchronisation(
         faults = without_shared_faults(trajectory.markers_px, trajectory.markers_covariance_px2, rig, recording.disc,
                                        R, trajectory.q[:, :3])  # fmt: skip
     if faults is None:
-        seen.say("fine", "clock", f"dots move by {speed:.2f} px per frame here: too few or too slow to tell a delay")
-        return False
+        text = f"dots move by {speed:.2f} px per frame here: too few or too slow to tell a delay"
+        seen.seen.append(("clock", text))
+        return
     offset = abs(faults.delay) * speed  # in pixels, against what the dots' noise leaves open
     noise = float(np.sqrt(np.nanmedian(np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1)) / 2))
     unsure = offset < 3 * max(noise, 0.02)  # 0.02 px: what a rig within its calibration leaves
     text = f"right camera {faults.delay:+.3f} frame periods after the left, by the dots' motion"
-    if unsure:
-        seen.say("fine", "clock", f"no delay between the cameras shows ({text})")
-    else:
-        seen.say("look", "clock", text, "are both cameras triggered by one signal, with one exposure time?")
-    return False
+    seen.seen.append(("clock", f"no delay between the cameras shows ({text})" if unsure else text))
+    if not unsure:
+        seen.warn(Kind.DELAY, text, "are both cameras triggered by one signal, with one exposure time?")
 
 
 def _slip(

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -10,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.threads import one_blas_thread
+from disctrack.analyse.declaration import contradictions
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
+from disctrack.findings import warn_of_doubts
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.follow.tracking import TrackingSettings, prepare, stretch_edges, track
-from disctrack.track.measurement import Measurement, Progress, findings_of
+from disctrack.track.measurement import Measurement, Progress, details_of
 
 Images = NDArray[Any]  # uint8 or uint16
 
@@ -75,7 +78,10 @@ def measure_pairs(
         workers=threads,
         progress=progress,
     )
-    return Measurement(tracking.trajectory, (), findings_of(tracking), time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    found = (*contradictions(tracking.trajectory, disc), *tracking.findings)
+    warn_of_doubts(found, stacklevel=4)
+    return Measurement(replace(tracking.trajectory, findings=found), (), details_of(tracking), seconds)
 
 
 def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:

@@ -14,7 +14,9 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
+from disctrack.analyse.declaration import Boards, contradictions_of
 from disctrack.errors import RecordingError, TrackingError
+from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
 from disctrack.recording.declaration import Recording
@@ -44,16 +46,10 @@ class ImagePairs:
     right: FrameReader
     start: int
     stop: int
-    warnings: tuple[str, ...] = ()  # where the cameras' headers leave doubt that the frames are simultaneous
-    doubts: tuple[str, ...] = ()  # what had to be assumed of the frames' instants: the result may be wrong by that
+    findings: tuple[Finding, ...] = ()  # how the frames are read, and what had to be assumed of their instants
 
     def __len__(self) -> int:
         return self.stop - self.start
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What the user should know about how the frames are read."""
-        return (*self.left.notes, *self.right.notes)
 
     def camera_headers(self) -> dict[str, Any]:
         """Under "camera_headers" what the cameras wrote about themselves (exposure, trigger, ...), if anything."""
@@ -70,16 +66,16 @@ class ImagePairs:
 
 @dataclass(frozen=True, repr=False)
 class Measurement(Brief):
-    """A tracked recording and what the run found out on the way."""
+    """A tracked recording, with what was noticed in `trajectory.findings`."""
 
     trajectory: Trajectory
     unreadable: tuple[Unreadable, ...]
-    findings: dict[str, Any]  # blur, noise, warnings, ...: of JSON's types, stored with the result
+    details: dict[str, Any]  # blur, noise, ...: of JSON's types, stored with the result
     seconds: float  # spent on reading and tracking
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
-        told = {**self.trajectory.facts(), "warnings": f"{len(self.findings['warnings'])}"}
+        told = self.trajectory.facts()
         return told | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else told
 
 
@@ -95,21 +91,24 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     ]
     readers = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
     left, right = frames_in_parts(readers, image_parts(recording.parts), str(recording.file))
-    warnings = check_headers(left, right, recording.frame_rate, str(recording.file))
-    warnings += other_exposure(left, right, recording.exposure, str(recording.file))
+    headers = check_headers(left, right, recording.frame_rate, str(recording.file))
+    headers += other_exposure(left, right, recording.exposure, str(recording.file))
     check_pair(left, right)
     stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)
-    doubts = (
-        *(doubt for reader in (left, right) for doubt in getattr(reader, "doubts", ())),
-        *check_same_numbers(left, right),
-        *stamp_doubts,
+    assumed = [doubt for reader in (left, right) for doubt in getattr(reader, "doubts", ())]
+    findings = (
+        *of_kind(Kind.READING, Severity.DOUBT, (*assumed, *check_same_numbers(left, right))),
+        *of_kind(Kind.TIME_STAMPS, Severity.DOUBT, stamp_doubts),
+        *of_kind(Kind.TIME_STAMPS, Severity.WARNING, stamp_warnings),
+        *of_kind(Kind.HEADERS, Severity.WARNING, headers),
+        *of_kind(Kind.READING, Severity.NOTE, (*left.notes, *right.notes)),
     )
     start, stop, _ = slice(*frames).indices(len(left))
     if stop <= start:
         raise RecordingError(
             f"{recording.folder}: --frames {frames[0]}:{frames[1]} holds no frame; the recording has {len(left)}."
         )
-    return ImagePairs(left, right, start, stop, (*warnings, *stamp_warnings), doubts)
+    return ImagePairs(left, right, start, stop, findings)
 
 
 def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
@@ -131,16 +130,18 @@ def measure(
     settings: TrackingSettings | None = None,
     threads: int | None = None,
     progress: Progress = lambda n: None,
+    boards: Boards | None = None,
 ) -> Measurement:
     """Track the disc through the pairs; the trajectory has the length of the recording.
 
     Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
+    boards : of the calibration's views, so that a wrong table view is told with the right one
     Raises TrackingError if the disc is found in no frame.
     """
     settings = settings or TrackingSettings()
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)
-    exposure, exposure_source = _exposures(recording, pairs)
+    exposure, headers = _exposures(recording, pairs)
     settings = dataclasses.replace(settings, exposure=exposure)
     not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
     rate = recording.frame_rate
@@ -179,12 +180,16 @@ def measure(
         raise
     unreadable = [not_read[place] for place in sorted(not_read)]
     seconds = time.perf_counter() - began
-    found = findings_of(tracking)
-    findings = {
-        **found,
-        "notes": [*pairs.notes, *exposure_source, *found["notes"]],
-        "warnings": list(dict.fromkeys([*pairs.warnings, *pairs.doubts, *found["warnings"]])),
-        "doubts": [*pairs.doubts, *found["doubts"]],
+    lost = [f"{len(unreadable)} image(s) could not be read; their frames rest on one camera or none. The first: "
+            f"{unreadable[0].reason}"] if unreadable else []  # fmt: skip
+    findings = (
+        *pairs.findings,
+        *of_kind(Kind.EXPOSURE, Severity.NOTE, headers),
+        *of_kind(Kind.UNREADABLE, Severity.WARNING, lost),
+        *tracking.findings,
+    )
+    details = {
+        **details_of(tracking),
         "unreadable": [image.reason for image in unreadable],
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),
@@ -193,7 +198,10 @@ def measure(
     trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
-    return Measurement(trajectory, tuple(unreadable), findings, seconds)
+    contradicted = contradictions_of(recording, trajectory, findings, boards)
+    trajectory = dataclasses.replace(trajectory, findings=(*contradicted, *findings))
+    warn_of_doubts(trajectory.findings, stacklevel=4)
+    return Measurement(trajectory, tuple(unreadable), details, seconds)
 
 
 def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, error: TrackingError) -> None:
@@ -206,14 +214,10 @@ def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, 
         ) from error
 
 
-def findings_of(tracking: Tracking) -> dict[str, Any]:
-    """What tracking found out on the way, of JSON's types."""
+def details_of(tracking: Tracking) -> dict[str, Any]:
+    """Numbers that tracking found on the way, of JSON's types."""
     return {
-        "notes": [tracking.exposure.note] if tracking.exposure.note else [],
         "exposure_s": list(tracking.exposure.seconds),
-        "warnings": list(dict.fromkeys([*tracking.doubts, *tracking.warnings])),
-        "doubts": list(tracking.doubts),
-        "unreadable": [],
         "blur_px": list(tracking.blur_px),
         "noise": [_json_fields(noise) for noise in tracking.noise],
         "variance_factor": tracking.variance_factor,

@@ -10,6 +10,7 @@ from calibration import StereoCalibration, StereoRig
 from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
 from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
+from disctrack.findings import leading
 from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -34,8 +35,8 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
     ]
     if found.lens is not None:
         (left, right), gain = found.lens.rms_px, found.lens.gain
-        told = f"the lenses depart from their polynomial by {left:.3f} and {right:.3f} px rms per axis: corrected"
-        lines.append(_line("", f"{told} (views left out: squared misfit {100 * gain:.0f} % less)"))
+        departs = f"the lenses depart from their polynomial by {left:.3f} and {right:.3f} px rms per axis: corrected"
+        lines.append(_line("", f"{departs} (views left out: squared misfit {100 * gain:.0f} % less)"))
     corners = len(found.rejected_corners())
     if corners:
         lines.append(_line("", f"{corners} corners were found but not used"))
@@ -92,35 +93,33 @@ def left_out(rejected: Mapping[int, str]) -> list[str]:
     return [f"not used: {', '.join(views)}: {why}" for why, views in groups.items()]
 
 
-def trajectory_lines(trajectory: Trajectory, findings: Mapping[str, Any]) -> list[str]:
-    """Frames measured and lost with the reasons, sigmas, reprojection error, warnings."""
+def trajectory_lines(trajectory: Trajectory, details: Mapping[str, Any]) -> list[str]:
+    """Frames measured and lost with the reasons, sigmas, reprojection error, findings."""
     lines = [*_frame_lines(trajectory)]
-    if found := findings.get("first_pass"):
+    if found := details.get("first_pass"):
         looked = f" (first pass, {found['looked_at']} pairs looked at)" if found["looked_at"] else ""
         lines.append(_line("motion", f"{found['verdict']}{looked}"))
     if trajectory.measured.any():
         lines += [
             _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
             _sigma_line("", trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats"),
-            *_shared_lines(findings),
+            *_shared_lines(details),
             _fit_line(trajectory),
         ]
-        if any(repeats := findings.get("systematic_px", ())):
+        if any(repeats := details.get("systematic_px", ())):
             left, right = repeats
             what = "lens beyond its model, printed dots, light"
             lines.append(_line("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
-        if table := findings.get("table"):
+        if table := details.get("table"):
             lines.append(_line("table", table["told"]))
-    lines += [_line("image", reason) for reason in list(findings.get("unreadable", []))[:SHOWN_RANGES]]
-    lines += [_line("note", note) for note in findings.get("notes", [])]
-    lines += [_line("warning", warning) for warning in findings.get("warnings", [])]
-    return lines
+    lines += [_line("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
+    return lines + [_line(finding.severity.name.lower(), finding.sentence) for finding in leading(trajectory.findings)]
 
 
-def _shared_lines(findings: Mapping[str, Any]) -> Iterable[str]:
-    if shared := findings.get("shared_sigma"):
+def _shared_lines(details: Mapping[str, Any]) -> Iterable[str]:
+    if shared := details.get("shared_sigma"):
         yield _line("", _mostly(shared, "shared by frames"))
-    size = findings.get("size", {})
+    size = details.get("size", {})
     if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > LEAST_SIZE:
         yield _line(
             "size",

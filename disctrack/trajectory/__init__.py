@@ -13,6 +13,7 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, Disc
+from disctrack.findings import Finding
 from disctrack.frames import euler_jacobian
 
 if TYPE_CHECKING:
@@ -110,6 +111,7 @@ class Trajectory(Brief):
     # Sizes by which the table's plane was moved from the board's to where the disc rolls, as far as their sigmas do not
     # allow it: height at the origin [m], slopes along x and y. The board is bent, or the table is not flat
     table_moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    findings: tuple[Finding, ...] = ()  # what was noticed when it was measured
 
     def __len__(self) -> int:
         return len(self.time)

@@ -28,6 +28,7 @@ from disctrack.files.json_text import json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.findings import Finding, Kind, Severity, finding_from_json, warn_of_doubts
 from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -67,11 +68,11 @@ def write_trajectory(
     trajectory: Trajectory,
     provenance: Provenance,
     overwrite: bool = False,
-    findings: Mapping[str, Any] | None = None,
+    details: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be.
 
-    findings : what the run found out on the way (blur, noise, warnings, ...), of JSON's types; see `read_findings`
+    details : numbers of the run (blur, noise, ...), of JSON's types; see `read_details`
     """
     path = Path(path)
     refuse_existing(path, overwrite)
@@ -83,9 +84,11 @@ def write_trajectory(
         file["disc"].attrs.update(_disc_attributes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
         file.attrs.update(_root_attributes(trajectory, provenance))
-        file.attrs["findings"] = json_text(dict(findings or {}))
+        file.attrs["findings"] = json_text([finding.as_json() for finding in trajectory.findings])
+        file.attrs["details"] = json_text(dict(details or {}))
         made_from = {"inputs_sha256": provenance.inputs, "settings": provenance.settings, "dependencies": _versions()}
-        write_attributes(file, {"findings": findings or {}, "made_from": made_from})
+        told = [f"{finding.severity.name.lower()}: {finding.sentence}" for finding in trajectory.findings]
+        write_attributes(file, {"findings": {"told": told, **(details or {})}, "made_from": made_from})
         file.attrs["complete"] = 1
     write_whole(path, buffer.getbuffer())
 
@@ -96,7 +99,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
     path : of the file, or of the folder that holds it, itself or in its `results`
     """
     with _Reading(trajectory_in(Path(path))) as file:
-        return _trajectory(file)
+        trajectory = _trajectory(file)
+    warn_of_doubts(trajectory.findings)
+    return trajectory
 
 
 def trajectory_in(path: Path) -> Path:
@@ -120,10 +125,25 @@ def read_provenance(path: Path) -> Provenance:
         )
 
 
-def read_findings(path: Path) -> dict[str, Any]:
-    """What the run that wrote the file found out on the way. Raises TrajectoryFileError."""
+def read_details(path: Path) -> dict[str, Any]:
+    """Numbers of the run that wrote the file. Raises TrajectoryFileError."""
     with _Reading(path) as file:
-        return dict(json.loads(file.attrs["findings"]))
+        return dict(json.loads(file.attrs["details" if "details" in file.attrs else "findings"]))  # of earlier versions
+
+
+def read_findings(path: Path) -> tuple[Finding, ...]:
+    """What was noticed in the measurement. Raises TrajectoryFileError."""
+    with _Reading(path) as file:
+        return _findings(json.loads(file.attrs["findings"]))
+
+
+def _findings(content: Any) -> tuple[Finding, ...]:
+    """Findings of a file; earlier versions had sentences, those that put the result in doubt twice."""
+    if isinstance(content, list):
+        return tuple(finding_from_json(document) for document in content)
+    doubts, warnings = (content.get(key, ()) for key in ("doubts", "warnings"))
+    severities = {**dict.fromkeys(warnings, Severity.WARNING), **dict.fromkeys(doubts, Severity.DOUBT)}
+    return tuple(Finding(Kind.OTHER, severity, text) for text, severity in severities.items())
 
 
 def is_result_of(path: Path, provenance: Provenance) -> bool:
@@ -465,6 +485,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         gravity=float(file.attrs["gravity_m_s2"]),
         air_density=float(file.attrs.get("air_density_kg_m3", AIR_DENSITY)),  # files of earlier versions
         table_moved=(height, slope_x, slope_y),
+        findings=_findings(json.loads(file.attrs["findings"])),
         **found,
     )
     _check_values(trajectory)

@@ -16,7 +16,7 @@ import numpy as np
 from disctrack.cli import main as disctrack_cli
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.declared_dots import with_declared_dots
-from disctrack.trajectory.file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_details, read_trajectory
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import newton_euler, point_laboratory
 
@@ -130,7 +130,7 @@ def rendered(folder):
             assert disctrack_cli(["run", str(folder), "-o", str(out), "--no-figures", "--no-video"]) == 0
     effect, R, t = truth_of(folder)
     file = out / "trajectory.h5"
-    return row_of(folder.name, effect, read_trajectory(file), read_findings(file), R, t)
+    return row_of(folder.name, effect, read_trajectory(file), read_details(file), R, t)
 
 
 def by_points(seed, effect, frames=300, frame_rate=500.0):

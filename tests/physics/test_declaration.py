@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from calibration.cameras.camera import Camera, StereoRig
-from disctrack.analyse.declaration import balance, contradictions, handedness, told, turned_board, unseen_dots
+from disctrack.analyse.declaration import (
+    Boards,
+    balance,
+    contradictions,
+    handedness,
+    thickness,
+    turned_board,
+    unseen_dots,
+)
+from disctrack.findings import Finding, Kind, Number, Severity, leading
 from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
@@ -54,18 +63,18 @@ def test_honest_motions_are_not_contradicted(theta, seconds, k_m, nutation, spin
 @pytest.mark.parametrize("factor", [2.0, 0.5, 1.1, 0.9])
 def test_a_wrong_frame_rate_is_named_with_the_true_one(factor, honest):
     (finding,) = contradictions(at_another_rate(honest, factor))
-    first = finding.suspects[0]
+    first = finding.remedies[0]
     assert first.key == "[cameras] frame_rate_hz"
-    assert abs(float(first.would_be.split()[0]) / 1000.0 - 1) < 2e-3
-    assert "(1000 is usual)" in finding.sentence
-    assert finding.spoils
+    assert abs(float(first.fits) / 1000.0 - 1) < 2e-3
+    assert "1000 is usual" in finding.sentence
+    assert finding.doubtful
 
 
 @pytest.mark.parametrize(("gravity", "hint"), [(9810.0, "mm/s^2"), (1.62, ""), (98.1, "")])
 def test_a_wrong_gravity_is_named_with_the_true_one(gravity, hint, honest):
     (finding,) = contradictions(replace(honest, gravity=gravity))
-    assert finding.suspects[0].key == "[gravity] g_m_s2"
-    assert abs(float(finding.suspects[0].would_be.split(",")[0]) / 9.81 - 1) < 2e-3
+    assert finding.remedies[0].key == "[gravity] g_m_s2"
+    assert abs(float(finding.remedies[0].fits) / 9.81 - 1) < 2e-3
     assert hint in finding.sentence
 
 
@@ -73,10 +82,10 @@ def test_a_wrong_gravity_is_named_with_the_true_one(gravity, hint, honest):
 def test_a_wrong_radius_is_named_before_the_rate_where_the_rim_says_so(factor, honest):
     """The balance of moments alone knows radius / rate^2: that the rim is on the table tells which of the two it is."""
     disc = replace(honest.disc, radius=factor * honest.disc.radius)
-    found = {finding.check: finding for finding in contradictions(replace(honest, disc=disc))}
-    first = found["gravity and rate"].suspects[0]
+    found = {finding.kind: finding for finding in contradictions(replace(honest, disc=disc))}
+    first = found[Kind.GRAVITY_OR_RATE].remedies[0]
     assert first.key == "[disc] radius_mm"
-    assert abs(float(first.would_be) / (1e3 * honest.disc.radius) - 1) < 2e-3
+    assert abs(float(first.fits) / (1e3 * honest.disc.radius) - 1) < 2e-3
 
 
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
@@ -92,16 +101,16 @@ def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(
     q = np.column_stack([trajectory.q[:, :3] @ Q.T + [0.0, 0.0, 0.02], unwrap_euler(euler_from_rotation(R))])
     turned = replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)))
     (finding,) = contradictions(turned)
-    assert finding.suspects[0].key == "[table] view"
+    assert finding.remedies[0].key == "[table] view"
     assert f"turned by {turn_deg:.1f} deg" in finding.sentence
-    assert finding.spoils
+    assert finding.doubtful
 
 
 @pytest.mark.parametrize("key", ["mass", "half_thickness"])
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_a_disc_of_no_known_density_is_told(key, factor, honest):
     disc = replace(honest.disc, **{key: factor * getattr(honest.disc, key)})
-    assert "density" in [finding.check for finding in contradictions(honest, disc)]
+    assert Kind.DENSITY in [finding.kind for finding in contradictions(honest, disc)]
 
 
 def test_departures_that_a_table_or_an_edge_may_make_are_no_contradiction(honest):
@@ -115,8 +124,8 @@ def test_a_film_that_runs_backwards_gains_energy(true_motion, as_tracked):
     backwards = replace(forwards, q=forwards.q[::-1], quaternion=forwards.quaternion[::-1])
     assert contradictions(forwards) == ()
     (finding,) = contradictions(backwards)
-    assert finding.check == "energy"
-    assert "reverse order" in finding.sentence
+    assert finding.kind == Kind.REVERSED
+    assert "in the order of time" in finding.sentence
 
 
 def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracked, true_motion):
@@ -128,7 +137,7 @@ def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracke
     held = replace(motion, R=np.stack([axes, np.cross(e3, axes), e3], -1), position=motion.position[:1] + 0 * e3)
     resting = replace(held, R=np.broadcast_to(held.R[0], held.R.shape))
     for motion in (held, resting):
-        assert not [f for f in contradictions(as_tracked(motion, np.random.default_rng(3))) if f.check != "radius"]
+        assert not [f for f in contradictions(as_tracked(motion, np.random.default_rng(3))) if f.kind != Kind.RADIUS]
 
 
 def test_a_wrong_radius_is_seen_where_the_nutation_varies(true_motion, as_tracked):
@@ -137,8 +146,8 @@ def test_a_wrong_radius_is_seen_where_the_nutation_varies(true_motion, as_tracke
     assert np.ptp(np.sin(trajectory.q[:, 4])) > 0.05
     assert contradictions(trajectory) == ()
     (finding,) = contradictions(replace(trajectory, disc=replace(trajectory.disc, radius=35.0e-3)))
-    assert (finding.check, finding.suspects[0].key) == ("radius", "[disc] radius_mm")
-    assert abs(float(finding.suspects[0].would_be) / 37.5 - 1) < 5e-3
+    assert (finding.kind, finding.remedies[0].key) == (Kind.RADIUS, "[disc] radius_mm")
+    assert abs(float(finding.remedies[0].fits) / 37.5 - 1) < 5e-3
 
 
 def with_dots(trajectory: Trajectory, scale: float, unseen: tuple[int, ...] = ()) -> Trajectory:
@@ -156,15 +165,15 @@ def with_dots(trajectory: Trajectory, scale: float, unseen: tuple[int, ...] = ()
 @pytest.mark.parametrize("scale", [6.0 / 6.1, 6.1 / 6.0])
 def test_a_chessboard_of_another_scale_is_told_from_the_dots(scale, honest):
     (finding,) = contradictions(with_dots(honest, scale))
-    assert finding.check == "scale"
-    square = next(s for s in finding.suspects if s.key == "[calibration] square_mm")
-    assert abs(float(square.would_be.split()[0]) * scale - 1) < 1e-3
+    assert finding.kind == Kind.SQUARE
+    square = next(r for r in finding.remedies if r.key == "[calibration] square_mm")
+    assert abs(float(square.action.split()[1]) * scale - 1) < 1e-3
 
 
 def test_the_true_square_of_a_board_is_named_first(honest):
     (finding,) = contradictions(with_dots(honest, 6.1 / 6.0), square=6.1e-3)
-    assert finding.suspects[0].key == "[calibration] square_mm"
-    assert abs(float(finding.suspects[0].would_be) - 6.0) < 5e-3
+    assert finding.remedies[0].key == "[calibration] square_mm"
+    assert abs(float(finding.remedies[0].fits) - 6.0) < 5e-3
 
 
 def test_dots_on_the_boards_scale_but_for_printing_are_fine(honest):
@@ -180,11 +189,11 @@ def test_a_dot_that_is_never_seen_is_named(honest):
 def test_corners_counted_along_the_short_side_first_turn_the_table():
     assert turned_board((9, 6)) == turned_board((7, 7)) == ()
     assert "[9, 6]" in turned_board((6, 9))[0].sentence
-    assert turned_board((6, 9))[0].spoils, "x and y of every pose"
+    assert turned_board((6, 9))[0].doubtful, "x and y of every pose"
 
 
 def test_a_dot_without_which_the_layout_repeats_spoils_the_spin_angle(honest):
-    assert not contradictions(with_dots(honest, 1.0, unseen=(1,)))[0].spoils
+    assert not contradictions(with_dots(honest, 1.0, unseen=(1,)))[0].doubtful
     hexagon = honest.disc.marker_centres_body.copy()
     hexagon[:, :2] = 0.03 * np.column_stack([np.cos(SIXTHS), np.sin(SIXTHS)])
     seventh = np.vstack([hexagon, hexagon[:1] * [0.4, 0.4, 1.0]])
@@ -192,7 +201,7 @@ def test_a_dot_without_which_the_layout_repeats_spoils_the_spin_angle(honest):
         with_dots(replace(honest, disc=replace(honest.disc, marker_centres_body=seventh)), 1.0, unseen=(6,)),
         replace(honest.disc, marker_centres_body=seventh),
     )
-    assert finding.spoils, "six dots in a hexagon are left"
+    assert finding.doubtful, "six dots in a hexagon are left"
 
 
 def camera_rig(left, right):
@@ -218,7 +227,7 @@ def test_a_mirrored_world_is_told_by_the_cameras_places_or_by_dots_without_an_ax
     assert handedness(camera_rig(left, right), honest.disc) == ()
     mirror = [1.0, -1.0, 1.0]
     (finding,) = handedness(camera_rig(left * mirror, right * mirror), honest.disc)
-    assert finding.spoils
+    assert finding.doubtful
     assert "mirrored" in finding.sentence
     assert "exchanged" in finding.sentence
     asymmetric = honest.disc.marker_centres_body.copy()
@@ -233,9 +242,47 @@ def test_cameras_that_face_each_other_tell_no_left_and_right(honest):
     assert handedness(across, honest.disc) == handedness(above, honest.disc) == ()
 
 
-def test_findings_carry_what_is_wrong_into_warnings_and_doubts(honest):
-    found = contradictions(with_dots(at_another_rate(honest, 2.0), 1.0, unseen=(0,)))
-    run = told({"warnings": ["one"], "doubts": [], "notes": []}, found)
-    assert len(run["warnings"]) == 3
-    assert len(run["doubts"]) == 1, "a dot that is not seen costs precision, a rate spoils every velocity"
-    assert [item["check"] for item in run["declaration"]] == ["dot", "gravity and rate"]
+def test_a_dot_that_is_not_seen_costs_precision_and_a_rate_spoils_every_velocity(honest):
+    dot, rate = contradictions(with_dots(at_another_rate(honest, 2.0), 1.0, unseen=(0,)))
+    assert (dot.kind, dot.severity) == (Kind.DOT_UNSEEN, Severity.WARNING)
+    assert (rate.kind, rate.severity) == (Kind.GRAVITY_OR_RATE, Severity.DOUBT)
+
+
+def test_the_view_whose_board_lies_where_the_rim_rolls_is_named(true_motion, as_tracked):
+    """The world is that of a view that leans; the board of another view has the plane that the disc rolls on."""
+    trajectory = as_tracked(true_motion(10.0, 0.2, spin=1.0), np.random.default_rng(1))
+    Q = rotation_from_vector(np.radians(25.0) * np.array([0.6, -0.8, 0.0]))
+    R = Q @ rotation_from_quaternion(trajectory.quaternion)
+    q = np.column_stack([trajectory.q[:, :3] @ Q.T, unwrap_euler(euler_from_rotation(R))])
+    rig = camera_rig((-0.15, -0.4, 0.5), (0.15, -0.4, 0.5))
+    turned = replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)), rig=rig)
+
+    def seen(normal_turn, foot):  # the printed face is 3 mm above the board's foot
+        R_board = rig.R_left_world @ normal_turn
+        return R_board, rig.R_left_world @ (foot + 3e-3 * normal_turn[:, 2]) + rig.t_left_world
+
+    places = {3: seen(np.eye(3), np.zeros(3)), 0: seen(Q, np.zeros(3)), 5: seen(Q, 0.1 * Q[:, 2])}
+    (finding,) = contradictions(turned, boards=Boards(places, 3, 3e-3))
+    assert finding.sentence.startswith(
+        "[table] view: 0 would fit (declared 3): view 3 does not lie on the table; view 0"
+    )
+    (unnamed,) = contradictions(turned, boards=Boards({3: places[3], 5: places[5]}, 3, 3e-3))
+    assert unnamed.remedies[0].fits == ""
+
+
+@pytest.mark.parametrize(
+    ("declared", "height", "first"),
+    [
+        (0.0, -3.0, "[table] board_thickness_mm: 3.00 would fit (declared 0)"),
+        (3.0, 1.0, "[disc] thickness_mm: 7.00 would fit (declared 6)"),
+        (1.0, 2.0, "[disc] thickness_mm: 8.00 would fit (declared 6)"),
+    ],
+)
+def test_the_thickness_that_would_put_the_rim_on_the_table_is_named(declared, height, first, honest):
+    seen = {"height": Number(1e3 * height, "um")}
+    off = Finding(Kind.TABLE_DISAGREES, Severity.DOUBT, "", numbers=seen)
+    (found,) = thickness(honest.disc, 1e-3 * declared, [off])
+    assert str(found.remedies[0]) == first
+    assert len(found.remedies) == (1 if declared - height < 0 else 2)
+    assert leading([off, found]) == (found,)
+    assert not thickness(honest.disc, 1e-3 * declared, [replace(off, severity=Severity.WARNING)])

@@ -12,7 +12,7 @@ from calibration.rig_file import read_rig
 from disctrack.calibrate.views import find_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
-from disctrack.trajectory.file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_details, read_trajectory
 from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]
@@ -69,7 +69,7 @@ def test_poses_from_mraw_of_8_bit_are_those_from_png_to_the_last_bit(recording, 
     assert "exposure 50 us, trigger Start" in output
     found = recording / "results" / "trajectory.h5"
     assert_array_equal(read_trajectory(found).q, from_png_of_50_us.q)
-    headers = read_findings(found)["camera_headers"]
+    headers = read_details(found)["camera_headers"]
     assert headers["right"]["exposure"] == pytest.approx(5e-5)
     assert headers["left"]["saturation"] == 255
     assert main(["run", str(recording), *QUICK]) == 0
@@ -103,7 +103,7 @@ def test_poses_and_times_from_cine_are_those_from_png(recording, from_png, bits)
     else:  # as for 12 bit above
         assert (np.abs(trajectory.q - from_png.q) <= 1e-5 * from_png.coordinate_sigma).all()
     assert_allclose(trajectory.time, from_png.time, atol=2**-29)  # stamps have 2**-30 s
-    assert read_findings(found)["camera_headers"]["left"]["first_frame"] == -5
+    assert read_details(found)["camera_headers"]["left"]["first_frame"] == -5
 
 
 def test_a_declared_exposure_that_no_header_confirms_is_told(recording, capsys):
@@ -164,7 +164,7 @@ def test_doubts_about_the_headers_are_told_and_kept(recording, capsys):
     use_files(recording, "raw/left.cih", "raw/right.cih")
     assert main(["run", str(recording), *QUICK]) == 0
     assert "the cameras exposed for different times" in capsys.readouterr().out
-    assert "left 50 us" in "".join(read_findings(recording / "results" / "trajectory.h5")["warnings"])
+    assert "left 50 us" in "".join(f.text for f in read_trajectory(recording / "results" / "trajectory.h5").findings)
 
 
 def test_a_part_of_a_recording_keeps_the_time_of_every_frame(recording):

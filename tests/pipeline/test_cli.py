@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.cli import COMMANDS, main
 from disctrack.trajectory import FrameStatus
-from disctrack.trajectory.file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_details, read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 
@@ -177,7 +177,7 @@ def test_an_unreadable_image_is_one_lost_camera_and_the_exit_code_says_so(record
     assert trajectory.frame_status[7] == FrameStatus.ONE_CAMERA
     others = np.delete(trajectory.frame_status, [7, 11])
     assert (others == FrameStatus.MEASURED).all()
-    assert len(read_findings(recording / "results" / "trajectory.h5")["unreadable"]) == 3
+    assert len(read_details(recording / "results" / "trajectory.h5")["unreadable"]) == 3
     assert main(["run", str(recording), *QUICK]) == 3  # reused, and still incomplete
 
 

@@ -17,7 +17,7 @@ from disctrack.synthetic import read_truth
 from disctrack.synthetic import recording as render_recording
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import FrameStatus
-from disctrack.trajectory.file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_details, read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 
@@ -26,7 +26,7 @@ def measured(recording, code: int = 0):
     """Trajectory and findings of a run that ends with this exit code."""
     assert main(["run", str(recording), *QUICK]) == code
     file = recording / "results" / "trajectory.h5"
-    return read_trajectory(file), read_findings(file)
+    return read_trajectory(file), read_details(file)
 
 
 @pytest.fixture(scope="session")

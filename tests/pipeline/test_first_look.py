@@ -126,7 +126,8 @@ def test_check_names_the_file_of_a_view_that_is_not_used(sample_clip, tmp_path, 
     views[-1].unlink()
     cv2.imwrite(str(views[-1]), blank)
     main(["check", str(folder)])
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if "left out" in line)
+    line = re.sub(r"\s+", " ", capsys.readouterr().out).partition("left out")[2]
+    assert line
     assert str(views[-1]) in line
     assert not re.search(r"view \d", line)  # a number among those that were looked at means nothing to a reader
 
@@ -197,12 +198,11 @@ def checked(folder: Path, capsys) -> tuple[int, str]:
 
 @pytest.mark.statistical
 def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, capsys):
-    assert main(["check", str(sample_clip), "-o", str(tmp_path / "check.png")]) == 0
+    assert main(["check", str(sample_clip), "-v", "-o", str(tmp_path / "check.png")]) == 0
     told = capsys.readouterr().out
-    assert "\nfix " not in told
-    assert "\nlook " not in told
+    assert not re.search(r"^(refusal|doubt|warning) ", told, re.MULTILINE)
     for what in ("declaration", "frames", "chessboard", "light", "dots", "sharpness", "accuracy"):
-        assert f"fine  {what}" in told
+        assert f"\n{what} " in told
     assert cv2.imread(str(tmp_path / "check.png")) is not None
 
 
@@ -229,15 +229,15 @@ FAULTS = {
     "other corners": (lambda f: declare(f, "[9, 6]", "[8, 5]"), "inner_corners = [9, 6]", 1),
     "no dot there": (lambda f: declare(f, "[6.5000, -11.2583]", "[0.5, 0.5]"), "dot 5", 1),
     "twice the rate": (
-        lambda f: declare(f, "frame_rate_hz = 1000.0", "frame_rate_hz = 2000.0"), "frame_rate_hz = 2000 would be", 1,
+        lambda f: declare(f, "frame_rate_hz = 1000.0", "frame_rate_hz = 2000.0"), "1000 would fit (declared 2000)", 1,
     ),
-    "gravity in mm": (lambda f: declare(f, "g_m_s2 = 9.81", "g_m_s2 = 9810.0"), "if it was given in mm/s^2", 1),
-    "wrong square": (lambda f: declare(f, "square_mm = 6.0", "square_mm = 6.1"), "square_mm = 6.1 would be 6;", 1),
-    "short side first": (lambda f: declare(f, "[9, 6]", "[6, 9]"), "would be [9, 6]", 1),
-    "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "lowest point", 1),
+    "gravity in cm": (lambda f: declare(f, "g_m_s2 = 9.81", "g_m_s2 = 981.0"), "g_m_s2: 9.8", 1),
+    "wrong square": (lambda f: declare(f, "square_mm = 6.0", "square_mm = 6.1"), "6.00 would fit (declared 6.1)", 1),
+    "short side first": (lambda f: declare(f, "[9, 6]", "[6, 9]"), "[9, 6] would fit", 1),
+    "wrong thickness": (lambda f: declare(f, "thickness_mm = 6.0", "thickness_mm = 6.5"), "_mm: 6.00 would fit", 1),
     "cameras exchanged": (
         lambda f: declare(declare(f, 'left = "left/', 'left = "_') or f, 'right = "right/', 'right = "left/')
-        or declare(f, 'left = "_', 'left = "right/'), "left and right are exchanged", 1,
+        or declare(f, 'left = "_', 'left = "right/'), "the left and right images are exchanged", 1,
     ),
     "one frame late": (renumber_right, "right frame i+1 show the same instant", 1),
     "three frames late": (lambda f: renumber_right(f, 3), "right frame i+3 show the same instant", 1),
@@ -252,8 +252,8 @@ def test_check_names_the_fault(fault, sample_clip, tmp_path, capsys):
     plant(folder)
     code, told = checked(folder, capsys)
     assert words in told, told
-    assert re.search(r"(^| )(look|fix) ", told), told
+    assert re.search(r"(^| )(warning|doubt|refusal) ", told), told
     if expected is not None:
         assert code == expected, told
     if "late" in fault:  # and it is told once, not by every place looked at and by all that follows from it
-        assert len(re.findall(r"(^| )(look|fix) +(clock|cameras|physics)", told)) == 1, told
+        assert len(re.findall(r"(^| )(warning|doubt|refusal) ", told)) == 1, told

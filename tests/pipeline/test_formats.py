@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 
 from calibration.rig_file import read_rig
 from disctrack.cli import main
-from disctrack.trajectory.file import read_findings, read_trajectory
+from disctrack.trajectory.file import read_trajectory
 
 QUICK = ["--no-figures", "--no-video"]
 CAMERAS = ("left", "right")
@@ -87,7 +87,7 @@ def test_both_cameras_and_their_times_in_one_hdf5_file(recording, from_png, caps
     found = recording / "results" / "trajectory.h5"
     assert_array_equal(read_trajectory(found).time, times)
     assert_array_equal(read_trajectory(found).q, from_png.q)
-    assert any("30 us after" in warning for warning in read_findings(found)["warnings"])
+    assert any("30 us after" in finding.text for finding in read_trajectory(found).findings)
 
 
 def test_deep_video_gives_the_poses_of_its_grey_values(recording, from_png):

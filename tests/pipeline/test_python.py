@@ -7,6 +7,7 @@ import pytest
 
 import disctrack
 from disctrack.errors import TrackingError
+from disctrack.findings import DoubtWarning, Kind, in_doubt
 from disctrack.trajectory import FrameStatus
 
 
@@ -26,17 +27,18 @@ def test_arrays_give_to_the_last_bit_what_files_give(taken):
         found = disctrack.measure_pairs(given, rig, declared.disc, declared.frame_rate)
         for name in ("q", "pose_covariance", "markers_px", "time", "frame_status"):
             assert np.array_equal(getattr(found.trajectory, name), getattr(by_files.trajectory, name)), name
-    assert found.findings["noise"] == by_files.findings["noise"]
+    assert found.details["noise"] == by_files.details["noise"]
 
 
 def test_what_puts_a_result_in_doubt_is_told_of_arrays_too(taken):
     declared, rig, images, by_files = taken
-    assert by_files.findings["doubts"] == []
+    assert not in_doubt(by_files.trajectory.findings)
     centres = declared.disc.marker_centres_body + np.array([[3e-4, 0, 0], *np.zeros((declared.disc.n_markers - 1, 3))])
     wrong = replace(declared.disc, marker_centres_body=centres)
-    found = disctrack.measure_pairs(images, rig, wrong, declared.frame_rate).findings
-    assert any("dots lie off the places declared" in doubt for doubt in found["doubts"])
-    assert set(found["doubts"]) <= set(found["warnings"])
+    with pytest.warns(DoubtWarning, match="dots lie off the places declared") as told:
+        found = disctrack.measure_pairs(images, rig, wrong, declared.frame_rate)
+    assert told[0].filename == __file__, "it points at the line that measures"
+    assert [f.kind for f in found.trajectory.findings if f.doubtful] == [Kind.DOTS_MISPLACED]
 
 
 @pytest.mark.parametrize(

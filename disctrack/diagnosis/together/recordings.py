@@ -31,7 +31,7 @@ from disctrack.discrepancy.noise import THIRD, inflation
 from disctrack.discrepancy.system import Quantity, Values
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.trajectory import MarkerStatus, Trajectory
-from disctrack.trajectory.file import read_findings, read_provenance, read_trajectory
+from disctrack.trajectory.file import read_details, read_provenance, read_trajectory
 
 SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
 SEEN_PLACES = 60  # frames of a recording whose dots tell where the lenses' fields are needed
@@ -53,7 +53,7 @@ def read_recorded(path: Path) -> Recorded:
     declared = provenance.settings.get("recording", {})
     return Recorded(
         provenance.recording,
-        with_declared_dots(read_trajectory(path), read_findings(path)),
+        with_declared_dots(read_trajectory(path), read_details(path)),
         str(declared.get("surface", "")),
         str(declared.get("disc", {}).get("name", "")),
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 from threading import Event, Lock
 
 import numpy as np
@@ -20,6 +20,7 @@ from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.errors import TrackingError
+from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track import pose
 from disctrack.track.follow import following
@@ -34,8 +35,7 @@ from disctrack.track.follow.following import (
     empty_tables,
     follow_block,
 )
-from disctrack.track.judge.doubts import LIE_OFF, LOWEST_POINT, MOVED, ONE_SIDED
-from disctrack.track.judge.dropped_frames import LEFT_OUT
+from disctrack.track.judge.doubts import MOVED
 from disctrack.track.judge.image_arrangement import arrangement_found
 from disctrack.track.judge.moved_camera import moved_camera
 from disctrack.track.judge.wrong_declaration import unlike_declared
@@ -50,7 +50,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
-NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
+DECLARED = (Kind.DOTS_MISPLACED, Kind.OFF_THE_TABLE, Kind.TABLE_DISAGREES)  # of numbers, not of images
 PAIRS_TRIED = 12  # where no disc is found, for what else is wrong: some more than the refinement of a rig takes
 STUCK_FRAMES = 8  # from which the pixels are told that do not see
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
@@ -107,36 +107,36 @@ def track(
         reason = next((f.first_reason for f in followers if f.first_reason), "")
         stop = "" if reason.endswith("?") else "."
         told = f"First search: {reason.rstrip('.')}{stop} {MOVED}" if reason else "No image could be read"
-        if arranged := _arrangement(read_blocks, rig, disc, pairs):
-            told = f"It is there if {arranged}"
-        raise TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}")
+        why = _arrangement(read_blocks, rig, disc, pairs)
+        told = f"Most likely {why[0].sentence}" if why else told
+        text = f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}"
+        raise TrackingError(text, findings=why)
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     taken = Taken(pairs, np.asarray(timestamps, float), frame_rate, gravity)
     tracking = assemble(followers, tables, settings, taken, workers)
     found = tracking.trajectory.disc
-    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not tracking.doubts:
+    faulty = in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
+    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not faulty:
         again = replace(setup, disc=found)
         followers, tables = _followed(read_blocks, edges, again, settings, workers, lambda n: None)
         for follower in followers:
             follower.setup = setup
         tracking = assemble(followers, tables, settings, taken, workers)
-    tracking = replace(tracking, warnings=(*tracking.warnings, *stuck))
+        faulty = in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
+    kinds = {finding.kind for finding in tracking.findings}
     status = tracking.trajectory.frame_status
-    one_sided = any(doubt.startswith(ONE_SIDED) for doubt in tracking.doubts)
-    left_out = any(LEFT_OUT in doubt for doubt in tracking.doubts)  # which makes cameras contradict each other
-    contradicted = one_sided or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
-    far = bool(tracking.doubts) and max(tracking.systematic_px) > FAR_PX
-    if (contradicted or far) and not left_out:
+    contradicted = Kind.ONE_SIDED in kinds or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
+    far = faulty and max(tracking.systematic_px) > FAR_PX
+    arranged: tuple[Finding, ...] = ()
+    if (contradicted or far) and Kind.DROPPED_FRAMES not in kinds:  # which makes cameras contradict each other
         of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
         rows = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))
-        if len(rows) and (arranged := _arrangement(read_blocks, rig, disc, pairs[rows[0] :])):
-            told = f"the dots of both cameras make sense if {arranged}: no pose of this run is right"
-            tracking = replace(tracking, doubts=(told, *tracking.doubts))
+        arranged = _arrangement(read_blocks, rig, disc, pairs[rows[0] :]) if len(rows) else ()
     # in doubt only here: dots found elsewhere than declared are what the second look above is for
-    apart = tracking.table is not None and abs(tracking.table.plane[0]) > NO_TOLERANCE
-    wrong = (LIE_OFF, LOWEST_POINT) if apart else (LIE_OFF,)
-    return replace(tracking, doubts=(*tracking.doubts, *(t for t in tracking.warnings if t.startswith(wrong))))
+    doubt = {Kind.DOTS_MISPLACED: Severity.DOUBT}
+    noticed = (*arranged, *tracking.findings, *stuck)
+    return replace(tracking, findings=tuple(replace(f, severity=doubt.get(f.kind, f.severity)) for f in noticed))
 
 
 def _followed(
@@ -204,8 +204,8 @@ def _followed(
     return followers, tables
 
 
-def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: range) -> str:
-    """Why the disc is not seen as declared, in words, by some of the pairs; "" if nothing explains it.
+def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: range) -> tuple[Finding, ...]:
+    """Why the disc is not seen as declared, by some of the pairs; nothing where nothing explains it.
 
     Images are mirrored or exchanged, a camera was moved, or the dots are others.
     """
@@ -213,12 +213,17 @@ def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: ran
     blocks = [block for pair in chosen for block in read_blocks(pair, pair + 1)]
     images = [block.images[0] for block in blocks if block.readable.all()]
     if not images:
-        return ""
+        return ()
     few = images[:: max(1, len(images) // 2)][:2]
-    return (
-        next(filter(None, (arrangement_found(image, rig, disc) for image in few)), "")
-        or moved_camera(np.array(images), rig, disc)
-        or next(filter(None, (unlike_declared(image, rig, disc) for image in few)), "")
+    return tuple(
+        islice(
+            chain(
+                (finding for image in few for finding in arrangement_found(image, rig, disc)),
+                moved_camera(np.array(images), rig, disc),
+                (finding for image in few for finding in unlike_declared(image, rig, disc)),
+            ),
+            1,
+        )
     )
 
 
@@ -237,8 +242,8 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     return [pairs.start, *(pairs.start + round(k * share) - waited for k in range(1, count)), pairs.stop]
 
 
-def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[str]]:
-    """Blocks without a colour filter's pattern and pixels that do not see, and what is to be said of both."""
+def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[Finding]]:
+    """Blocks without a colour filter's pattern and pixels that do not see, and both as findings."""
     # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
     chosen = np.unique(np.linspace(pairs.start, pairs.stop - 1, STUCK_FRAMES).astype(int)) if len(pairs) else ()
     found = [block.images[block.readable.all(1)].copy() for i in chosen for block in read_blocks(int(i), int(i) + 1)]
@@ -249,14 +254,17 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
             images[:, camera] = _without_mosaic(images[:, camera], pattern)
     stuck = [stuck_pixels(images[:, camera]) for camera in (0, 1)]
     told = [
-        f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
-        + " ".join(f"{gain:.2f}" for gain in pattern.ravel())
-        + "): they are divided by it, which is right for grey discs only; a monochrome camera sees more"
+        (
+            name,
+            f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
+            + " ".join(f"{gain:.2f}" for gain in pattern.ravel())
+            + "): they are divided by it, which is right for grey discs only; a monochrome camera sees more",
+        )
         for name, pattern in zip(frames.CAMERAS, gains, strict=True)
         if pattern is not None
     ]
     told += [
-        f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in for them"
+        (name, f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in")
         for name, mask in zip(frames.CAMERAS, stuck, strict=True)
         if mask is not None
     ]
@@ -274,7 +282,7 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
                         repair(image, mask)
             yield replace(block, images=images)
 
-    return repaired, told
+    return repaired, [Finding(Kind.SENSOR, Severity.WARNING, text, Subject("track", name)) for name, text in told]
 
 
 def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:

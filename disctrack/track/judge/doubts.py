@@ -1,12 +1,13 @@
 """What a run says about its own result: what makes it worse, and what puts it in question."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from calibration.kit.arrays import Array, Mask
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
+from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.track.follow.following import Follower
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
 from disctrack.track.refine.pose_scatter import GROUPS, PoseScatter
@@ -23,25 +24,22 @@ HOPELESS = 25.0  # times the variance of the noise: no result of such dots is ri
 LATE = 0.9  # share of the square of a misfit that a delay explains, from which on it is its cause
 HARDLY = 0.3  # and below which it has no part in it: what a camera that moved leaves looks a little like one
 SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is worth a word
-ONE_SIDED = "the dots of only one camera make sense"
+NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
-MISFIT = "the dots miss their fitted places"
-LIE_OFF = "dots lie off the places declared in [markers]"
-LOWEST_POINT = "the disc's lowest point"
 
 
-def repeats_in_words(repeated: Mask, pairs: range) -> tuple[str, ...]:
+def repeated_images(repeated: Mask, pairs: range) -> Iterator[Finding]:
     """Images that are copies of earlier ones, as (n, 2)."""
-    said = []
     for camera, copies in zip(frames.CAMERAS, (repeated & ~repeated.all(axis=1, keepdims=True)).T, strict=True):
         rows = np.flatnonzero(copies)
         if len(rows):
             shown = ", ".join(str(pairs[row]) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
-            said.append(
+            text = (
                 f"{camera} camera: {len(rows)} image(s) are copies of earlier ones (frame {shown}): the camera or its "
                 "recorder lost these; the frames are measured without them"
             )
-    return tuple(said)
+            where = Subject("track", camera, tuple((pairs[row], pairs[row]) for row in rows))
+            yield Finding(Kind.REPEATED_IMAGES, Severity.DOUBT, text, where)
 
 
 def _table_gap(trajectory: Trajectory) -> Array:
@@ -52,11 +50,11 @@ def _table_gap(trajectory: Trajectory) -> Array:
     return z - trajectory.disc.resting_height(theta)
 
 
-def off_the_table_in_words(trajectory: Trajectory) -> str:
-    """Where the disc's lowest point lies if not on the table, or scatters about it by more than its noise; else ""."""
+def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING) -> tuple[Finding, ...]:
+    """Where the disc's lowest point lies if not on the table, or scatters about it by more than its noise."""
     gap = _table_gap(trajectory)
     if not gap.size:
-        return ""
+        return ()
     psi, theta = trajectory.q[trajectory.measured][:, [3, 4]].T
     disc, C = trajectory.disc, trajectory.pose_covariance[trajectory.measured]
     by_tilt = disc.half_thickness * np.sin(theta) - disc.radius * np.cos(theta)
@@ -64,29 +62,37 @@ def off_the_table_in_words(trajectory: Trajectory) -> str:
     noise = np.median(np.einsum("ni,nij,nj->n", J, C[:, 2:5, 2:5], J))
     spread = 1.4826 * np.median(np.abs(gap - np.median(gap)))
     if max(abs(np.median(gap)), np.sqrt(max(spread**2 - NOISE_ALLOWED * noise, 0.0))) <= MAX_TABLE_GAP:
-        return ""
-    return (
-        f"{LOWEST_POINT} lies {np.median(gap) * 1e6:+.0f} um from the table (scatter "
-        f"{gap.std() * 1e6:.0f} um): thickness of the board or of the disc, radius, or the table view do not fit "
-        "this recording, a camera or both moved since it, or the disc is in the air"
+        return ()
+    seen = Number(1e6 * float(np.median(gap)), "um", 1e6 * float(gap.std()))
+    text = (
+        f"the disc's lowest point lies {seen.value:+.0f} um from the table (scatter {seen.sigma:.0f} um): thickness of "
+        "the board or of the disc, radius, or the table view do not fit this recording, a camera or both moved since "
+        "it, or the disc is in the air"
     )
+    return (Finding(Kind.OFF_THE_TABLE, severity, text, numbers={"height": seen}),)
 
 
-def misplaced_in_words(declared: Disc, found: Array) -> str:
-    """Dots whose places (m, 3) [m] are not where a printer puts them, and what to declare; "" without any."""
+def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
+    """Dots whose places (m, 3) [m] are not where a printer puts them, and what to declare."""
     away = 1e3 * np.linalg.norm(found - declared.marker_centres_body, axis=1)
     far = np.flatnonzero(away > MISPLACED_MM)
     if not len(far):
-        return ""
+        return ()
     named = ", ".join(f"dot {dot} by {away[dot]:.2f} mm" for dot in far)
     centres = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in 1e3 * found[:, :2])
     others = np.delete(away, far)
     rest = f" (the others within {others.max():.3f} mm)" if len(others) else ""
-    return f"{LIE_OFF}: {named}{rest}, counted from 0; centres_mm = [{centres}] fits"
+    text = (
+        f"dots lie off the places declared in [markers]: {named}{rest}, counted from 0. Poses rest on those found; "
+        "that their middle is the disc's is as declared"
+    )
+    of = Subject("track", dot=int(far[0]) if len(far) == 1 else None)
+    remedy = Remedy("[markers] centres_mm", f"[{centres}]")
+    return (Finding(Kind.DOTS_MISPLACED, Severity.WARNING, text, of, remedies=(remedy,)),)
 
 
-def _shaken_in_words(poses: PoseScatter, trajectory: Trajectory) -> str:
-    """Poses that scatter far more than their dots tell, with how far; "" without any."""
+def _shaken(poses: PoseScatter, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Poses that scatter far more than their dots tell, with how far."""
     names = ("horizontal position", "height", "tilt", "turn about the vertical")
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
     told = [
@@ -97,32 +103,43 @@ def _shaken_in_words(poses: PoseScatter, trajectory: Trajectory) -> str:
         for length in [f"{1e6 * sigma:.1f} um" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"]
     ]
     if not told:
-        return ""
-    return (
+        return ()
+    text = (
         f"from frame to frame poses scatter more than their dots tell: {', '.join(told)}. Dots that err alike leave no "
         "residual: a camera or the table trembles, or the frames were compressed as video. The sigmas follow"
     )
+    return (Finding(Kind.POSES_SCATTER, Severity.WARNING, text),)
 
 
-def _cause_in_words(ahead: float, explained: float, frame_rate: float) -> str:
+def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Finding:
     """What makes the two cameras contradict each other in all frames: a delay moves dots as they are fast."""
     if explained < LATE:
         lags = "" if explained < HARDLY else ", or one lags"
-        return (
-            f"a camera moved or was refocused since the calibration{lags} (a delay between the two would explain "
-            f"{100 * explained:.0f} % of it). disctrack diagnose tells which and by how much; calibrate again"
+        text = (
+            f"{seen}: a camera moved or was refocused since the calibration{lags} (a delay between the two would "
+            f"explain {100 * explained:.0f} % of it). `disctrack diagnose` tells which and by how much; calibrate again"
         )
+        # now this, now that dot is struck, which shakes the poses
+        return Finding(Kind.DOTS_MISFIT, Severity.DOUBT, text, explains=(Kind.POSES_SCATTER,))
     early, late = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
-    told = f"{abs(ahead):.2f} frames ({1e3 * abs(ahead) / frame_rate:.2f} ms)"
     whole = round(abs(ahead))
-    again = f": number its images higher by {whole}" if whole and abs(abs(ahead) - whole) < 0.1 * whole else ""
-    return (
-        f"the {early} camera is {told} ahead of the {late} one, which explains {100 * explained:.0f} % of it{again}. "
-        "Check the synchronisation; disctrack diagnose measures a constant delay"
+    again = f"number its images higher by {whole}" if whole and abs(abs(ahead) - whole) < 0.1 * whole else ""
+    text = (
+        f"the {early} camera is {abs(ahead):.2f} frames ({1e3 * abs(ahead) / frame_rate:.2f} ms) ahead of the {late} "
+        f"one, which explains {100 * explained:.0f} % of this: {seen}. `disctrack diagnose` measures a constant delay"
+    )
+    return Finding(
+        Kind.DELAY,
+        Severity.DOUBT,
+        text,
+        Subject("track", early),
+        {"delay": Number(abs(ahead) / frame_rate, "s")},
+        (Remedy(action=again or "check the synchronisation"),),
+        MISFITS,
     )
 
 
-def warnings_of(
+def doubts_of(
     follower: Follower,
     faults: SharedFaults | None,
     scatter: Scatter,
@@ -130,55 +147,67 @@ def warnings_of(
     table: TableFromDisc | None,
     trajectory: Trajectory,
     delay: Callable[[], tuple[float, float]],
-) -> tuple[str, ...]:
-    """One sentence each.
+) -> tuple[Finding, ...]:
+    """What a tracking says about its own result.
 
     delay : frame periods by which the right camera is ahead, and the share of the dots' misfit that this explains
     """
-    warnings = []
+    misplaced = misplaced_dots(follower.setup.disc, trajectory.disc.marker_centres_body)
+    found = [*_one_sided(trajectory), *_symmetric(follower.setup.disc), *_clipped(follower), *misplaced]
     own = scatter.whole if faults is None else max(1.0, faults.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
-    one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
-    if one > both:
-        warnings.append(
-            f"{ONE_SIDED} in {one} of {one + both} measured frames: are left and right "
-            f"exchanged, does the rig belong to this recording, does one camera look at the underside? {MOVED}"
-        )
-    order = symmetry_order(follower.setup.disc)
-    if order > 1:
-        warnings.append(
-            f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
-            "multiples of that (its rate is not affected)"
-        )
-    for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
-        if saturation is not None:
-            warnings.append(
-                f"{camera} camera: the brighter side of the dots' edges is clipped at grey value {saturation}, which "
-                "hides part of them and of the noise: positions may be off by a micrometre. Expose for a shorter time"
-            )
-    if misplaced := misplaced_in_words(follower.setup.disc, trajectory.disc.marker_centres_body):
-        warnings.append(f"{misplaced}. Poses rest on these; that their middle is the disc's is as declared")
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
-        warnings.append(
-            f"{MISFIT} by {np.sqrt(scatter.whole / own):.1f} times their own "
-            f"scatter ({systematic_px:.3f} px): {_cause_in_words(*delay(), trajectory.frame_rate)}"
-        )
+        times = np.sqrt(scatter.whole / own)
+        seen = f"the dots miss their fitted places by {times:.1f} times their own scatter ({systematic_px:.3f} px)"
+        found.append(_misfit(seen, *delay(), trajectory.frame_rate))
     elif scatter.noise > 4.0:
-        warnings.append(
+        text = (
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
             "round, or their edges are not sharp, or the images were processed"
         )
-    # a camera that moved strikes now this, now that dot, which shakes the poses: told above
-    misfit = any(text.startswith(MISFIT) for text in warnings)
-    if (shaken := _shaken_in_words(poses, trajectory)) and not misfit:
-        warnings.append(shaken)
+        found.append(Finding(Kind.DOTS_SCATTER, Severity.WARNING, text))
+    found += _shaken(poses, trajectory)
+    apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
+    severity = Severity.DOUBT if apart else Severity.WARNING
     if table is not None and table.probability < DISAGREE:
-        warnings.append(
-            f"{LOWEST_POINT} does not roll on the board's table: {table.sentence}. They differ by more than "
+        text = (
+            f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
             "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
             "is, a camera moved up or down by about twice as much since the calibration (or both together), or a long "
             "exposure is not declared (exposure_us)"
         )
-    if off := off_the_table_in_words(trajectory):
-        warnings.append(off)
-    return tuple(warnings)
+        height = Number(1e6 * float(table.plane[0]), "um", 1e6 * float(np.hypot(table.sigma[0], table.board_sigma[0])))
+        found.append(Finding(Kind.TABLE_DISAGREES, severity, text, numbers={"height": height},
+                             explains=(Kind.OFF_THE_TABLE,)))  # fmt: skip
+    return (*found, *off_the_table(trajectory, severity))
+
+
+def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
+    one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
+    if one > both:
+        text = (
+            f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
+            f"exchanged, does the rig belong to this recording, does one camera look at the underside? {MOVED}"
+        )
+        yield Finding(Kind.ONE_SIDED, Severity.DOUBT, text, explains=(Kind.POSES_SCATTER, Kind.OFF_THE_TABLE))
+
+
+def _symmetric(disc: Disc) -> Iterator[Finding]:
+    order = symmetry_order(disc)
+    if order > 1:
+        text = (
+            f"the layout of the dots repeats every {360 / order:.0f} deg: the spin angle phi is known only up to "
+            "multiples of that (its rate is not affected)"
+        )
+        yield Finding(Kind.SYMMETRIC_DOTS, Severity.WARNING, text)
+
+
+def _clipped(follower: Follower) -> Iterator[Finding]:
+    for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
+        if saturation is not None:
+            text = (
+                f"{camera} camera: the brighter side of the dots' edges is clipped at grey value {saturation}, which "
+                "hides part of them and of the noise: positions may be off by a micrometre"
+            )
+            advice = (Remedy(action="expose for a shorter time"),)
+            yield Finding(Kind.CLIPPED, Severity.WARNING, text, Subject("track", camera), remedies=advice)

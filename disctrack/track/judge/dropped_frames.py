@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import ranges
+from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS
 from disctrack.track.pose import PoseFits, marker_pixels, whitening
 
 SHORTEST = 4  # frames: a gleam or a hand is told by the frames' own status
-LEFT_OUT = "it left out"
-REFUSED = "are refused: the dots of the two cameras contradict each other"
 THROUGHOUT = 3  # stretches with one and the same delay
 EXPLAINED, TOLD = 0.9, 0.5  # of the square of the misfit: by a slip; or by no delay at all, below
 
 
-def slips_in_words(
+def dropped_frames(
     refused: Mask,
     fits: PoseFits,
     markers_px: Array,
@@ -33,8 +32,8 @@ def slips_in_words(
     rig: StereoRig,
     centres: Array,
     pairs: range,
-) -> tuple[str, ...]:
-    """Sentences on long stretches of frames refused (n,) for their dots; the other arguments as in `fit_poses`."""
+) -> tuple[Finding, ...]:
+    """Long stretches of frames refused (n,) for their dots; the other arguments as in `fit_poses`."""
     delay_of = partial(delay_of_right, fits, markers_px, covariance_px2, rig, centres)
     slips: list[tuple[list[int], int, list[float]]] = []  # rows of each, the images left out, the delays that say so
     unexplained: list[int] = []
@@ -59,19 +58,24 @@ def slips_in_words(
         rows, told = [i for part, _, _ in slips for i in part], [delay for _, _, part in slips for delay in part]
         slips = [(rows, slips[0][1], told)]
     said = []
+    refused_for = "are refused: the dots of the two cameras contradict each other"
     for k, (rows, ahead, delays) in enumerate(slips):
         camera, other = CAMERAS[::-1] if ahead > 0 else CAMERAS
         always = k == 0 and (
             rows[0] <= gap or (rows[0] >= SHORTEST and _as_late(delay_of, np.arange(rows[0]), ahead, fits))
         )
-        said.append(
-            f"frames {ranges([pairs[i] for i in rows])} {REFUSED}, as if the {camera} camera were "
-            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}: {LEFT_OUT} {abs(ahead)} image(s) "
-            f"{'before' if always else 'at'} frame {pairs[0] if always else pairs[rows[0]]}. "
-            f"Number its images from there on higher by {abs(ahead)}"
+        frames, n = [pairs[i] for i in rows], abs(ahead)
+        text = (
+            f"frames {ranges(frames)} {refused_for}, as if the {camera} camera were "
+            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}: it left out {n} image(s) "
+            f"{'before' if always else 'at'} frame {pairs[0] if always else frames[0]}"
         )
+        of = Subject("track", camera, ((frames[0], frames[-1]),))
+        remedy = Remedy(action=f"number its images from there on higher by {n}")
+        said.append(Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, {"images": Number(n)}, (remedy,), MISFITS))
     if unexplained:
-        said.append(f"frames {ranges(unexplained)} {REFUSED}")
+        text = f"frames {ranges(unexplained)} {refused_for}"
+        said.append(Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text))
     return tuple(said)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc, has_mirror_axis
+from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity
 from disctrack.frames import CAMERAS
 from disctrack.track.dots.acquisition import acquire
 
@@ -23,21 +24,25 @@ MIRRORED: dict[str, Turn] = {
 }
 
 
-def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
-    """What was done to the images, in words, where undoing it shows the disc; "" where nothing does.
+def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
+    """What was done to the images, where undoing it shows the disc.
 
     pair : (2, height, width). All but one of the dots must be found in both cameras, and more than as declared.
     """
     enough = max(acquire(pair[0], pair[1], rig, disc).n_explained + 1, 2 * disc.n_markers - 2)
-    found = [(acquire(left, right, rig, layout).n_explained, told) for told, left, right, layout in _ways(pair, disc)]
-    dots, told = max(found)
-    return told if dots >= enough else ""
+    ways = list(_ways(pair, disc))
+    dots = [acquire(left, right, rig, layout).n_explained for _, left, right, layout in ways]
+    best = dots.index(max(dots))
+    if dots[best] >= enough:
+        kind = Kind.MIRRORED if best else Kind.EXCHANGED
+        remedy = Remedy("[cameras] left, right", action="store them as the views are" if best else "exchange the two")
+        yield Finding(kind, Severity.DOUBT, ways[best][0], remedies=(remedy,), explains=NONSENSE)
 
 
 def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, NDArray, NDArray, Disc]]:
     """What may have been done, and the images with that undone."""
     left, right = pair
-    yield "left and right are exchanged", right, left, disc
+    yield "the left and right images are exchanged", right, left, disc
     for what, turn in MIRRORED.items():
         one, other = np.ascontiguousarray(turn(left)), np.ascontiguousarray(turn(right))
         since = "since the chessboard was seen"

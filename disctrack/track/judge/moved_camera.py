@@ -5,6 +5,7 @@ shift of the right camera for all are fitted (`as_printed`, with a rig of which 
 degree and a millimetre or two, as the two make up for each other; enough to say what happened.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig
 from disctrack.disc import Disc
+from disctrack.findings import NONSENSE, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.frames import vector_from_rotation
 from disctrack.track.dots.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
 from disctrack.track.pose import fit_poses
@@ -25,8 +27,8 @@ BETTER = 3.0  # times, than with the camera where it was
 _POSE = np.r_[PAIR_TURN, PAIR_SHIFT]  # of RIG_PARAMETERS: the right camera's turn and shift
 
 
-def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
-    """How the right camera moved against the left one, in words; "" where that does not explain what is seen.
+def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
+    """How the right camera moved against the left one, where that explains what is seen.
 
     pairs : (n, 2, height, width), from all over the recording; fewer than MIN_FRAMES with dots tell nothing
     """
@@ -35,7 +37,7 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
     pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
     good = np.isfinite(pixels).all(-1).sum(axis=2).min(axis=1, initial=disc.n_markers) >= MIN_EXPLAINED
     if good.sum() < MIN_FRAMES:
-        return ""
+        return
     pixels = pixels[good]
     R, t = (np.array([pair[0][k] for pair in seen])[good] for k in (1, 2))
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2))
@@ -58,10 +60,12 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> str:
     rms = BLOB_PX * np.sqrt([found.reduced_chi_square_before, found.reduced_chi_square_after])
     turn = np.linalg.norm(vector_from_rotation(found.rig.R_right_left @ rig.R_right_left.T))
     shift = np.linalg.norm(found.rig.t_right_left - rig.t_right_left)
-    if not (rms[-1] < FITS_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS):
-        return ""
-    return (
-        f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm against "
-        f"the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
-        f"{rms[0]:.1f} as calibrated); calibrate again"
-    )
+    if rms[-1] < FITS_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS:
+        text = (
+            f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm "
+            f"against the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
+            f"{rms[0]:.1f} as calibrated)"
+        )
+        sizes = {"turn": Number(float(np.degrees(turn)), "deg"), "shift": Number(1e3 * float(shift), "mm")}
+        advice = (Remedy(action="calibrate again"),)
+        yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)

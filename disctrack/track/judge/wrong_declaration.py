@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
+from disctrack.findings import NONSENSE, Finding, Kind, Number, Remedy, Severity
 from disctrack.track.dots.acquisition import (
     EPIPOLAR_PX,
     MIN_EXPLAINED,
@@ -20,7 +21,7 @@ from disctrack.track.dots.acquisition import (
     rigid_motions,
     seen_by_one_camera,
 )
-from disctrack.track.judge.doubts import misplaced_in_words
+from disctrack.track.judge.doubts import misplaced_dots
 from disctrack.track.refine.self_calibration import declared_places_kept
 
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
@@ -42,27 +43,29 @@ class SeenDots:
     misfit_px: float  # largest, of the blobs against one point in space
 
 
-def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> str:
-    """Which declared number makes no sense, in words, and what it should be; "" where that is not seen.
+def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+    """Which declared number makes no sense, and what it should be, where that is seen.
 
     pair : (2, height, width), images of the left and the right camera
     """
     several = list(_seen_dots(pair, rig, disc))
     if not several:
-        return ""
+        return ()
     seen = max(several, key=lambda found: found.which.sum())
     if abs(np.log(seen.scale)) > SIDE_TOLERANCE:
-        return _scale_in_words(seen.scale)
+        return (_on_another_scale(seen.scale),)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
     # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
     sizes = [np.median(np.sqrt(found.areas / _areas(found, R, rig, disc))) for found in several]
     diameter = disc.marker_diameter * float(np.median(sizes))
     if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
-        return f"[markers] diameter_mm is about {1e3 * diameter:.2g}, not {1e3 * disc.marker_diameter:g}"
+        remedy = Remedy("[markers] diameter_mm", f"{1e3 * diameter:.2g}", f"{1e3 * disc.marker_diameter:g}")
+        text = "the dots' images are of another size"
+        return (Finding(Kind.DIAMETER, Severity.DOUBT, text, remedies=(remedy,), explains=NONSENSE),)
     if not seen.which.all() or seen.misfit_px > MEETING_PX:
-        return ""
+        return ()
     shift = (seen.points - t) @ R - disc.marker_centres_body
-    return misplaced_in_words(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
+    return misplaced_dots(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
 
 
 def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
@@ -94,8 +97,12 @@ def _areas(seen: SeenDots, R: Array, rig: StereoRig, disc: Disc) -> Array:
     return np.asarray(0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1), axis=-1)))
 
 
-def _scale_in_words(scale: float) -> str:
+def _on_another_scale(scale: float) -> Finding:
     units = [words for unit, words in UNITS.items() if abs(abs(np.log(scale)) / np.log(unit) - 1) < 0.02]
-    mixed = f" (are {units[0]} mixed up?)" if units else ""
-    disc, board = (f"{float(f'{factor:.3g}'):g} times" for factor in (scale, 1 / scale))
-    return f"every length of [disc] and [markers] is {disc} the declared one, or [calibration] square_mm {board}{mixed}"
+    mixed = f": are {units[0]} mixed up?" if units else ""
+    disc, board = (f"times {float(f'{factor:.3g}'):g}" for factor in (scale, 1 / scale))
+    keys = "[calibration] square_mm", "every length of [disc] and [markers]"
+    remedies = Remedy(keys[0], action=board), Remedy(keys[1], action=disc)
+    text = f"the dots are {scale:.3g} times as far apart as declared{mixed}"
+    found = {"scale": Number(scale)}
+    return Finding(Kind.LENGTHS, Severity.DOUBT, text, numbers=found, remedies=remedies, explains=NONSENSE)

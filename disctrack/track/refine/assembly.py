@@ -13,11 +13,12 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import normal_of_rows
 from disctrack import frames
 from disctrack.disc import Disc
+from disctrack.findings import Finding
 from disctrack.track.dots.template import NoiseModel, TemplateLimits
 from disctrack.track.dots.template_response import Pull
 from disctrack.track.follow.following import Follower, Tables, TrackingSetup, repeats
-from disctrack.track.judge.doubts import FAULTY, MISFIT, ONE_SIDED, repeats_in_words, warnings_of
-from disctrack.track.judge.dropped_frames import LEFT_OUT, delay_of_right, slips_in_words
+from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
+from disctrack.track.judge.dropped_frames import delay_of_right, dropped_frames
 from disctrack.track.judge.outlier_tests import Verdicts, judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import PoseFits, fit_poses, misses
 from disctrack.track.refine.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
@@ -73,8 +74,7 @@ class Tracking:
     table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
     exposure: Exposure  # that the dots were moved by
     acquisitions: int  # times the disc had to be searched for without a prior and was found
-    warnings: tuple[str, ...]
-    doubts: tuple[str, ...] = ()  # what puts the result in question: images that are copies of others
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,7 @@ def assemble(
     trajectory = _trajectory(fits, verdicts, systematic, tables, as_built, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    warnings = (*exposure.warnings, *warnings_of(first, faults, scatter, poses, table, trajectory, delay))
-    if any(LEFT_OUT in text for text in slips):  # which is why each camera is believed alone
-        warnings = tuple(text for text in warnings if not text.startswith(ONE_SIDED))
+    doubts = doubts_of(first, faults, scatter, poses, table, trajectory, delay)
     return Tracking(
         trajectory=trajectory,
         noise=first.law.noise,
@@ -128,12 +126,7 @@ def assemble(
         table=table,
         exposure=exposure,
         acquisitions=sum(f.acquisitions for f in followers),
-        warnings=warnings,
-        doubts=(
-            *repeats_in_words(repeated, taken.pairs),
-            *slips,
-            *(text for text in warnings if text.startswith((MISFIT, ONE_SIDED))),
-        ),
+        findings=(*repeated_images(repeated, taken.pairs), *slips, *exposure.findings, *doubts),
     )
 
 
@@ -208,7 +201,7 @@ def _scattered(
 
 def _judged(
     fits: PoseFits, tables: Tables, as_built: AsBuilt, repeated: Mask, outlying: Mask, taken: Taken, workers: int
-) -> tuple[PoseFits, Verdicts, tuple[str, ...]]:
+) -> tuple[PoseFits, Verdicts, tuple[Finding, ...]]:
     """Poses without those that are refused, what each is worth, and exchanged images in words."""
     struck = (np.isfinite(tables.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
     verdicts = judge_poses(
@@ -216,9 +209,9 @@ def _judged(
     )
     contradicted = verdicts.status == FrameStatus.CONTRADICTED
     centres = as_built.disc.marker_centres_body
-    slips = slips_in_words(contradicted, fits, tables.pixels, tables.covariance_px2, as_built.rig, centres, taken.pairs)
+    slips = dropped_frames(contradicted, fits, tables.pixels, tables.covariance_px2, as_built.rig, centres, taken.pairs)
     fits.covariance[...] *= verdicts.factor[:, None, None]
-    return replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED)), verdicts, tuple(slips)
+    return replace(fits, converged=fits.converged & (verdicts.status == FrameStatus.MEASURED)), verdicts, slips
 
 
 def _on_the_table(

@@ -29,6 +29,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
+from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
 from disctrack.track.dots.template_response import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 from disctrack.track.pose import marker_pixels
@@ -59,8 +60,7 @@ class Exposure(NamedTuple):
     """What was taken off, and what is to be told of it."""
 
     seconds: tuple[float, float]  # [s] of the left and the right camera
-    note: str = ""
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def shift_by_exposure(
@@ -132,19 +132,17 @@ def exposure_of(found: ExposureSquared, declared: tuple[float, float] | None, lo
     if declared is None:
         seconds = _likely(found, longest)
         note = f"exposure by the smear of the moving dots: {told}; poses are of the middle of {1e6 * seconds:.0f} us"
-        return Exposure((seconds, seconds), note=note if seconds else "")
+        return Exposure((seconds, seconds), (Finding(Kind.EXPOSURE, Severity.NOTE, note),) if seconds else ())
     expected = np.array(declared) ** 2
     doubt = np.hypot(found.sigma, APPROXIMATE * np.fmax(np.abs(found.value), expected))
     if not (np.abs(found.value - expected) > CONTRADICTS * doubt).any():
         return Exposure(declared)
     said = " and ".join(f"{1e6 * T:g}" for T in declared)
-    return Exposure(
-        declared,
-        warnings=(
-            f"exposure_us is declared (or in the cameras' headers) as {said} us, the smear of the moving dots tells "
-            f"{told}. The declared one is used: poses are off by up to g T^2 / (6 r) in theta if it is wrong",
-        ),
+    text = (
+        f"exposure_us is declared (or in the cameras' headers) as {said} us, the smear of the moving dots tells "
+        f"{told}. The declared one is used: poses are off by up to g T^2 / (6 r) in theta if it is wrong"
     )
+    return Exposure(declared, (Finding(Kind.EXPOSURE, Severity.WARNING, text),))
 
 
 def _likely(found: ExposureSquared, longest: float) -> float:

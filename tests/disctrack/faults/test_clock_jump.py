@@ -8,6 +8,7 @@ import pytest
 from disctrack.analyse.declaration import contradictions
 from disctrack.diagnosis import diagnose
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
+from disctrack.findings import Kind
 from tests.oracles.measured_disc import measured
 
 FRAME = 50
@@ -35,10 +36,10 @@ def test_lost_pairs_are_counted_and_their_place_is_told(rolling, k):
 
 def test_a_run_puts_the_result_in_doubt_and_names_frame_and_number(rolling):
     found = contradictions(without(rolling, [FRAME, FRAME + 1]))
-    (lost,) = (one for one in found if one.check == "clock")
-    assert lost.spoils
+    (lost,) = (one for one in found if one.kind == Kind.CLOCK_JUMP)
+    assert lost.doubtful
     assert f"frame {FRAME}: the clock jumps by 2 frame(s)" in lost.sentence
-    assert not [one for one in contradictions(rolling) if one.check == "clock"]
+    assert not [one for one in contradictions(rolling) if one.kind == Kind.CLOCK_JUMP]
 
 
 def test_two_losses_are_two_and_the_right_times_come_back(rolling):

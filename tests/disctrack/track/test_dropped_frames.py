@@ -25,6 +25,6 @@ def test_one_delay_in_three_stretches_is_one_sentence(monkeypatch, delays, sente
 
     monkeypatch.setattr(slips, "delay_of_right", delay_of_right)
     fits, nothing = SimpleNamespace(residuals_px=np.zeros((60, 2, 4, 2))), np.zeros(0)
-    told = slips.slips_in_words(stretch > 0, fits, nothing, nothing, None, nothing, range(60))
+    told = slips.dropped_frames(stretch > 0, fits, nothing, nothing, None, nothing, range(60))
     assert len(told) == sentences
-    assert where in told[0]
+    assert where in told[0].text

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, measure_pairs, read_recording, rolling
 from disctrack.errors import RecordingError
+from disctrack.findings import Kind, Severity
 from disctrack.synthetic import render_disc
 from disctrack.track.dots import template_response as template_pull
 from disctrack.track.dots.template import NoiseModel, locate_on_plane
@@ -173,15 +174,20 @@ def test_theta_is_that_of_mid_exposure(measured, rendered_pairs):
     assert np.mean(errors[2]) == pytest.approx(0.0, abs=4 * sigma)  # nobody tells
 
 
+def said_of(run, severity):
+    found = run.trajectory.findings
+    return [f.text for f in found if (f.kind, f.severity) == (Kind.EXPOSURE, severity)]
+
+
 @pytest.mark.statistical
 def test_the_smear_tells_the_exposure(measured):
     _, (none, told, smeared, wrong) = measured
-    assert smeared.findings["exposure_s"] == pytest.approx([EXPOSURE, EXPOSURE], rel=0.1)
-    assert "exposure by the smear" in smeared.findings["notes"][0]
-    assert told.findings["exposure_s"] == [EXPOSURE, EXPOSURE]
-    assert not [text for text in told.findings["warnings"] if "smear" in text]
+    assert smeared.details["exposure_s"] == pytest.approx([EXPOSURE, EXPOSURE], rel=0.1)
+    assert "exposure by the smear" in said_of(smeared, Severity.NOTE)[0]
+    assert told.details["exposure_s"] == [EXPOSURE, EXPOSURE]
+    assert not said_of(told, Severity.WARNING)
     for run, said in ((none, "0 and 0 us"), (wrong, "200 and 200 us")):
-        (warning,) = [text for text in run.findings["warnings"] if "smear" in text]
+        (warning,) = said_of(run, Severity.WARNING)
         assert said in warning
 
 
@@ -210,8 +216,8 @@ def test_no_smear_where_nothing_was_smeared(rendered_pairs, motion):
             q[:, 4], rendered_pairs.rig, rendered_pairs.disc, scene, np.random.default_rng(4), qdot=moving
         )
         run = measure_pairs(images, rendered_pairs.rig, rendered_pairs.disc, RATE)
-        assert run.findings["exposure_s"] == [0.0, 0.0]
-        assert run.findings["notes"] == []
+        assert run.details["exposure_s"] == [0.0, 0.0]
+        assert said_of(run, Severity.NOTE) == []
 
 
 @pytest.mark.statistical

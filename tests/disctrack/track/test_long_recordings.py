@@ -126,6 +126,6 @@ def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_
     for name, value in vars(one.trajectory).items():
         if isinstance(value, np.ndarray):
             assert value.tobytes() == getattr(three.trajectory, name).tobytes(), name
-    assert (one.warnings, one.doubts, one.shared_sigma) == (three.warnings, three.doubts, three.shared_sigma)
+    assert (one.findings, one.shared_sigma) == (three.findings, three.shared_sigma)
     other = by(3, np.nextafter(pixels, np.inf))  # what one unit in the last place does is seen
     assert other.trajectory.q.tobytes() != one.trajectory.q.tobytes()

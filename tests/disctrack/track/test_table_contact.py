@@ -15,7 +15,7 @@ from disctrack.frames import (
     rotation_from_quaternion,
     unwrap_euler,
 )
-from disctrack.track.judge.doubts import off_the_table_in_words
+from disctrack.track.judge.doubts import off_the_table
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine import table_contact
 from disctrack.track.refine.self_calibration import motions_of_pattern
@@ -157,8 +157,8 @@ def test_scatter_about_the_table_is_told_where_noise_does_not_explain_it():
     """A noisy recording's lowest point scatters by 40 um as stated: no thickness is to be suspected for that."""
     trajectory, sigma = measured(n=200), 40e-6
     trajectory.q[:, 2] += sigma * np.random.default_rng(1).normal(size=len(trajectory))
-    assert "lowest point" in off_the_table_in_words(trajectory)  # poses are stated as sure as before
+    assert off_the_table(trajectory)  # poses are stated as sure as before
     trajectory.pose_covariance[:, 2, 2] += sigma**2
-    assert off_the_table_in_words(trajectory) == ""
+    assert not off_the_table(trajectory)
     trajectory.q[:, 2] += 3e-5
-    assert "+" in off_the_table_in_words(trajectory)  # a height that all frames share is none of the noise
+    assert off_the_table(trajectory)[0].numbers["height"].value > 0  # that all frames share

@@ -9,6 +9,7 @@ import pytest
 from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
+from disctrack.findings import Kind
 from disctrack.synthetic import render_disc
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.follow.tracking import STUCK_FRAMES, TrackingSettings, _as_one_sensor, track
@@ -258,7 +259,7 @@ def test_a_symmetric_layout_is_announced(rolling, rendered_pairs):
     images, _ = rolling
     four = replace(rendered_pairs.disc, marker_centres_body=rendered_pairs.disc.marker_centres_body[[0, 1, 3, 4]])
     result = track(blocks_of(images[:12]), range(12), rendered_pairs.rig, four, 1000.0)
-    assert any("repeats every 180 deg" in warning for warning in result.warnings)
+    assert any("repeats every 180 deg" in f.text for f in result.findings)
 
 
 @pytest.mark.parametrize("keep", [[0, 3], [0, 3, 6]])
@@ -272,12 +273,12 @@ def test_dots_that_carry_no_pose_are_refused(rendered_pairs, keep):
 def test_a_table_that_is_not_where_the_rig_says_is_announced(rolling, rendered_pairs):
     images, _ = rolling
     good = track(blocks_of(images[:12]), range(12), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    assert not any("from the table" in warning for warning in good.warnings)
+    assert not any("from the table" in f.text for f in good.findings)
     thicker = replace(
         rendered_pairs.rig, t_left_world=rendered_pairs.rig.t_left_world + 1e-4 * rendered_pairs.rig.R_left_world[:, 2]
     )
     off = track(blocks_of(images[:12]), range(12), thicker, rendered_pairs.disc, 1000.0)
-    assert any("-100 um from the table" in warning for warning in off.warnings)
+    assert any("-100 um from the table" in f.text for f in off.findings)
 
 
 def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rendered_pairs):
@@ -304,7 +305,8 @@ def test_what_hardly_moves_for_a_millisecond_is_no_stuck_pixel(rng):
     assert _as_one_sensor(blocks_of(images), range(n))[1] == []
     images[:, 1, 5, 5] = 255
     read, told = _as_one_sensor(blocks_of(images), range(n))
-    assert told == ["right camera: 1 pixels show one value whatever passes; their neighbours stand in for them"]
+    assert [(f.kind, f.subject.camera) for f in told] == [(Kind.SENSOR, "right")]
+    assert told[0].text == "right camera: 1 pixels show one value whatever passes; their neighbours stand in"
     assert all((block.images[:, 1, 5, 5] < 210).all() for block in read(0, n))
 
 
@@ -320,9 +322,9 @@ def test_behind_a_colour_filter_the_disc_is_measured_as_without(rolling, rendere
         return blocks_of(filtered.copy())(start, stop)
 
     result = track(read, range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    assert sum("a colour filter lies on the sensor" in warning for warning in result.warnings) == 2
+    assert sum("a colour filter lies on the sensor" in f.text for f in result.findings) == 2
     plain = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
-    assert not any("colour filter" in warning for warning in plain.warnings)
+    assert not any("colour filter" in f.text for f in plain.findings)
     rms = [np.sqrt(np.mean(errors(t.trajectory, q) ** 2, axis=0)) for t in (plain, result)]
     # rounding to grey values that are 0.55 and 0.75 as large adds 1/12 of their square to the noise
     assert (rms[1] < 1.6 * rms[0]).all()

@@ -22,6 +22,7 @@ from calibration.cameras.splines import LensField
 from disctrack.disc import MA_2014
 from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable
+from disctrack.findings import DoubtWarning, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.trajectory import FrameStatus, Trajectory
 from disctrack.trajectory import file as storage
@@ -30,6 +31,8 @@ from disctrack.trajectory.file import (
     Group,
     Provenance,
     is_result_of,
+    read_details,
+    read_findings,
     read_group,
     read_provenance,
     read_trajectory,
@@ -217,11 +220,46 @@ def test_the_csv_keeps_an_angle_after_a_thousand_turns(tmp_path, trajectory):
     assert_allclose(float(rows[7]["phi_deg"]), np.degrees(turned.q[7, 5]), atol=1e-7)
 
 
-def test_findings_are_json_for_every_reader(tmp_path, trajectory):
-    findings = {"size": {"sigma": np.nan}, "blur_px": (0.7, np.inf)}
-    write_trajectory(tmp_path / "t.h5", trajectory, PROVENANCE, findings=findings)
+SEEN = Finding(
+    Kind.SQUARE,
+    Severity.DOUBT,
+    "on another scale",
+    Subject("track", frames=((3, 7),)),
+    {"scale": Number(0.9877, "", 1e-4)},
+    (Remedy("square_mm", "8.00", "8.1"),),
+    (Kind.RADIUS,),
+)
+
+
+def test_findings_come_back_and_doubts_are_python_warnings(tmp_path, trajectory):
+    noticed = dataclasses.replace(trajectory, findings=(SEEN, Finding(Kind.EXPOSURE, Severity.NOTE, "by the smear")))
+    write_trajectory(tmp_path / "t.h5", noticed, PROVENANCE)
+    with pytest.warns(DoubtWarning, match="8.00 would fit") as told:
+        again = read_trajectory(tmp_path / "t.h5")
+    assert again.findings == noticed.findings == read_findings(tmp_path / "t.h5")
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    write_trajectory(tmp_path / "clean.h5", trajectory, PROVENANCE)
+    assert read_trajectory(tmp_path / "clean.h5").findings == ()
+
+
+def test_a_file_of_an_earlier_version_gives_its_sentences(tmp_path, trajectory):
+    write_trajectory(tmp_path / "t.h5", trajectory, PROVENANCE)
+    with h5py.File(tmp_path / "t.h5", "r+") as handle:
+        handle.attrs["findings"] = json.dumps({"warnings": ["one", "two"], "doubts": ["two"], "blur_px": [0.7, 0.8]})
+        del handle.attrs["details"]
+    assert [(f.kind, f.severity, f.text) for f in read_findings(tmp_path / "t.h5")] == [
+        (Kind.OTHER, Severity.WARNING, "one"),
+        (Kind.OTHER, Severity.DOUBT, "two"),
+    ]
+    assert read_details(tmp_path / "t.h5")["blur_px"] == [0.7, 0.8]
+
+
+def test_details_are_json_for_every_reader(tmp_path, trajectory):
+    details = {"size": {"sigma": np.nan}, "blur_px": (0.7, np.inf)}
+    write_trajectory(tmp_path / "t.h5", trajectory, PROVENANCE, details=details)
     with h5py.File(tmp_path / "t.h5") as handle:
-        assert json.loads(handle.attrs["findings"], parse_constant=pytest.fail) == {
+        assert json.loads(handle.attrs["details"], parse_constant=pytest.fail) == {
             "size": {"sigma": None},
             "blur_px": [0.7, None],
         }
@@ -233,16 +271,17 @@ def test_what_was_found_and_chosen_are_plain_attributes_that_a_later_stage_keeps
     xarray = pytest.importorskip("xarray")
     pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
     path = tmp_path / "t.h5"
-    findings = {
-        "warnings": ["one", "two"], "notes": [], "blur_px": (0.7, np.inf), "first_pass": {"moves": True, "start": 3},
+    details = {
+        "words": ["one", "two"], "notes": [], "blur_px": (0.7, np.inf), "first_pass": {"moves": True, "start": 3},
         "noise": [{"read": 1.0}], "shared_sigma": [[1e-7, "the views"]], "none": None,
     }  # fmt: skip
-    write_trajectory(path, trajectory, PROVENANCE, findings=findings)
+    write_trajectory(path, dataclasses.replace(trajectory, findings=(SEEN,)), PROVENANCE, details=details)
     write_group(path, "later", {}, attributes={"found": {"km.k_m": {"value": 1.5}}})
     tree = xarray.open_datatree(path, engine=engine)
     found = tree["findings"].attrs
-    assert set(found) == {"warnings", "notes", "blur_px"}  # objects in lists, and nothing, stand in the JSON alone
-    assert found["warnings"] == "one\ntwo"
+    assert set(found) == {"told", "words", "notes", "blur_px"}  # objects in lists, and nothing, stand in the JSON alone
+    assert found["words"] == "one\ntwo"
+    assert found["told"] == f"doubt: {SEEN.sentence}"
     assert_array_equal(found["blur_px"], (0.7, np.inf))
     assert dict(tree["findings/first_pass"].attrs) == {"moves": 1, "start": 3}
     assert tree["made_from/inputs_sha256"].attrs == PROVENANCE.inputs

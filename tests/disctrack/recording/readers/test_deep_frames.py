@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc
+from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic import render_disc, rig_of
 from disctrack.synthetic.description import Scene, load_scene
@@ -78,9 +79,10 @@ def test_predicted_sigmas_hold_for_twelve_bits(dim, plain):
 def test_clipped_light_is_told_and_light_below_it_is_not(dim):
     images, rig, disc, _ = dim
     clipped = np.minimum(images, np.uint16(0.9 * np.percentile(images, 98)))
-    assert not any("clipped" in warning for warning in follow(images, rig, disc).warnings)
-    warnings = follow(clipped, rig, disc).warnings
-    assert [w.split()[0] for w in warnings if f"clipped at grey value {clipped.max()}" in w] == ["left", "right"]
+    assert Kind.CLIPPED not in {finding.kind for finding in follow(images, rig, disc).findings}
+    found = [finding for finding in follow(clipped, rig, disc).findings if finding.kind == Kind.CLIPPED]
+    assert [finding.subject.camera for finding in found] == ["left", "right"]
+    assert all(f"clipped at grey value {clipped.max()}" in finding.text for finding in found)
 
 
 def test_the_overlay_shows_deep_frames_as_bright_as_those_of_eight_bits(dim, plain, rng):
