@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+Addresses: TypeAlias = NDArray[np.int64]
 
 
 def _call_by_address(n_pointers: int) -> Callable[..., Any]:

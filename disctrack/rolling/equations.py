@@ -37,12 +37,18 @@ The functions are written for float and for complex numbers: an imaginary part o
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from calibration.kit.compiled import njit
-from disctrack.rolling._addresses import call_law
+from disctrack.rolling._addresses import Addresses, call_law
+from disctrack.rolling.records import Numbers, Record
+
+Vector: TypeAlias = tuple[complex, complex, complex]  # all numbers may be real
+State: TypeAlias = Sequence[complex]
+Motion: TypeAlias = tuple[Vector, Vector, Vector]  # omegadot, turn of the frame, acceleration of O
 
 _part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
 
@@ -61,33 +67,33 @@ HEADER = 4
 
 
 @_part
-def _cross(a: Any, b: Any) -> Any:
+def _cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @_part
-def _dot(a: Any, b: Any) -> Any:
+def _dot(a: Vector, b: Vector) -> complex:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @_part
-def _add(a: Any, b: Any) -> Any:
+def _add(a: Vector, b: Vector) -> Vector:
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 @_part
-def _scale(f: Any, a: Any) -> Any:
+def _scale(f: complex, a: Vector) -> Vector:
     return (f * a[0], f * a[1], f * a[2])
 
 
 @_part
-def _nodal(n: Any, m: Any, z: Any, s: Any, c: Any) -> Any:
+def _nodal(n: complex, m: complex, z: complex, s: complex, c: complex) -> Vector:
     """(n0, m0, k) -> (e1, e2, e3): n0 = e1, m0 = c e2 - s e3, k = s e2 + c e3."""
     return (n, m * c + z * s, z * c - m * s)
 
 
 @_part
-def _solve(rows: Any, b: Any) -> Any:
+def _solve(rows: tuple[Vector, Vector, Vector], b: Vector) -> Vector:
     """3 x 3 system by Cramer's rule."""
     r0, r1, r2 = rows
     c0, c1, c2 = _cross(r1, r2), _cross(r2, r0), _cross(r0, r1)
@@ -96,7 +102,7 @@ def _solve(rows: Any, b: Any) -> Any:
 
 
 @_part
-def _is_plain(body: Any) -> bool:
+def _is_plain(body: Record) -> bool:
     """A round rim on a level, flat table."""
     return bool(
         body.curvature == 0.0
@@ -111,7 +117,7 @@ def _is_plain(body: Any) -> bool:
 
 
 @_part
-def _plain_arm(body: Any, s: Any, c: Any) -> Any:
+def _plain_arm(body: Record, s: complex, c: complex) -> tuple[Vector, Vector]:
     """r_OA and its part a that turns with the nodal frame, nodal components."""
     rho = body.edge_radius
     a2, a3 = rho - body.radius, rho - body.half_thickness
@@ -120,7 +126,7 @@ def _plain_arm(body: Any, s: Any, c: Any) -> Any:
 
 
 @_part
-def _support(body: Any, cb: Any, sb: Any) -> Any:
+def _support(body: Record, cb: complex, sb: complex) -> Vector:
     """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
     c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
     c3, s3 = c2 * cb - s2 * sb, s2 * cb + c2 * sb
@@ -136,7 +142,7 @@ def _support(body: Any, cb: Any, sb: Any) -> Any:
 
 
 @_part
-def _place(body: Any, kin: Any) -> Any:
+def _place(body: Record, kin: Record) -> tuple[Vector, Vector, complex, Vector, complex]:
     """W, its part in the face over its length, that length, the rim's support there, and the height of O."""
     s, c = kin.sin_theta, kin.cos_theta
     cf, sf, sp, cp = np.cos(kin.phi), np.sin(kin.phi), np.sin(kin.psi), np.cos(kin.psi)
@@ -161,7 +167,7 @@ def _place(body: Any, kin: Any) -> Any:
 
 
 @_part
-def _contact(body: Any, kin: Any) -> Any:
+def _contact(body: Record, kin: Record) -> tuple[Vector, Vector, complex]:
     """r_OA, the normal of the table there, and the height of O."""
     s, c = kin.sin_theta, kin.cos_theta
     if _is_plain(body):
@@ -177,7 +183,7 @@ def _contact(body: Any, kin: Any) -> Any:
 
 
 @_part
-def _contact_rates(body: Any, kin: Any, omega: Any, frame: Any, v: Any) -> Any:
+def _contact_rates(body: Record, kin: Record, omega: Vector, frame: Vector, v: Vector) -> tuple[Vector, Vector]:
     """Rates of r_OA and of the normal, as vectors; v: velocity of O, nodal components."""
     s, c = kin.sin_theta, kin.cos_theta
     if _is_plain(body):
@@ -205,7 +211,7 @@ def _contact_rates(body: Any, kin: Any, omega: Any, frame: Any, v: Any) -> Any:
 
 
 @_part
-def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
+def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> None:
     """Fills the record of kinematic quantities from the state."""
     psi, theta = y[2], y[3]
     s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
@@ -233,7 +239,7 @@ def _kinematics(regime: int, t: Any, y: Any, body: Any, k: Any) -> None:
 
 
 @_part
-def _apply_laws(table: Any, w: Any) -> None:
+def _apply_laws(table: Addresses, w: Record) -> None:
     w.M_n = w.M_m = w.M_z = 0.0
     w.load_n = w.load_m = w.load_z = 0.0
     w.X_n = w.X_m = w.X_z = 0.0
@@ -246,7 +252,7 @@ def _apply_laws(table: Any, w: Any) -> None:
 
 
 @_part
-def _inertia_rows(body: Any, phi: Any) -> Any:
+def _inertia_rows(body: Record, phi: complex) -> tuple[Vector, Vector, Vector]:
     """Inertia about G in nodal axes, from body axes turned by the spin angle."""
     c, s = np.cos(phi), np.sin(phi)
     J11 = c * c * body.J_11 - 2 * c * s * body.J_12 + s * s * body.J_22
@@ -257,7 +263,7 @@ def _inertia_rows(body: Any, phi: Any) -> Any:
 
 
 @_part
-def _speed_of_friction(body: Any, slip: Any) -> Any:
+def _speed_of_friction(body: Record, slip: Vector) -> complex:
     """Slip over F_t / F_z: |slip| / mu with Coulomb's friction, c on a film."""
     if body.inverse_friction == 0.0:
         return body.creep
@@ -265,7 +271,7 @@ def _speed_of_friction(body: Any, slip: Any) -> Any:
 
 
 @_part
-def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
+def _accelerations(regime: int, y: State, body: Record, kin: Record, w: Record) -> Motion:
     """Omegadot and acceleration of O (vectors, nodal components); writes the contact force into the record."""
     s, c, m = kin.sin_theta, kin.cos_theta, body.mass
     omega = (y[5], y[6], y[7])
@@ -319,14 +325,14 @@ def _accelerations(regime: int, y: Any, body: Any, kin: Any, w: Any) -> Any:
         a_G = _scale(1.0 / m, _add(F, weight))
         a_O = _add(a_G, _scale(-1.0, _add(_cross(omegadot, com), centripetal_G)))
     w.F_n, w.F_m, w.F_z = F[0], c * F[1] - s * F[2], s * F[1] + c * F[2]
-    w.N = _dot(F, k)
-    tangential = _add(F, _scale(-w.N, k))
-    w.T = np.sqrt(_dot(tangential, tangential))
+    normal_force = _dot(F, k)
+    tangential = _add(F, _scale(-normal_force, k))
+    w.N, w.F_t = normal_force, np.sqrt(_dot(tangential, tangential))
     return omegadot, frame, a_O
 
 
 @_part
-def _state(regime: int, y: Any) -> Any:
+def _state(regime: int, y: Numbers) -> State:
     """All twelve components; zeros for those that a regime does not have: so that all below is compiled once."""
     zero = 0.0 * y[0]
     v_x, v_y = (y[8], y[9]) if regime != ROLLING else (zero, zero)
@@ -335,7 +341,9 @@ def _state(regime: int, y: Any) -> Any:
 
 
 @_part
-def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+def _evaluate(
+    t: complex, y: State, table: Addresses, body: Record, kin: Record, wrench: Record
+) -> tuple[Motion, State]:
     load = _course_of_load(t, y, table, body, kin, wrench)
     slide = _creeping(t, y, table, body, kin, wrench)
     _kinematics(table[0], t, y, body, kin)
@@ -349,7 +357,7 @@ def _evaluate(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> A
 
 
 @_part
-def _flow(t: Any, y: Any, held: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+def _flow(t: complex, y: State, held: Vector, table: Addresses, body: Record, kin: Record, wrench: Record) -> State:
     """Rates of the first ten components on a rigid table; fills kinematics and wrench on the way.
 
     held : slip along n0 and m0 that takes the place of the state's own, and the share to which it does
@@ -362,7 +370,7 @@ def _flow(t: Any, y: Any, held: Any, table: Any, body: Any, kin: Any, wrench: An
 
 
 @_part
-def _rates_of(y: Any, kin: Any, found: Any) -> Any:
+def _rates_of(y: State, kin: Record, found: Motion) -> State:
     omegadot, frame, a_O = found
     s, c, sp, cp = kin.sin_theta, kin.cos_theta, np.sin(kin.psi), np.cos(kin.psi)
     # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
@@ -376,7 +384,7 @@ def _rates_of(y: Any, kin: Any, found: Any) -> Any:
 
 
 @_part
-def _moved(y: Any, h: float, rate: Any) -> Any:
+def _moved(y: State, h: float, rate: State) -> State:
     """The state after h along these rates of its first ten components."""
     return (
         y[0] + h * rate[0], y[1] + h * rate[1], y[2] + h * rate[2], y[3] + h * rate[3], y[4] + h * rate[4],
@@ -386,7 +394,7 @@ def _moved(y: Any, h: float, rate: Any) -> Any:
 
 
 @_part
-def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+def _course_of_load(t: complex, y: State, table: Addresses, body: Record, kin: Record, wrench: Record) -> Vector:
     """F_z on the rigid table and its first two derivatives by time; zeros where the table does not give way."""
     nothing = 0.0 * y[0]
     if body.compliance == 0.0 or table[0] == FLYING:
@@ -410,7 +418,16 @@ def _course_of_load(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any
 
 
 @_part
-def _pull(t: Any, y: Any, slide_x: Any, slide_y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+def _pull(
+    t: complex,
+    y: State,
+    slide_x: complex,
+    slide_y: complex,
+    table: Addresses,
+    body: Record,
+    kin: Record,
+    wrench: Record,
+) -> tuple[State, State]:
     """F_x / N and F_y / N of a disc that rolls, its contact accelerated by `slide`; and the rates of the state."""
     _kinematics(table[0], t, y, body, kin)
     _apply_laws(table, wrench)
@@ -423,7 +440,7 @@ def _pull(t: Any, y: Any, slide_x: Any, slide_y: Any, table: Any, body: Any, kin
 
 
 @_part
-def _creeping(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> Any:
+def _creeping(t: complex, y: State, table: Addresses, body: Record, kin: Record, wrench: Record) -> State:
     """Velocity and acceleration along i and j of a contact that creeps; zeros where it does not, or slips."""
     nothing = 0.0 * y[0]
     if body.creep == 0.0 or table[0] != ROLLING:
@@ -444,7 +461,7 @@ def _creeping(t: Any, y: Any, table: Any, body: Any, kin: Any, wrench: Any) -> A
     return -c * f[0], -c * f[1], a_x, a_y
 
 
-def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
+def rates(t: Numbers, y: Numbers, ydot: Numbers, table: Addresses, body: Record, kin: Record, wrench: Record) -> None:
     """Time derivative of the state; fills kinematics and wrench on the way."""
     state = _state(table[0], y)
     found, slide = _evaluate(t[0], state, table, body, kin, wrench)
@@ -458,7 +475,9 @@ def rates(t: Any, y: Any, ydot: Any, table: Any, body: Any, kin: Any, wrench: An
         ydot[10], ydot[11] = kin.v_z, kin.sin_theta * a_O[1] + kin.cos_theta * a_O[2]
 
 
-def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, wrench: Any) -> None:
+def event_margins(
+    t: Numbers, y: Numbers, margin: Numbers, table: Addresses, body: Record, kin: Record, wrench: Record
+) -> None:
     """Margins (EVENTS) that are positive while the regime lasts.
 
     theta_end: nutation above its end. load: N, or in flight the gap. grip: rolling N - |F_t|/mu, slipping the slip
@@ -470,7 +489,7 @@ def event_margins(t: Any, y: Any, margin: Any, table: Any, body: Any, kin: Any, 
     margin[1] = wrench.N
     margin[2] = 1.0 + 0.0 * kin.theta
     if table[0] == ROLLING:
-        margin[2] = wrench.N - body.inverse_friction * wrench.T
+        margin[2] = wrench.N - body.inverse_friction * wrench.F_t
     if table[0] == SLIPPING and body.inverse_friction != 0.0:  # on a film nothing sticks
         margin[2] = np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m) - STICK_SPEED
     if table[0] == FLYING:

@@ -9,16 +9,19 @@ to their own largest size: a law whose amount is zero shows nowhere else.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import typeof
-from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from calibration.kit.arrays import Array
 from calibration.kit.compiled import njit
-from disctrack.rolling._addresses import call_system
+from disctrack.rolling._addresses import Addresses, call_system
+from disctrack.rolling.records import Numbers, Records
+
+Tableau: TypeAlias = tuple[Array, ...]  # A, B, C, E3, E5, D
+Box: TypeAlias = tuple[Numbers, Numbers]  # scratch for a state, and for an instant
 
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
 RTOL_IMAGINARY = 1e-7  # error of fifth order per step; the derivatives then hold to about 1e-9 of their size
@@ -40,7 +43,7 @@ class CompiledSystem:
     rates: int
     margins: int
     n_margins: int
-    arguments: NDArray[np.int64]  # (4,)
+    arguments: Addresses  # (4,)
 
 
 @dataclass(frozen=True)
@@ -49,17 +52,17 @@ class SolvedStretch:
 
     status: int
     n_filled: int  # grid points reached
-    y: NDArray[Any]  # (n_grid, n)
-    t_last: Any  # instant of the event, or the last grid point
-    y_last: NDArray[Any]  # (n,)
+    y: Numbers  # (n_grid, n)
+    t_last: complex  # instant of the event, or the last grid point
+    y_last: Numbers  # (n,)
     event: int  # number of the margin that ran out, or -1
     n_steps: int
 
 
 def integrate(
     system: CompiledSystem,
-    t0: Any,
-    y0: NDArray[Any],
+    t0: complex,
+    y0: Numbers,
     grid: Array,
     rtol: float,
     atol: Array,
@@ -85,7 +88,7 @@ def prepare(scalar: type) -> None:
 
 
 def _passed(
-    system: CompiledSystem, t0: Any, y0: NDArray[Any], grid: Array, rtol: float, atol: Array, max_steps: int
+    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
 ) -> tuple[Any, ...]:
     """What the compiled integrator is called with; the last four are its results and its scratch."""
     kind = y0.dtype
@@ -109,22 +112,23 @@ def _passed(
 
 
 @_part
-def _assign(target: Any, values: Any) -> None:
+def _assign(target: Numbers, values: Numbers) -> None:
     """As target[:] = values, for which numba compiles the text of an error besides: a second."""
     for i in range(target.size):
         target[i] = values[i]
 
 
 @_part
-def _call(function: int, t: Any, y: Any, out: Any, t_box: Any, args: Any) -> None:
+def _call(function: int, t: complex, y: Numbers, out: Numbers, t_box: Numbers, args: Addresses) -> None:
     t_box[0] = t
     call_system(function, t_box.ctypes.data, y.ctypes.data, out.ctypes.data, args[0], args[1], args[2], args[3])
 
 
 @_part
 def _stages(
-    rates: int, args: Any, t: Any, y: Any, h: Any, first: int, last: int, A: Any, C: Any, K: Any, box: Any
-) -> None:
+    rates: int, args: Addresses, t: complex, y: Numbers, h: complex, first: int, last: int, A: Array, C: Array,
+    K: Numbers, box: Box,
+) -> None:  # fmt: skip
     """K[i] = f(t + c_i h, y + h sum_j a_ij K_j) for first <= i < last."""
     y_stage, t_box = box
     for i in range(first, last):
@@ -137,7 +141,10 @@ def _stages(
 
 
 @_part
-def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, box: Any, y_new: Any) -> None:
+def _step(
+    rates: int, args: Addresses, t: complex, y: Numbers, h: complex, tableau: Tableau, K: Numbers, box: Box,
+    y_new: Numbers,
+) -> None:  # fmt: skip
     """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
     A, B, C, _, _, _ = tableau
     _stages(rates, args, t, y, h, np.int64(1), B.size, A, C, K, box)  # a literal is a type of its own
@@ -149,7 +156,7 @@ def _step(rates: int, args: Any, t: Any, y: Any, h: Any, tableau: Any, K: Any, b
 
 
 @_part
-def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float, atol: Any) -> float:
+def _error_norm(y: Numbers, y_new: Numbers, h: float, K: Numbers, tableau: Tableau, rtol: float, atol: Array) -> float:
     """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance."""
     _, _, _, E3, E5, _ = tableau
     sum5, sum3 = 0.0, 0.0
@@ -168,7 +175,7 @@ def _error_norm(y: Any, y_new: Any, h: float, K: Any, tableau: Any, rtol: float,
 
 
 @_part
-def _imaginary_error(y_new: Any, h: float, K: Any, tableau: Any, atol: Any, size: Any) -> float:
+def _imaginary_error(y_new: Numbers, h: float, K: Numbers, tableau: Tableau, atol: Array, size: Array) -> float:
     """Embedded error of the imaginary parts in units of its tolerance; `size` (1,) is their largest so far in atol."""
     _, _, _, _, E5, _ = tableau
     worst = 0.0
@@ -182,7 +189,7 @@ def _imaginary_error(y_new: Any, h: float, K: Any, tableau: Any, atol: Any, size
 
 
 @_part
-def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
+def _interpolant(y: Numbers, y_new: Numbers, h: complex, K: Numbers, D: Array, F: Numbers) -> None:
     """Coefficients F (7, n) of the polynomial of degree 7 through the step."""
     for k in range(y.size):
         difference = y_new[k] - y[k]
@@ -197,7 +204,7 @@ def _interpolant(y: Any, y_new: Any, h: Any, K: Any, D: Any, F: Any) -> None:
 
 
 @_part
-def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
+def _interpolate(y: Numbers, F: Numbers, x: complex, out: Numbers) -> None:
     """Value at the fraction x of the step, by nested factors x, 1 - x, x, ..."""
     for k in range(y.size):
         total = 0.0 * F[0, k]
@@ -208,20 +215,9 @@ def _interpolate(y: Any, F: Any, x: Any, out: Any) -> None:
 
 @_part
 def _fill(
-    rates: int,
-    args: Any,
-    t: Any,
-    y: Any,
-    h: Any,
-    tableau: Any,
-    K: Any,
-    box: Any,
-    y_new: Any,
-    F: Any,
-    grid: Any,
-    i_grid: int,
-    solution: Any,
-) -> int:
+    rates: int, args: Addresses, t: complex, y: Numbers, h: complex, tableau: Tableau, K: Numbers, box: Box,
+    y_new: Numbers, F: Numbers, grid: Array, i_grid: int, solution: Numbers,
+) -> int:  # fmt: skip
     """Write the grid points from number i_grid up to the end of the step; returns the number of the next one."""
     A, B, C, _, _, D = tableau
     _stages(rates, args, t, y, h, B.size + 1, C.size, A, C, K, box)
@@ -233,7 +229,7 @@ def _fill(
 
 
 @_part
-def _first_step(y: Any, f: Any, atol: Any) -> float:
+def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
     """A hundredth of the time in which the fastest component changes by its own size."""
     fastest = 0.0
     for k in range(y.size):
@@ -242,7 +238,7 @@ def _first_step(y: Any, f: Any, atol: Any) -> float:
 
 
 @_part
-def _ran_out(before: Any, after: Any) -> int:
+def _ran_out(before: Numbers, after: Numbers) -> int:
     """Number of the first margin that was positive and is no longer, or -1."""
     for e in range(after.size):
         if before[e].real > 0.0 and after[e].real <= 0.0:
@@ -252,18 +248,9 @@ def _ran_out(before: Any, after: Any) -> int:
 
 @_part
 def _locate(
-    system: Any,
-    args: Any,
-    t: Any,
-    y: Any,
-    h: float,
-    tableau: Any,
-    K: Any,
-    box: Any,
-    y_new: Any,
-    before: Any,
-    after: Any,
-) -> Any:
+    system: tuple[int, int], args: Addresses, t: complex, y: Numbers, h: float, tableau: Tableau, K: Numbers,
+    box: Box, y_new: Numbers, before: Numbers, after: Numbers,
+) -> tuple[int, float]:  # fmt: skip
     """Shorten the step to where the first margin has just run out, by bisection; y_new and `after` hold there.
 
     Returns the number of the margin and the length of the step.
@@ -288,22 +275,10 @@ def _locate(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _dop853(
-    rates: int,
-    margins: int,
-    args: Any,
-    t0: Any,
-    y0: Any,
-    grid: Any,
-    rtol: float,
-    atol: Any,
-    max_steps: int,
-    is_complex: bool,
-    tableau: Any,
-    solution: Any,
-    margin: Any,
-    t_last: Any,
-    y_last: Any,
-) -> Any:
+    rates: int, margins: int, args: Addresses, t0: Numbers, y0: Numbers, grid: Array, rtol: float, atol: Array,
+    max_steps: int, is_complex: bool, tableau: Tableau, solution: Numbers, margin: Numbers, t_last: Numbers,
+    y_last: Numbers,
+) -> tuple[int, np.signedinteger, int, int]:  # fmt: skip
     n, n_stages = y0.size, tableau[1].size
     unit = 0.0 * y0[0] + 1.0  # one, in the kind of number of the state
     K, F = np.zeros((tableau[2].size, n), y0.dtype), np.zeros((7, n), y0.dtype)
@@ -358,7 +333,15 @@ def _dop853(
 
 @njit(cache=True, error_model="numpy")
 def _evaluate(
-    function: int, args: Any, t: Any, Y: Any, out: Any, first: Any, second: Any, firsts: Any, seconds: Any
+    function: int,
+    args: Addresses,
+    t: Numbers,
+    Y: Numbers,
+    out: Numbers,
+    first: Numbers,
+    second: Numbers,
+    firsts: Numbers,
+    seconds: Numbers,
 ) -> None:
     t_box = t[:1].copy()
     for i in range(len(t)):
@@ -369,12 +352,12 @@ def _evaluate(
 
 def evaluate(
     function: int,
-    arguments: NDArray[np.int64],
-    t: NDArray[Any],
-    Y: NDArray[Any],
+    arguments: Addresses,
+    t: Numbers,
+    Y: Numbers,
     n_out: int,
-    scratch: tuple[NDArray[Any], NDArray[Any]],
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    scratch: tuple[Records, Records],
+) -> tuple[Numbers, Records, Records]:
     """Call a system function at many states; also returns the two scratch records (1,) as they are after each call.
 
     t : (n,), Y : (n, n_y) -> (n, n_out), (n,), (n,)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from calibration.kit.brief import Outline
 from disctrack.frames import nodal_axes_world, rotation_from_euler
 from disctrack.rolling import equations
 from disctrack.rolling.model import Model
-from disctrack.rolling.records import ROLLING_COMPONENTS
+from disctrack.rolling.records import ROLLING_COMPONENTS, Numbers, Records
 
 
 class Regime(IntEnum):
@@ -84,7 +83,7 @@ class Motion(Outline):
             return np.hypot(self.contact_force[:, 0], self.contact_force[:, 1]) / self.contact_force[:, 2]
 
 
-def coordinates(kinematics: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def coordinates(kinematics: Records) -> tuple[Numbers, Numbers]:
     """Q and qdot (n, 6), real or complex, from records of kinematic quantities (n,)."""
     k = kinematics
     cp, sp = np.cos(k["psi"]), np.sin(k["psi"])
@@ -94,7 +93,7 @@ def coordinates(kinematics: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     return q, qdot
 
 
-def as_seen(kinematics: NDArray[Any], wrench: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def as_seen(kinematics: Records, wrench: Records) -> tuple[Numbers, Numbers]:
     """Q and qdot (n, 6) in the axes of cameras at rest, from records (n,): the table may move in them."""
     q, qdot = coordinates(kinematics)
     for i, axis in enumerate("xyz"):
@@ -108,15 +107,15 @@ class MotionSamples:
     """Raw answers of the compiled equations at n times."""
 
     time: Array  # (n,)
-    kinematics: NDArray[Any]  # (n,) records
-    wrench: NDArray[Any]  # (n,) records
-    rates: NDArray[Any]  # (n, 8) of the rolling components
+    kinematics: Records  # (n,) records
+    wrench: Records  # (n,) records
+    rates: Numbers  # (n, 8) of the rolling components
     regime: NDArray[np.uint8]  # (n,)
 
 
 def motion_from_samples(
     model: Model,
-    body: NDArray[Any],
+    body: Records,
     samples: MotionSamples,
     switches: list[Switch],
     end: EndReason,
@@ -125,7 +124,7 @@ def motion_from_samples(
 ) -> Motion:
     """All quantities of a `Motion` from the solution's samples; `body` is a record (1,) of records.BODY."""
     k, w, b = samples.kinematics, samples.wrench, body[0]
-    q, qdot = as_seen(k, w)
+    q, qdot = (x.real for x in as_seen(k, w))
     omega_nodal = np.stack([k["thetadot"], k["omega2"], k["omega3"]], axis=-1)
     frame_nodal = np.stack([k["thetadot"], k["omega2"], k["psidot"] * k["cos_theta"]], axis=-1)
     omegadot_nodal = samples.rates[:, 5:8] + np.cross(frame_nodal, omega_nodal)
@@ -183,7 +182,7 @@ def motion_from_samples(
     )
 
 
-def moment_power(kinematics: NDArray[Any], moment: Array) -> Array:
+def moment_power(kinematics: Records, moment: Array) -> Array:
     """M . Omega [W]; Omega = thetadot n0 - phidot sin(theta) m0 + omega_z k."""
     k = kinematics
     return (

@@ -15,8 +15,11 @@ from __future__ import annotations
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+Numbers: TypeAlias = NDArray[np.inexact[Any]]  # real, or complex where imaginary parts carry derivatives
 Record: TypeAlias = "np.recarray[Any, Any]"  # the numbers of one kind below, read and written by name
+Records: TypeAlias = NDArray[np.void]  # many of them
 
 STATE_COMPONENTS = ("x", "y", "psi", "theta", "phi", "thetadot", "omega2", "omega3", "v_x", "v_y", "z", "v_z")
 ROLLING_COMPONENTS = STATE_COMPONENTS[:8]
@@ -68,7 +71,7 @@ WRENCH = (
     "F_m",
     "F_z",
     "N",  # its part along the normal of the table at the contact: F_z on a flat one
-    "T",  # and the size of the rest, which friction has to supply
+    "F_t",  # and the size of the rest, which friction has to supply
     *(f"table_{a}" for a in "xyz"),  # where the table is, in the axes of cameras at rest [m]; q is relative to it
     *(f"table_v{a}" for a in "xyz"),  # its velocity [m/s]
     *(f"table_a{a}" for a in "xyz"),  # and acceleration [m/s^2]

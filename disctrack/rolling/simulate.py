@@ -1,10 +1,9 @@
 """From a model and a state to the motion: pure rolling, slip and flight, with the switches between them found."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
 from disctrack.rolling import integrate
@@ -13,6 +12,7 @@ from disctrack.rolling.effects import ModelError
 from disctrack.rolling.equations import EVENTS, FLYING, ROLLING, SLIPPING, STICK_SPEED
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Motion, MotionSamples, Regime, Switch, coordinates, motion_from_samples
+from disctrack.rolling.records import Numbers, Records
 from disctrack.rolling.state import State
 
 RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over 1.5 s
@@ -51,7 +51,7 @@ def simulate(
     assembly = Assembly(model, theta_end)
     path = follow(assembly, _start(state, theta_end), grid, rtol)
     return motion_from_samples(
-        model, assembly.body, path.samples, path.switches, path.end, float(path.end_time), path.end_state
+        model, assembly.body, path.samples, path.switches, path.end, path.end_time.real, path.end_state.real
     )
 
 
@@ -95,14 +95,14 @@ class Path:
     samples: MotionSamples
     switches: list[Switch]
     end: EndReason
-    end_time: Any
-    end_state: NDArray[Any]
+    end_time: complex
+    end_state: Numbers
     slip_steps: int = 0  # of the integrator in slip, which is stiff where it creeps
 
 
 def follow(
     assembly: Assembly,
-    y: NDArray[Any],
+    y: Numbers,
     grid: Array,
     rtol: float,
     max_switches: int = MAX_SWITCHES,
@@ -110,7 +110,7 @@ def follow(
 ) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
-    t: Any = grid[0] * y.dtype.type(1.0)
+    t: complex = grid[0] * y.dtype.type(1.0)
     regime = {n: r for r, n in _N_STATE.items()}[len(y)]
     pieces: list[MotionSamples] = []
     switches: list[Switch] = []
@@ -158,7 +158,7 @@ def _join(pieces: list[MotionSamples]) -> MotionSamples:
     )
 
 
-def _sample(assembly: Assembly, regime: int, time: Array, Y: NDArray[Any]) -> MotionSamples:
+def _sample(assembly: Assembly, regime: int, time: Array, Y: Numbers) -> MotionSamples:
     system = assembly.system(regime)
     n = Y.shape[1]
     rates, kinematics, wrench = integrate.evaluate(
@@ -167,7 +167,7 @@ def _sample(assembly: Assembly, regime: int, time: Array, Y: NDArray[Any]) -> Mo
     return MotionSamples(time, kinematics, wrench, rates[:, :8], np.full(len(time), regime, np.uint8))
 
 
-def _rates(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def _rates(assembly: Assembly, regime: int, t: complex, y: Numbers) -> tuple[Numbers, Records, Records]:
     """Rates (n,), kinematics (1,) and wrench (1,) at one state."""
     system = assembly.system(regime)
     scratch = (assembly.kinematics, assembly.wrench)
@@ -175,13 +175,13 @@ def _rates(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> tuple[ND
     return rates[0], k, w
 
 
-def _margins(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> NDArray[Any]:
+def _margins(assembly: Assembly, regime: int, t: complex, y: Numbers) -> Numbers:
     system = assembly.system(regime)
     scratch = (assembly.kinematics, assembly.wrench)
     return integrate.evaluate(system.margins, system.arguments, np.array([t]), y[None], system.n_margins, scratch)[0][0]
 
 
-def _event_at_start(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> int | None:
+def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int | None:
     """An event that holds already where a stretch starts: the regime asked for is not the one that physics allows."""
     margins = _margins(assembly, regime, t, y).real
     if regime == SLIPPING and not margins[EVENTS.index("grip")] > 0:  # without slip the direction of friction is open,
@@ -191,7 +191,7 @@ def _event_at_start(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) ->
     return int(failed[0]) if failed.size else None
 
 
-def _complex_instant(assembly: Assembly, regime: int, event: int, t: Any, y: NDArray[Any]) -> tuple[Any, NDArray[Any]]:
+def _complex_instant(assembly: Assembly, regime: int, event: int, t: complex, y: Numbers) -> tuple[complex, Numbers]:
     """Event moved in imaginary time to where the margin's imaginary part vanishes too.
 
     The instant depends on the parameters; to first order, which is all that imaginary parts of 1e-30 know, the state
@@ -206,8 +206,8 @@ def _complex_instant(assembly: Assembly, regime: int, event: int, t: Any, y: NDA
 
 
 def _switch(
-    assembly: Assembly, regime: int, event: int, t: Any, y: NDArray[Any]
-) -> tuple[EndReason | None, int, NDArray[Any]]:
+    assembly: Assembly, regime: int, event: int, t: complex, y: Numbers
+) -> tuple[EndReason | None, int, Numbers]:
     """What follows an event: (reason to end or None, next regime, its state)."""
     name = EVENTS[event]
     if name == "theta_end":
@@ -220,20 +220,20 @@ def _switch(
         return None, FLYING, _full_state(assembly, regime, t, y)
     _, _, wrench = _rates(assembly, ROLLING, t, y[:8])
     F_n, F_m = (wrench[f"F_{axis}"][0] for axis in "nm")
-    holds = (wrench["N"][0] - assembly.constant("inverse_friction") * wrench["T"][0]).real > 0
+    holds = (wrench["N"][0] - assembly.constant("inverse_friction") * wrench["F_t"][0]).real > 0
     if regime == SLIPPING and holds:
         return None, ROLLING, y[:8]
     return None, SLIPPING, _slipping_state(assembly, t, y[:8], F_n, F_m)
 
 
-def _full_state(assembly: Assembly, regime: int, t: Any, y: NDArray[Any]) -> NDArray[Any]:
+def _full_state(assembly: Assembly, regime: int, t: complex, y: Numbers) -> Numbers:
     """All twelve components of a state in contact."""
     _, k, _ = _rates(assembly, regime, t, y)
     q, qdot = coordinates(k)
     return np.concatenate([y[:8], qdot[0, :2], [q[0, 2], qdot[0, 2]]])
 
 
-def _slipping_state(assembly: Assembly, t: Any, y: NDArray[Any], F_n: Any, F_m: Any) -> NDArray[Any]:
+def _slipping_state(assembly: Assembly, t: complex, y: Numbers, F_n: complex, F_m: complex) -> Numbers:
     """Rolling state that has just begun to slip, against the friction force that rolling would have needed."""
     _, k, _ = _rates(assembly, ROLLING, t, y)
     v = coordinates(k)[1][0, :2]
