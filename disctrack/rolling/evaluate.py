@@ -32,18 +32,13 @@ def kinematics(
     v_n, v_m = v_x * cp + v_y * sp, v_y * cp - v_x * sp
     omega2, omega3 = psidot * s, psidot * c + phidot
     r, h = disc.radius, disc.half_thickness
-    quantities = {
-        "time": time,
-        **dict(x=x, y=y, z=z, psi=psi, theta=theta, phi=phi, sin_theta=s, cos_theta=c),
-        **dict(
-            thetadot=thetadot, psidot=psidot, phidot=phidot, omega2=omega2, omega3=omega3, v_n=v_n, v_m=v_m, v_z=v_z
-        ),
-        "omega_z": psidot + phidot * c,
-        "slip_n": v_n - h * omega2 + r * omega3,
-        "slip_m": v_m + (r * s + h * c) * thetadot,
-        **dict(radius=r, half_thickness=h, mass=disc.mass, gravity=gravity, air_density=air_density),
-        **dict(normal_n=0.0, normal_m=0.0, normal_z=1.0),
-    }
+    quantities = dict(
+        time=time, x=x, y=y, z=z, psi=psi, theta=theta, phi=phi, sin_theta=s, cos_theta=c, thetadot=thetadot,
+        psidot=psidot, phidot=phidot, omega2=omega2, omega3=omega3, omega_z=psidot + phidot * c, v_n=v_n, v_m=v_m,
+        v_z=v_z, slip_n=v_n - h * omega2 + r * omega3, slip_m=v_m + (r * s + h * c) * thetadot, radius=r,
+        half_thickness=h, mass=disc.mass, gravity=gravity, air_density=air_density, normal_n=0.0, normal_m=0.0,
+        normal_z=1.0,
+    )  # fmt: skip
     result = np.empty(theta.shape, record_dtype(KINEMATICS, float))
     for name in KINEMATICS:
         result[name] = quantities[name]

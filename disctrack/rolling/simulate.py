@@ -24,11 +24,11 @@ MAX_SLIP_STEPS = 10**9  # of the integrator in slip, over all stretches, and ...
 MAX_STEPS = 200_000  # ... in each
 
 
-def time_grid(duration: float, rate: float = 1000.0, start: float = 0.0) -> Array:
-    """Instants start + i / rate up to start + duration, both ends included [s]."""
+def time_grid(duration: float, rate: float = 1000.0) -> Array:
+    """Instants i / rate up to the duration, both ends included [s]."""
     if not (duration > 0 and rate > 0):
         raise ModelError(f"duration {duration:g} s and rate {rate:g} Hz must be positive")
-    return start + np.arange(int(np.floor(duration * rate * (1 + 1e-12))) + 1) / rate
+    return np.arange(int(np.floor(duration * rate * (1 + 1e-12))) + 1) / rate
 
 
 def simulate(

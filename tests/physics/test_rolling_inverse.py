@@ -48,16 +48,3 @@ def test_moment_that_a_model_lacks_is_that_of_the_missing_effect():
     lacking, _ = effect_wrench(CATALOGUE["kz"](k_z=6e-5), k, force[:, 2])
     assert np.abs(lacking).max() > 1e-4
     assert_allclose(moment - supplied, lacking, atol=1e-12)
-
-
-def test_probe_gives_the_response_to_a_short_moment():
-    probe = CATALOGUE["wrench_probe"]
-    model = Model(MA_2014, effects=(probe(**{**probe.absent().values, "t_0": 0.1, "width": 3e-3}),))
-    times = np.linspace(0, 0.2, 201)
-    found = rolling.sensitivities(model, STATE, times, ["wrench_probe.M_z", "wrench_probe.X_n"], components=[])
-    before, after = times < 0.08, times > 0.12
-    assert np.abs(found.dqdot[before]).max() < 1e-6 * np.abs(found.dqdot[after]).max()
-    pushed = rolling.simulate(model.with_values({"wrench_probe.M_z": 1e-6}), STATE, times=times)
-    plain = rolling.simulate(model, STATE, times=times)
-    assert_allclose((pushed.q - plain.q)[after] / 1e-6, found.dq[after, :, 0], rtol=1e-3, atol=1e-4)
-    assert not probe.candidate
