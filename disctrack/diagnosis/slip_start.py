@@ -208,7 +208,7 @@ def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: Rolling
             return later
     if diagnosis.held_out_after is None or not _declares(system):
         return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis), *crept))
-    rows = training_rows(system, settings.train_fraction)
+    rows = training_rows(system)
     judged = diagnosis.judged or system
     slip = SlipStart(base, held_out(judged, base.quantities, base.values, rows), _candidate(system))
     notes = (*system.stretch.notes, *_in_words(system, diagnosis), *crept)

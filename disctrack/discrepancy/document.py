@@ -23,12 +23,8 @@ def parameters_json(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
     return [{"name": name, **vars(size), "meaning": q.meaning} for q, name, size in named]
 
 
-def effect_json(found: Found, after: Fit, apart: Mapping[str, Any] = _NOTHING) -> dict[str, Any]:
-    """One effect found, of any system.
-
-    after : fit of the enlarged model
-    apart : what would separate the effect from its rivals, by their names
-    """
+def effect_json(found: Found, after: Fit) -> dict[str, Any]:
+    """One effect found, of any system.   after : fit of the enlarged model"""
     c = found.candidate
     return {
         "name": c.effect,
@@ -44,7 +40,6 @@ def effect_json(found: Found, after: Fit, apart: Mapping[str, Any] = _NOTHING) -
                 "angle_deg": np.degrees(r.angle),
                 "delta_chi_square": r.loss,
                 "parameters": parameters_json(r.candidate.quantities, r.fit),
-                "separated_by": apart.get(r.candidate.name),
             }
             for r in found.cannot_be_told_from
         ],

@@ -32,10 +32,10 @@ class HeldOut:
         return float(np.sqrt(self.chi_square / self.expected)) if self.expected > 0 else float("nan")
 
 
-def training_rows(system: System, fraction: float = TRAIN_FRACTION) -> Mask:
+def training_rows(system: System) -> Mask:
     """(n,) True in the first part of the time that has data."""
     seen = system.time[system.weights > 0]
-    return np.asarray(system.time <= seen[0] + fraction * (seen[-1] - seen[0]), bool)
+    return np.asarray(system.time <= seen[0] + TRAIN_FRACTION * (seen[-1] - seen[0]), bool)
 
 
 def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows: Mask) -> HeldOut:

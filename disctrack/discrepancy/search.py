@@ -18,7 +18,7 @@ from scipy import stats
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
 from disctrack.discrepancy.fit import Fit, fit, no_fit, prior_residual
-from disctrack.discrepancy.held_out import TRAIN_FRACTION, HeldOut, held_out, training_rows
+from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, RowWhitened, common_modes, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all, score_pairs
 from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
@@ -39,8 +39,6 @@ FAINT = 1e3  # chi-square of an effect, below which many others may do as well a
 MOST_RIVALS = 12
 NOT_CONVERGED = "its refit does not converge"
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
-SOON = 0.3  # of the time that a trial has, for the first steps of one beyond a threshold
-FIRST_STEPS, PROMISING = 4, 0.7  # of a refit beyond a threshold, and the share of chi-square that they must get below
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
 FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
 UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
@@ -54,7 +52,6 @@ class Settings:
     max_effects: int = 3
     shortlist: int = 8  # proposals of one term more that are refitted in full for each explanation
     judged: int = 4  # explanations that may be put to the free run
-    train_fraction: float = TRAIN_FRACTION
     at_noise: float = 1.1  # reduced chi-square over the noise found in the data, up to which nothing is left
     unexplained_share: float = UNEXPLAINED_SHARE
     noise: float | None = None  # variance over that stated; None: from the residual's fast part
@@ -173,7 +170,7 @@ def with_shapes(system: System, diagnosis: Diagnosis) -> Diagnosis:
         diagnosis = replace(diagnosis, found=everything, after=fitted, remarks=(*diagnosis.remarks, *notes))
     if diagnosis.after is before:
         return diagnosis
-    rows = training_rows(system, diagnosis.settings.train_fraction)
+    rows = training_rows(system)
     held = held_out(system, diagnosis.after.quantities, diagnosis.after.values, rows)
     return replace(diagnosis, held_out_after=held)
 
@@ -213,7 +210,7 @@ class _Search:
             self.former[frozenset(f.candidate.name for f in former.found)] = former.after.values
             if former.nearest is not None:
                 self.former[frozenset(c.name for c in former.partial)] = former.nearest.values
-        self.rows = training_rows(system, settings.train_fraction) if rows is None else rows
+        self.rows = training_rows(system) if rows is None else rows
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
         self.rough = system.several_minima
@@ -483,8 +480,6 @@ class _Search:
                 followed = self._followed(current, together, start)
                 if followed is not None and self._at_noise(followed):
                     return followed
-            # a refit beyond a threshold is long: only where it leads somewhere
-            starts = [s for s in starts if self._promising(current, together, s)]
         fits = [self._fit(together, current.fit.values | start) for start in starts]
         if (ended := self.former.get(frozenset(c.name for c in together))) is not None:
             fits.append(self._fit(together, ended))
@@ -493,16 +488,6 @@ class _Search:
             # without the effect the others may have gone so far to make up for it that no step leads back
             fits.append(self._fit(together, current.fit.values | declared))
         return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else None
-
-    def _promising(self, current: Explanation, together: Sequence[Candidate], start: Values) -> bool:
-        """Have some steps from this start removed a good part of the residual?"""
-        values = dict(current.fit.values) | dict(start)
-        try:
-            with self.system.budget.trial(SOON * self.system.trial_steps):
-                few = fit(self.system, self._quantities(together), values, max_iterations=FIRST_STEPS)
-        except TrialGivenUp:
-            return False
-        return few.cost < PROMISING * current.fit.cost
 
     def _followed(self, current: Explanation, together: Sequence[Candidate], start: Values) -> Fit | None:
         """Refit that comes from longer and longer beginnings; None where one of them does not fit to the noise.

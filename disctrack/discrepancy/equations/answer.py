@@ -53,17 +53,16 @@ class ChannelErrors:
 @one_blas_thread
 def diagnose(
     equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
-    settings: Settings | None = None, stretch: float | None = None,
+    settings: Settings | None = None,
 ) -> Answer:  # fmt: skip
     """Fit the equations to the runs and look for what they lack.
 
     runs : they share all parameters, but for those declared `per` run or group; initial states are each one's own
     terms : what may be missing; the usual terms (`terms.usual`), if none are given
     settings : how hard to look, and how sure to be
-    stretch : [s] after which a run begins anew with a state of its own; if not given, as far as the model follows it
     Raises AnalysisError, which says what was found and what to do.
     """
-    return Answer(equations, ask(equations, [runs] if isinstance(runs, Run) else runs, terms, settings, stretch))
+    return Answer(equations, ask(equations, [runs] if isinstance(runs, Run) else runs, terms, settings))
 
 
 @dataclass(frozen=True)

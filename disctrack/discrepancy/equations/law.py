@@ -90,7 +90,6 @@ class LearnedForce:
     alike: tuple[Along, ...]  # others whose evidence is within ALIKE
     replaces: tuple[Candidate, ...] = ()  # known terms that describe the data too ...
     their_length: float = np.inf  # ... with this
-    theirs: Array | None = None  # (POINTS,) what they make together at the same places
     at_noise: bool = True  # is what it leaves noise?
     system: EquationSystem | None = None  # that knows the law
 
@@ -119,7 +118,6 @@ class LearnedForce:
             "cannot_be_told_from": [{"equation": a.equation, "variable": a.variable} for a in self.alike],
             "known_terms": [c.name for c in self.replaces],
             "minus_2_log_evidence_of_known_terms": self.their_length,
-            "force_of_known_terms": self.theirs,
         }
 
     def text(self, units: Mapping[str, str]) -> str:
@@ -403,11 +401,8 @@ class _Competition:
         sums = tuple(f.candidate for f in d.found) or d.partial
         of_sums = d.after if d.found else d.nearest
         their_length = self.known(sums, of_sums) if of_sums is not None and sums else np.inf
-        theirs = None
-        if of_sums is not None and sums and not there.formulas.equations.mass:
-            theirs = _sum_of(there, law, of_sums.values, x, part)
         return LearnedForce(law, candidate, best.beside, fitted, held, tuple(part), x, force, sigma, best.length,
-                            best.alike, sums, their_length, theirs, self.at_noise(fitted), there)  # fmt: skip
+                            best.alike, sums, their_length, self.at_noise(fitted), there)  # fmt: skip
 
 
 def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
@@ -612,29 +607,6 @@ def _declared_part(
     simple = [sympy.simplify(e.xreplace(here)) for e in formulas_]
     found = [np.broadcast_to(np.asarray(sympy.lambdify(variable, e, "numpy")(x), float), x.shape) for e in simple]
     return found[0], np.reshape(found[1:], (len(part), len(x))).T
-
-
-def _sum_of(system: EquationSystem, law: Along, values: Values, x: Array, part: Sequence[str]) -> Array:
-    """(POINTS,) what known terms, and parameters that moved for them, make where the law acts."""
-    i = system.formulas.equations.states.index(law.equation)
-    absent = {q.name: q.null for c in system.candidates for q in c.quantities}
-    back = absent | {n: system.formulas.fitted[n][1].value for n in part}
-    at, force = [], []
-    plain = {k: v for k, v in values.items() if not k.startswith(f"{NAME}_")}
-    for s, found in zip(system.stretches, system.predictions(plain), strict=True):
-        if found is not None:
-            with_, without = (
-                system._rates(s, system.numbers(v, s), s.time, found.states)[0][:, i] for v in (plain, plain | back)
-            )
-            at.append(_visited(system.with_(stretches=[s]), law.variable, plain)[0])
-            force.append(with_ - without)
-    if not at:
-        return np.full(len(x), np.nan)
-    here, there = np.concatenate(at), np.concatenate(force)
-    number = np.clip(np.round((here - x[0]) / max(x[1] - x[0], 1e-300)), 0, len(x) - 1).astype(int)
-    count, total = np.bincount(number, minlength=len(x)), np.bincount(number, there, minlength=len(x))
-    seen = count > 0
-    return np.asarray(np.interp(x, x[seen], total[seen] / count[seen]), float)
 
 
 def _tied(q: Quantity) -> Quantity:

@@ -65,7 +65,6 @@ class Answered:
     diagnosis: Diagnosis
     system: EquationSystem  # in the stretches that were judged
     judged: System  # the same with its noise as judged
-    samples: tuple[Samples, ...]  # whole runs
     notes: tuple[str, ...]
     memory: Array | None  # (w, order) autoregression of the noise, where it remembers
     law: LearnedForce | None = None  # where one describes the data: in place of known terms, or beside them
@@ -73,13 +72,9 @@ class Answered:
 
 def ask(
     equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None,
-    settings: Settings | None = None, stretch: float | None = None,
+    settings: Settings | None = None,
 ) -> Answered:  # fmt: skip
-    """Fit the equations to the runs and look for what they lack.
-
-    terms : None: the usual ones (`terms.usual`)
-    stretch : [s] after which every run begins anew with a state of its own; None: as far as the model follows
-    """
+    """Fit the equations to the runs and look for what they lack.   terms : None: the usual ones (`terms.usual`)"""
     runs = [runs] if isinstance(runs, Run) else list(runs)
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
@@ -92,20 +87,17 @@ def ask(
     notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
     system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
     system, declared = _prepared(system)
-    start: Start | None = None
-    leading: dict[str, Start] = {}
-    if stretch is None:
+    start, leading = led(system, declared), dict[str, Start]()
+    followed = system.with_(stretches=first_part(system.stretches, start.followed))
+    held = redundant(followed, start.values) if start.followed > 0.0 else ()
+    if held:
+        system = system.with_(held=held)
         start = led(system, declared)
-        followed = system.with_(stretches=first_part(system.stretches, start.followed))
-        held = redundant(followed, start.values) if start.followed > 0.0 else ()
-        if held:
-            system = system.with_(held=held)
-            start = led(system, declared)
-        if start.followed < min(turn(s) for s in system.stretches):
-            leading = _leading(system, declared)
-            if start.followed == 0.0 and not leading:
-                raise AnalysisError(_not_followed(system, declared))
-            notes.append(_lost_soon(start, leading))
+    if start.followed < min(turn(s) for s in system.stretches):
+        leading = _leading(system, declared)
+        if start.followed == 0.0 and not leading:
+            raise AnalysisError(_not_followed(system, declared))
+        notes.append(_lost_soon(start, leading))
     if leading:
         term, way = next(iter(leading.items()))
         system, diagnosis = _whole(system.with_(promoted=(term,)), (term,), way.values, settings)
@@ -123,14 +115,14 @@ def ask(
             values = diagnosis.before.values
             system, diagnosis = _searched(_sized(system, values), values, settings)
     else:
-        system, diagnosis, more = _as_far_as_followed(system, declared, start, settings, stretch)
+        system, diagnosis, more = _as_far_as_followed(system, start, settings)
         notes += more
     if not np.isfinite(diagnosis.before.chi_square):
         raise AnalysisError(
             "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
             "at a stiff contact. Write the contact wider, or cut the data into runs without it."
         )
-    if start is not None and not start.whole and not leading and diagnosis.found:
+    if not start.whole and not leading and diagnosis.found:
         system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
         notes.append(remark)
     judged: System = diagnosis.judged or system
@@ -152,7 +144,7 @@ def ask(
     if system.held:
         held_ones = ", ".join(system.held)
         notes.append(f"{held_ones} cannot be told from other numbers with these data, which hold for it as declared")
-    return Answered(diagnosis, system, judged, tuple(samples), tuple(notes), memory, law)
+    return Answered(diagnosis, system, judged, tuple(notes), memory, law)
 
 
 def _law(
@@ -165,15 +157,12 @@ def _law(
 
 
 def _as_far_as_followed(
-    system: EquationSystem, declared: Mapping[str, float], start: Start | None, settings: Settings,
-    stretch: float | None,
-) -> tuple[EquationSystem, Diagnosis, list[str]]:  # fmt: skip
+    system: EquationSystem, start: Start, settings: Settings
+) -> tuple[EquationSystem, Diagnosis, list[str]]:
     """The search over whole runs, or over stretches as long as the model follows them; and a note that says so."""
-    values: Mapping[str, float] = declared if start is None else start.values
-    notes = []
-    if start is None or not start.whole:
-        length = stretch or (SAFE * start.followed if start else np.inf)
-        system, values, note = _in_stretches(system, values, length)
+    values, notes = start.values, []
+    if not start.whole:
+        system, values, note = _in_stretches(system, values, SAFE * start.followed)
         notes.append(note)
     if not np.isfinite(system.linearise(values, [])[0]).all():
         raise AnalysisError(_not_followed(system, values))

@@ -28,14 +28,11 @@ def write_answer(answer: Answer, path: Path) -> list[Path]:
 
 
 def _law(answer: Answer, law: LearnedForce) -> Drawn:
-    """The law that was learned with its band, and what known terms make at the same places."""
+    """The law that was learned with its band."""
     units = answer.equations.units
     picture, (axes,) = panels(9, 3.5)
     axes.fill_between(law.variable, law.force - 2 * law.sigma, law.force + 2 * law.sigma, color=BLUE, alpha=0.25, lw=0)
     axes.plot(law.variable, law.force, color=BLUE, lw=1.2, label="learned, 95 %")
-    if law.theirs is not None:
-        known = " + ".join(c.name for c in law.replaces)
-        axes.plot(law.variable, law.theirs, "--", color=RED, lw=1.0, label=f"known terms: {known}")
     of = "time" if law.along.variable == "t" else law.along.variable
     unit = units.get(law.along.variable, "s" if law.along.variable == "t" else "")
     axes.set(xlabel=f"{of} ({unit})" if unit else of, ylabel=f"added to d{law.along.equation}/dt")

@@ -160,13 +160,13 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 
 
-def led(system: EquationSystem, values: dict[str, float], begin: float | None = None) -> Start:
-    """Fit over windows that grow from `begin` [s] (half a turn) to the whole, or until the model loses the motion."""
+def led(system: EquationSystem, values: dict[str, float]) -> Start:
+    """Fit over windows that grow from half a turn to the whole, or until the model loses the motion."""
     duration = max(float(s.time[-1] - s.time[0]) for s in system.stretches)
-    window = begin or max(0.5 * min(turn(s) for s in system.stretches), duration / 4000)
+    window = max(0.5 * min(turn(s) for s in system.stretches), duration / 4000)
     found = _led(system, values, window, duration)
     shortest = 12 * max(float(np.median(np.diff(s.time))) for s in system.stretches)
-    while found.followed == 0.0 and begin is None and window > shortest:
+    while found.followed == 0.0 and window > shortest:
         # what turns and drifts, or is chaotic, has no half turn: begin with less
         window = max(0.25 * window, shortest)
         found = _led(system, values, window, duration)

@@ -22,18 +22,13 @@ def told(values, sigmas, correlation=0.0):
     return bounds(Found(CANDIDATE, 50.0, 10.0, 10.0, ()), fitted)
 
 
-def test_a_number_that_is_told_from_nought_has_no_bound():
-    assert told((5e-6, -4e-6, 1.0), (1e-6, 1e-6, 0.1)) == []
-
-
-def test_a_number_within_its_sigma_is_bounded_by_the_noise():
-    (text,) = told((5e-6, 1e-6, 1.0), (1e-6, 1e-6, 0.1))
-    assert text == "tilt_y is only bounded, |tilt_y| < 2.96 µrad (95 %), by the noise"
-
-
-def test_a_number_that_another_keeps_open_names_it():
-    (text,) = told((5e-6, 1e-6, 1.0), (1e-6, 1e-6, 0.1), correlation=-0.97)
-    assert text.endswith("(95 %), as km.k_m moves with it")
+@pytest.mark.parametrize(
+    ("tilt_y", "correlation", "why"),
+    [(-4e-6, 0.0, None), (1e-6, 0.0, "by the noise"), (1e-6, -0.97, "as km.k_m moves with it")],
+)
+def test_a_number_that_may_be_zero_is_bounded_and_what_keeps_it_open_is_named(tilt_y, correlation, why):
+    bounded = told((5e-6, tilt_y, 1.0), (1e-6, 1e-6, 0.1), correlation)
+    assert bounded == ([f"tilt_y is only bounded, |tilt_y| < 2.96 µrad (95 %), {why}"] if why else [])
 
 
 def test_a_candidate_that_gains_no_more_than_noise_is_told_with_its_bound():

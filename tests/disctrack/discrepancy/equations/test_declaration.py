@@ -102,18 +102,6 @@ def test_what_leaves_more_than_the_sensor_scatters_is_not_found():
         assert answer.after["h"].rms < 5e-3 or answer.verdict == "unexplained"
 
 
-@pytest.mark.statistical
-def test_drag_of_a_thrown_ball_needs_no_start():
-    time = np.arange(0, 1.2, 0.01)
-    pull = np.array([0.0, 0.0, -9.81])
-    motion = followed(lambda t, y: [*y[3:], *(pull - 0.05 * np.linalg.norm(y[3:]) * y[3:])], [0, 0, 2, 4, 1, 3], time)
-    speed = "sqrt(vx**2 + vy**2 + vz**2)"
-    rates = {a: f"v{a}" for a in "xyz"} | {f"v{a}": f"-k*{speed}*v{a} - {9.81 if a == 'z' else 0}" for a in "xyz"}
-    data = {a: motion[i] + noise(len(time), i, 3e-3) for i, a in enumerate("xyz")}
-    answer = diagnose(Equations(rates, {"k": 0.03}), Run(time, data, sigma=3e-3), [terms.constant("vx")])
-    assert abs(answer.values["k"] - 0.05) < 4 * answer.sigmas["k"]
-
-
 def test_what_is_usual_follows_from_the_structure():
     """Friction acts on a velocity, a level runs over into the next one, and a sensor has limits."""
     tanks = Equations(
