@@ -18,8 +18,7 @@ from scipy import stats
 from calibration.kit.arrays import Array
 from disctrack.analyse.published import PREDICTED
 from disctrack.discrepancy.document import document, tables
-from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.held_out import held_out, training_rows
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_system import ExponentSystem, published_series
@@ -28,7 +27,6 @@ from disctrack.report.numbers import measured
 from disctrack.report.terminal import full
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
-ASKED = ("t_f", "air_bildsten", "air_moffatt", "contour_viscous", "t_f_each")  # looked at, found or not
 THIN_DISC = np.array([PREDICTED[1], PREDICTED[2], PREDICTED[0]])  # n_theta, n_psidot, n_energy
 NAMES = ("n_theta", "n_psidot", "n_energy")
 
@@ -68,24 +66,6 @@ class Explanation:
     sizes: tuple[str, ...]  # its fitted quantities
     gain: float  # decrease of chi-square against the base model
     misfits: tuple[Misfit, ...]
-    held_out_gain: float  # in 2 log density of the later trials, which were left out
-
-
-def explanation(system: ExponentSystem, base: Fit, name: str) -> Explanation:
-    """Refit one candidate together with all that the base fit moves, and judge it on the later trials."""
-    extra = tuple(q for c in system.candidates if c.name == name for q in c.quantities)
-    found = fit(system, (*system.base, *extra), base.values)
-    misfits = tuple(
-        misfit(s.setup.surface, s.exponents, system.outcomes(i, found.values)[:3]) for i, s in enumerate(system.series)
-    )
-    rows = training_rows(system)
-    held = [
-        held_out(system, quantities, f.values, rows)
-        for quantities, f in ((system.base, base), (found.quantities, found))
-    ]
-    ahead = 2 * (held[1].log_density - held[0].log_density) if all(h.train.converged for h in held) else float("nan")
-    gain = base.cost - found.cost if found.converged else float("nan")
-    return Explanation(name, found, tuple(q.name for q in extra), gain, misfits, ahead)
 
 
 @dataclass(frozen=True)
@@ -94,27 +74,25 @@ class Answer:
 
     diagnosis: Diagnosis
     thin: tuple[Misfit, ...]  # against 2/3, -1/3, 2/3
-    explanations: tuple[Explanation, ...]
-
-    @property
-    def undecided(self) -> tuple[Explanation, ...]:
-        """What was found, and what these tables cannot tell from it."""
-        return tuple(e for e in self.explanations if e.name in _named(self.diagnosis))
-
-
-def _named(diagnosis: Diagnosis) -> list[str]:
-    """Effects that were found, and those that cannot be told from them."""
-    rivals = [r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from]
-    return [*(f.candidate.name for f in diagnosis.found), *rivals]
+    undecided: tuple[Explanation, ...]  # what was found, and what these tables cannot tell from it
 
 
 def examine(system: ExponentSystem) -> Answer:
-    """Diagnosis of the trials, and everything that is said beside it; ASKED must be among the system's candidates."""
-    diagnosis = explain(system, system.start, SETTINGS)
+    """Diagnosis of the trials, with what each effect that may be the one leaves of every surface."""
+    d = explain(system, system.start, SETTINGS)
+    named = [(f.candidate, d.after) for f in d.found]
+    named += [(r.candidate, r.fit) for f in d.found for r in f.cannot_be_told_from]
     return Answer(
-        diagnosis,
+        d,
         tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series),
-        tuple(explanation(system, diagnosis.before, name) for name in dict.fromkeys([*_named(diagnosis), *ASKED])),
+        tuple(Explanation(c.name, f, c.names, d.before.cost - f.cost, left_by(system, f)) for c, f in named),
+    )
+
+
+def left_by(system: ExponentSystem, fit: Fit) -> tuple[Misfit, ...]:
+    """Every surface against the prediction of a fit."""
+    return tuple(
+        misfit(s.setup.surface, s.exponents, system.outcomes(i, fit.values)[:3]) for i, s in enumerate(system.series)
     )
 
 
@@ -141,12 +119,12 @@ def report(answer: Answer) -> str:
         for name, mean, sigma, predicted, s in zip(NAMES, m.mean, m.sigma, m.predicted, m.sigmas, strict=True):
             lines.append(f"  {m.surface:6}{name:9}{mean:8.4f} +- {sigma:.4f}   {predicted:8.4f}{s:6.1f} sigma")
         lines.append(f"  {m.surface:6}together {m.joint_sigmas:.1f} sigma (p = {m.p_value:.2g})")
-    lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size; gain in 2 ln p of the later trials"]
-    for e in answer.explanations:
+    lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size"]
+    for e in answer.undecided:
         units = {q.name: q.unit for q in e.fit.quantities}
         sizes = ", ".join(f"{n} = {measured(e.fit.values[n], e.fit.sigma(n), units[n])}" for n in e.sizes)
         left = ", ".join(f"{m.surface} {m.joint_sigmas:.1f}" for m in e.misfits)
-        lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes, f"{e.held_out_gain:.1f}") if x))
+        lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes) if x))
     return "\n".join([*lines, "", *full(Report("", "", blocks=tables(answer.diagnosis)))])
 
 
@@ -156,8 +134,8 @@ def example() -> Outcome:
     model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
     explained = [
         {"name": e.name, "gain": e.gain, "parameters": {n: (e.fit.values[n], e.fit.sigma(n)) for n in e.sizes},
-         "held_out_gain": e.held_out_gain, "exponents": [vars(m) for m in e.misfits]}
-        for e in answer.explanations
+         "exponents": [vars(m) for m in e.misfits]}
+        for e in answer.undecided
     ]  # fmt: skip
     return Outcome(report(answer), document(answer.diagnosis, model, sentence(answer)) | {
         "source": "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3",
