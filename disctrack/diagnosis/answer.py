@@ -1,6 +1,6 @@
 """What the diagnosis of a trajectory of the disc holds."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from calibration.kit.brief import Brief
 from disctrack.diagnosis.disc_system import DiscSystem
@@ -8,7 +8,7 @@ from disctrack.diagnosis.errors import Errors
 from disctrack.diagnosis.form_misfit import LawCourse
 from disctrack.diagnosis.left_over import LeftOver
 from disctrack.diagnosis.pages.words import sentence
-from disctrack.diagnosis.plan import Plan, Proposed
+from disctrack.diagnosis.plan import Plan
 from disctrack.diagnosis.regimes import Regimes
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
@@ -40,7 +40,6 @@ class DiscDiagnosis(Brief):
     after: Errors | None
     energy: dict[str, float]  # [J]
     learned: Learned | None = None
-    separated_by: dict[str, dict[str, Proposed | None]] = field(default_factory=dict)  # effect -> rival -> recording
     plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
     notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
     regimes: Regimes | None = None  # where a model that fails holds

@@ -31,6 +31,7 @@ SPINS = (0.5, 5.0)  # omega_3 [rad/s]
 DURATIONS = (0.5, 1.0)  # [s]
 NUTATION_SHARE = 0.05  # amplitude of the nutation oscillation over the nutation angle
 SEEN = 1e-6  # share of a column that is left after clearing, below which nothing is seen of it
+OPEN = 6  # questions that further recordings are sought for
 ENOUGH = 5.0  # sigmas from which on a recording answers a question
 
 
@@ -291,28 +292,12 @@ def _changed(disc: Disc, proposal: Proposal) -> Disc:
     )
 
 
-def separations(
-    system: DiscSystem, fit: Fit, effect: Candidate, rivals: Sequence[Candidate]
-) -> dict[str, Proposed | None]:
-    """For each rival, of the starts looked at, the one that would tell it best from the effect at its fitted size.
-
-    None where no such recording can be simulated.
-    """
-    found = plan(system, fit, [Question(effect, r) for r in rivals], changes=())
-    best = {r.name: found.best(i) for i, r in enumerate(rivals)}
-    return {
-        name: None if b is None else replace(b, answers=b.answers[i : i + 1])
-        for i, (name, b) in enumerate(best.items())
-    }
-
-
 def plan(
     system: DiscSystem,
     fit: Fit,
     questions: Sequence[Question],
     noise: float = 1.0,
     said: Callable[[Sequence[str]], Array] | None = None,
-    changes: Sequence[Mapping[str, float]] = CHANGES,
 ) -> Plan:
     """What each of many recordings would bring to the questions: starts first, then changes of the best of them.
 
@@ -336,11 +321,11 @@ def plan(
 
     first = Plan(tuple(questions), now, tuple(made(starts())))
     bases = {Proposal(): None} | {b.proposal: None for i in range(len(questions)) if (b := first.best(i)) is not None}
-    changed = (replace(base, **c) for base in list(bases)[:3] for c in changes if c or base == Proposal())
+    changed = (replace(base, **c) for base in list(bases)[:3] for c in CHANGES if c or base == Proposal())
     return replace(first, rows=(*first.rows, *made(changed)))
 
 
-def open_questions(diagnosis: Diagnosis, system: DiscSystem, most: int = 6) -> tuple[Question, ...]:
+def open_questions(diagnosis: Diagnosis, system: DiscSystem) -> tuple[Question, ...]:
     """What a diagnosis leaves open: effects and their rivals, then effects of the motion with an upper bound only.
 
     Of the latter those whose standard deviation is largest beside their usual size.
@@ -359,4 +344,4 @@ def open_questions(diagnosis: Diagnosis, system: DiscSystem, most: int = 6) -> t
         return sigma / c.quantities[0].typical if np.isfinite(sigma) else 0.0
 
     unsettled = sorted(single, key=share, reverse=True)
-    return tuple([*found[:most], *(Question(c) for c in unsettled[: max(most - len(found), 2)])])
+    return tuple([*found[:OPEN], *(Question(c) for c in unsettled[: max(OPEN - len(found), 2)])])

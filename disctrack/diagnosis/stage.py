@@ -18,7 +18,7 @@ from disctrack.diagnosis.missing_force import what_is_missing
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.pages.output import as_json, write_diagnosis
 from disctrack.diagnosis.pages.report import report_of
-from disctrack.diagnosis.plan import open_questions, plan, separations
+from disctrack.diagnosis.plan import open_questions, plan
 from disctrack.diagnosis.regimes import regimes
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit
@@ -54,13 +54,10 @@ class DiagnoseOutcome(Brief):
 
 
 @one_blas_thread
-def diagnose(
-    trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None, *, separate: bool = True
-) -> DiscDiagnosis:
+def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None) -> DiscDiagnosis:
     """What does the model lack? Fit, trace, refit, judge.
 
-    model    : "paper", "none", or a TOML file (`model_file.declared_model`)
-    separate : also look for recordings that would tell apart what this one does not
+    model : "paper", "none", or a TOML file (`model_file.declared_model`)
     Raises AnalysisError, SceneError, ModelError.
     """
     declared = declared_model(trajectory, model)
@@ -88,15 +85,8 @@ def diagnose(
     before = errors(system, diagnosis.before, held_before)
     after = errors(system, fit_, learned.held_out if learned else diagnosis.held_out_after or held_before)
     energy = energy_balance(system, fit_.values)
-    apart = {
-        f.candidate.name: separations(system, fit_, f.candidate, [r.candidate for r in f.cannot_be_told_from])
-        for f in diagnosis.found
-        if f.cannot_be_told_from and separate
-    }
     notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *notes) if note)
-    return DiscDiagnosis(
-        system, diagnosis, declared.name, before, after, energy, learned, apart, None, notes, parts, left
-    )
+    return DiscDiagnosis(system, diagnosis, declared.name, before, after, energy, learned, None, notes, parts, left)
 
 
 def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -157,7 +147,7 @@ def _with_law(
     """The system that knows the law, the law with its course, the diagnosis with it, and remarks."""
     law, fitted, kept, noise = found.law, found.fit, found.kept, diagnosis.noise
     known = system.knowing(law)
-    judged, rows = judged_as(diagnosis, known), training_rows(known, diagnosis.settings.train_fraction)
+    judged, rows = judged_as(diagnosis, known), training_rows(known)
     held = held_out(judged, fitted.quantities, fitted.values, rows)
     assert diagnosis.held_out_before is not None
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / noise

@@ -110,7 +110,7 @@ def hide(case: HiddenCase) -> Verdict:
     """Plant, diagnose, compare."""
     parts, trajectory = plant(case)
     began = perf_counter()
-    result = diagnose(trajectory, separate=False)
+    result = diagnose(trajectory)
     seconds = perf_counter() - began
     pulls = [_pull_of(result, p) for p in parts]
     d, nan = result.diagnosis, float("nan")

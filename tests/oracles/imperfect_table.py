@@ -98,7 +98,7 @@ def row_of(name, effect, trajectory, findings, R, t):
     """Errors of a trajectory, and its diagnosis."""
     error, variance = point_laboratory.errors_and_variances(trajectory, R, t)
     began = time.process_time()
-    result = diagnose(with_declared_dots(trajectory, findings), separate=False)
+    result = diagnose(with_declared_dots(trajectory, findings))
     seconds = time.process_time() - began
     claims, faults, fit = {}, [], result.after_fit
     if result.learned is not None:

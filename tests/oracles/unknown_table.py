@@ -35,7 +35,7 @@ def trial(name: str, seed: int) -> dict:
     """Diagnose, and compare with the truth."""
     made = recording(name, seed)
     began = time.process_time()
-    result = diagnose(made.trajectory, separate=False)
+    result = diagnose(made.trajectory)
     seconds = time.process_time() - began
     left = left_over(result.system, result.after_fit, result.diagnosis.noise) if result.after else None
     said = result.sentence

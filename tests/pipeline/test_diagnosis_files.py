@@ -68,7 +68,7 @@ def test_group_holds_the_moment_and_force_that_were_missing(diagnosed):
 @pytest.mark.statistical
 def test_what_was_found_supplies_the_missing_force(diagnosed):
     """Two routes: accelerations of the poses without a model, and the force of the enlarged model."""
-    result = diagnose(read_trajectory(diagnosed[0]), separate=False)
+    result = diagnose(read_trajectory(diagnosed[0]))
     beside = evidence(result)
     added = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
     missing = beside.measured.force - force_of(result.system, result.diagnosis.before)

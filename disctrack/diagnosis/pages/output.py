@@ -10,7 +10,6 @@ import numpy as np
 from disctrack.diagnosis.errors import Ahead, Errors
 from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.plan import Proposed
 from disctrack.discrepancy.document import declared_json, document, effect_json, parameters_json
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
@@ -22,18 +21,6 @@ if TYPE_CHECKING:
     from disctrack.diagnosis.free_runs import ModelFreeEvidence
 
 GROUP = "diagnosis"
-
-
-def _separation(separation: Proposed | None) -> dict[str, Any] | None:
-    """The recording that would separate two effects; None where none of those looked at can be made."""
-    if separation is None:
-        return None
-    return {
-        "theta_deg": separation.proposal.theta_deg,
-        "omega3_rad_s": separation.proposal.omega3,
-        "duration_s": separation.duration,
-        "sigmas": separation.answers[0],
-    }
 
 
 def _errors(errors: Errors | None, longer: tuple[Ahead, ...] = ()) -> dict[str, Any]:
@@ -79,10 +66,7 @@ def _learned(learned: Learned) -> dict[str, Any]:
 def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     d = result.diagnosis
-    effects = []
-    for f in d.found:
-        apart = result.separated_by.get(f.candidate.name, {})
-        effects.append(effect_json(f, d.after, {name: _separation(s) for name, s in apart.items()}))
+    effects = [effect_json(f, d.after) for f in d.found]
     rows, longer, holds = result.system.rows, beside.ahead if beside else (), result.regimes
     found = document(d, result.model, result.sentence) | {
         "notes": list(result.notes),

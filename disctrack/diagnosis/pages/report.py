@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
 MODELS = {PAPER: "rolling with the losses of Ma et al. 2014 (paper)", NONE: "rolling without losses (none)"}
-DISTINCT = 5.0  # sigmas from which on a recording separates two effects
 WORDS = (
     "Reduced chi-square: mean square of the residuals over that of the noise, 1 where only noise is left. rms: "
     "root mean square, over dots and both image axes, or over the three axes of the position. Ljung-Box: small where "
@@ -68,7 +67,7 @@ def report_of(
 
 def _effects(result: DiscDiagnosis) -> list[str]:
     d = result.diagnosis
-    items = [f"{effect_text(f, d)}. {significance_text(f)}. {_alternatives(f, result)}".rstrip() for f in d.found]
+    items = [f"{effect_text(f, d)}. {significance_text(f)}. {_alternatives(f)}".rstrip() for f in d.found]
     if result.learned is not None:
         learned = result.learned
         items.append(
@@ -78,18 +77,12 @@ def _effects(result: DiscDiagnosis) -> list[str]:
     return items
 
 
-def _alternatives(found: Found, result: DiscDiagnosis) -> str:
-    """Angles to the indistinguishable alternatives, and the recordings that would separate them."""
-    texts = []
-    for rival in found.cannot_be_told_from:
-        plan = result.separated_by.get(found.candidate.name, {}).get(rival.candidate.name)
-        angle = f"{np.degrees(rival.angle):.2g} deg"
-        texts.append(f"Its predicted residual and that of {rival.candidate.name} differ by an angle of {angle}; ")
-        if plan is None or plan.answers[0] < DISTINCT:
-            texts[-1] += "no recording that was tried (3 to 30 deg, spin 0.5 and 5 rad/s, up to 1 s) separates them."
-        else:
-            texts[-1] += f"to separate them, {plan.proposal.text}: {plan.answers[0]:.3g} sigmas apart."
-    return " ".join(texts)
+def _alternatives(found: Found) -> str:
+    """Angles to the indistinguishable alternatives."""
+    return " ".join(
+        f"Its predicted residual and that of {r.candidate.name} differ by an angle of {np.degrees(r.angle):.2g} deg."
+        for r in found.cannot_be_told_from
+    )
 
 
 def _before_after(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> list[Listing | Text]:

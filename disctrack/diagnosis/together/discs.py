@@ -7,13 +7,11 @@ import numpy as np
 
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.model_file import PAPER
-from disctrack.diagnosis.plan import Plan, Question
+from disctrack.diagnosis.plan import OPEN, Plan, Question
 from disctrack.diagnosis.together.recordings import Item, Recorded, Say, build, in_common, labels_of
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
 from disctrack.discrepancy.search import Settings
-
-OPEN = 6  # questions that further recordings are sought for
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,77 +108,46 @@ def as_json(answer: DiscsTogether) -> dict[str, Any]:
         key: fit_errors(fit, held) | {"parameters": declared_json(fit)}
         for key, fit, held in (("before", d.before, d.held_out_before), ("after", d.after, d.held_out_after))
     }
-    found = (
-        document(d, "shared by all recordings", sentence(answer))
-        | sides
-        | {
-            "notes": list(answer.notes),
-            "unusable": list(answer.unusable),
-            "recordings": [_recording_json(r) for r in answer.recordings],
-            "bounds": [_bound_json(b) for b in answer.bounds],
-            "dependences": [
-                {
-                    "quantity": x.quantity,
-                    "unit": x.unit,
-                    "by": x.by,
-                    "groups": {g: {"value": v, "sigma": s} for g, (v, s) in x.groups.items()},
-                    "hypotheses": [
-                        {
-                            "text": h.text,
-                            "numbers": {k: {"value": v, "sigma": s} for k, (v, s) in h.numbers.items()},
-                            "chi_square": h.chi_square,
-                            "degrees": h.degrees,
-                            "p_value": h.p_value,
-                            "holds": h.holds,
-                        }
-                        for h in x.hypotheses
-                    ],
-                }
-                for x in answer.dependences
-            ],
-            "plan": planned.as_json(answer.plan),
-        }
-    )
+    found = document(d, "shared by all recordings", sentence(answer)) | {
+        **sides,
+        "notes": list(answer.notes),
+        "unusable": list(answer.unusable),
+        "recordings": [_recording_json(r) for r in answer.recordings],
+        "bounds": [_bound_json(b) for b in answer.bounds],
+        "dependences": [_dependence_json(x) for x in answer.dependences],
+        "plan": planned.as_json(answer.plan),
+    }
     return dict(plain(found))
+
+
+def _known(numbers: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, float]]:
+    return {name: {"value": value, "sigma": sigma} for name, (value, sigma) in numbers.items()}
+
+
+def _dependence_json(x: Dependence) -> dict[str, Any]:
+    tested = [vars(h) | {"numbers": _known(h.numbers), "p_value": h.p_value, "holds": h.holds} for h in x.hypotheses]
+    return vars(x) | {"groups": _known(x.groups), "hypotheses": tested}
 
 
 def _recording_json(r: OfRecording) -> dict[str, Any]:
     told: dict[str, Any] = {"name": r.name, **r.labels, "left_out": r.reason}
-    if r.fits_in is not None:
-        told |= {
-            "chi_square_shared": r.fits_in.chi_square,
-            "difference_to_the_others": r.fits_in.statistic,
-            "degrees": r.fits_in.degrees,
-            "p_value": r.fits_in.p_value,
-        }
-    if r.alone is not None:
-        told["alone"] = {
-            "chi_square": r.alone.chi_square,
-            "degrees": r.alone.degrees,
-            "parameters": {
-                n: {"value": r.alone.values[n], "sigma": s * r.alone.inflation[n]} for n, s in r.alone.sigmas.items()
-            },
-        }
+    if (f := r.fits_in) is not None:
+        told |= {"chi_square_shared": f.chi_square, "difference_to_the_others": f.statistic}
+        told |= {"degrees": f.degrees, "p_value": f.p_value}
+    if (a := r.alone) is not None:
+        numbers = _known({n: (a.values[n], sigma * a.inflation[n]) for n, sigma in a.sigmas.items()})
+        told["alone"] = {"chi_square": a.chi_square, "degrees": a.degrees, "parameters": numbers}
     return told
 
 
 def _bound_json(b: Bound) -> dict[str, Any]:
-    return {
-        "candidate": b.candidate.name,
-        "kind": b.candidate.kind,
-        "title": b.candidate.title,
-        "parameters": [
-            {
-                "name": q.name,
-                "unit": q.unit,
-                "value": float(v),
-                "sigma": float(s),
-                "sigma_by_number_of_recordings": {str(k): float(x[i]) for k, x in b.by_number.items()},
-            }
-            for i, (q, v, s) in enumerate(zip(b.candidate.quantities, b.values, b.sigma, strict=True))
-        ],
-        "upper_limit_95": b.upper,
-    }
+    c, by_number = b.candidate, np.array(list(b.by_number.values()))
+    numbers = [
+        {"name": q.name, "unit": q.unit, "value": value, "sigma": sigma,
+         "sigma_by_number_of_recordings": dict(zip(b.by_number, sigmas, strict=True))}
+        for q, value, sigma, sigmas in zip(c.quantities, b.values, b.sigma, by_number.T, strict=True)
+    ]  # fmt: skip
+    return {"candidate": c.name, "kind": c.kind, "title": c.title, "parameters": numbers, "upper_limit_95": b.upper}
 
 
 def report_of(answer: DiscsTogether, drawn: Sequence[Drawn] = (), files: Sequence[Path] = ()) -> Report:

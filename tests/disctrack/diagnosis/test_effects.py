@@ -1,6 +1,6 @@
 """Effects hidden in measured trajectories are found, named and sized; nothing is found where nothing is hidden."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -8,6 +8,8 @@ import pytest
 from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.pages.output import as_json
+from disctrack.diagnosis.plan import Proposal
+from disctrack.diagnosis.stage import with_plan
 from disctrack.discrepancy.fit import fit
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.rolling import CATALOGUE
@@ -73,9 +75,9 @@ def test_nothing_is_found_where_nothing_is_hidden():
 def test_a_thickness_within_its_tolerance_is_no_effect():
     """0.03 mm off in height, 2 sigma of what a caliper may err by and 20 of a micrometer's."""
     trajectory = measured({"contact_height.h_error": 3e-5}, seed=8, n=200, declared_rate=500.0)
-    assert diagnose(trajectory, separate=False).diagnosis.verdict == "found"
+    assert diagnose(trajectory).diagnosis.verdict == "found"
     disc = replace(trajectory.disc, thickness_tolerance=3e-5)
-    result = diagnose(replace(trajectory, disc=disc), separate=False)
+    result = diagnose(replace(trajectory, disc=disc))
     assert result.diagnosis.verdict == "nothing missing"
     after = result.diagnosis.after
     assert abs(after.values["contact_height.h_error"] - 3e-5) < 4 * after.sigma("contact_height.h_error") < 3e-5
@@ -131,12 +133,14 @@ def test_false_alarms_are_rare():
 def test_the_recording_proposed_to_separate_two_effects_separates_them():
     """Viscous contour friction at 14 deg looks like the air; the proposed recording, once made, tells them apart."""
     hidden = {"contour_viscous.c": 1e-5}
-    first = diagnose(measured(hidden, seed=100, n=600))
+    first = with_plan(diagnose(measured(hidden, seed=100, n=600)))
     (found,) = first.diagnosis.found
-    name = found.candidate.name
-    assert name == "contour_viscous" or first.separated_by[name]["contour_viscous"] is not None
-    plans = [p for p in first.separated_by[name].values() if p is not None and p.answers[0] > 5]
-    plan = max(plans, key=lambda p: p.answers[0]).proposal
+    rivals = [r.candidate.name for r in found.cannot_be_told_from]
+    assert "contour_viscous" in (found.candidate.name, *rivals)
+    starts = [r for r in first.plan.rows if r.proposal == Proposal(*astuple(r.proposal)[:3])]  # of the same disc
+    best = max(starts, key=lambda r: max(r.answers[: len(rivals)]))
+    assert max(best.answers[: len(rivals)]) > 5
+    plan = best.proposal
     second = measured(hidden, seed=101, n=900, theta_deg=plan.theta_deg, omega3=plan.omega3, nutation_deg=0.4)
     again = diagnose(second)
     assert [f.candidate.name for f in again.diagnosis.found] == ["contour_viscous"]
@@ -147,8 +151,10 @@ def test_the_recording_proposed_to_separate_two_effects_separates_them():
 def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     result = diagnose(measured(faults=Faults(frame_rate_hz=1004.0), seed=14, n=300))
     (found,) = result.diagnosis.found
-    (plan,) = result.separated_by[found.candidate.name].values()
-    assert plan.answers[0] < 0.01  # all laws at hand are quadratic in the rates: time can be stretched
+    assert len(found.cannot_be_told_from) == 1
+    assert (
+        with_plan(result).plan.best(0).answers[0] < 0.01
+    )  # all laws at hand are quadratic in the rates: time can be stretched
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_poses_with_the_fault_agree_again():
 
 @pytest.mark.statistical
 def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
-    result = diagnose(measured(faults=Faults(frame_rate_hz=2000.0), seed=1, n=200), separate=False)
+    result = diagnose(measured(faults=Faults(frame_rate_hz=2000.0), seed=1, n=200))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "frame_rate"
     after = result.diagnosis.after
@@ -65,7 +65,7 @@ def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
 )
 def test_large_faults_are_named_and_sized_in_an_imperfect_laboratory(faults, truth):
     """1 deg, 2 mm, three frames; the fields of the lenses reach 0.02 px rms, and sigmas contain them."""
-    result = diagnose(recording(faults=faults, seed=1)[0], separate=False)
+    result = diagnose(recording(faults=faults, seed=1)[0])
     found = [f.candidate for f in result.diagnosis.found]
     assert all(c.kind == "measurement" for c in found)
     assert any(set(truth) <= set(c.names) for c in found)

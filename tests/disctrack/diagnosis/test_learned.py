@@ -40,7 +40,7 @@ def hiding(name: str, component: str, formula: str, size: float, **options):
 )
 def test_an_effect_in_no_catalogue_is_described_by_a_learned_law(name, component, formula, size, locked):
     trajectory = hiding(name, component, formula, size, seed=5, n=450, omega3=2.0)
-    result = diagnose(trajectory, separate=False)
+    result = diagnose(trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
     assert set(result.learned.law.formulas) == {component}
@@ -164,9 +164,7 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
 def test_a_law_that_a_found_effect_describes_alone_is_that_effect():
     """A table tilted about one axis beside a wrong frame rate: a constant force is the tilt in one number less."""
     faults, options = Faults(frame_rate_hz=500.05), {"seed": 3, "n": 250, "theta_deg": 11.0}
-    result = diagnose(
-        measured({"table_tilt.tilt_x": 2e-3}, faults=faults, declared_rate=500.0, **options), separate=False
-    )
+    result = diagnose(measured({"table_tilt.tilt_x": 2e-3}, faults=faults, declared_rate=500.0, **options))
     assert result.learned is None
     alike = [{f.candidate.name, *(r.candidate.name for r in f.cannot_be_told_from)} for f in result.diagnosis.found]
     assert any("table_tilt" in names for names in alike)
@@ -180,7 +178,7 @@ def test_a_law_that_a_found_effect_describes_alone_is_that_effect():
 def test_a_law_that_describes_no_more_than_a_known_effect_is_told_beside_it():
     """A weak spring: over so short a way a tilted table, and a force of constant size in one number less."""
     options = {"nutation_deg": 0.5, "n": 150, "theta_deg": 10.0, "omega3": 1.0, "declared_rate": 500.0}
-    result = diagnose(measured({"spring.k": 0.05}, seed=11, rig_seed=5, **options), separate=False)
+    result = diagnose(measured({"spring.k": 0.05}, seed=11, rig_seed=5, **options))
     assert result.learned is None
     (found,) = result.diagnosis.found
     assert "spring" in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}

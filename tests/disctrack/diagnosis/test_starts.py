@@ -106,7 +106,7 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
     """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within 1e6 steps."""
     trajectory = measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0)
     began = time.process_time()
-    result = diagnose(trajectory, separate=False)
+    result = diagnose(trajectory)
     assert time.process_time() - began < 60.0  # 3 and 13 s were measured
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     assert result.after.reduced_chi_square < 1.03 < 1000 < result.before.reduced_chi_square

@@ -51,7 +51,7 @@ def filmed():
 
 @pytest.mark.slow
 def test_air_that_single_recordings_do_not_show_is_found_in_four_and_another_disc_is_named(filmed):
-    alone = diagnose(filmed[0].trajectory, separate=False).diagnosis
+    alone = diagnose(filmed[0].trajectory).diagnosis
     assert "air_moffatt" not in {f.candidate.name for f in alone.found}
     answer = diagnose_together([*filmed[:2], independent(9, F, axial=1.02), *filmed[2:]])
     assert [r.name for r in answer.recordings if r.reason] == ["run 9"]
@@ -126,7 +126,7 @@ def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagn
 def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
     """With another disc, too, whose k_m is its own."""
     first = measured(seed=1, n=120, theta_deg=6.0, omega3=1.0, declared_rate=RATE, rig_seed=RIG)
-    result = diagnose(first, separate=False)
+    result = diagnose(first)
     system, fit = result.system, result.diagnosis.after
     candidate = next(c for c in system.candidates if c.name == "air_bildsten")
     planner = Planner(system, fit, [candidate])

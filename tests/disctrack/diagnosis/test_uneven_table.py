@@ -62,7 +62,7 @@ def test_uneven_tables_are_looked_for_where_the_disc_touches():
 @pytest.mark.slow
 def test_a_groove_is_no_tilted_table():
     """The tilt leaves 1.03 of the noise, with p = 0.02; a law by the place leaves noise, and is named in its stead."""
-    result = diagnose(recording("groove").trajectory, separate=False)
+    result = diagnose(recording("groove").trajectory)
     assert result.learned.law.title == "a ridge or groove of the table"
     assert not result.diagnosis.found
     assert result.after.reduced_chi_square < 1.0

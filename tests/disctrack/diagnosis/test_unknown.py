@@ -54,7 +54,7 @@ def recording(law, theta_deg: float, omega3: float, duration: float, seed: int =
 
 
 def test_a_spring_is_no_tilt_with_an_inertia():
-    result = diagnose(recording(newton_euler.spring(0.8), 14.0, 1.0, 0.9), separate=False)
+    result = diagnose(recording(newton_euler.spring(0.8), 14.0, 1.0, 0.9))
     assert [f.candidate.name for f in result.diagnosis.found] == ["spring"]
     assert result.after.reduced_chi_square < 1.05
     fit = result.diagnosis.after
@@ -66,7 +66,7 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
     """3 um at 60 Hz, 16 deg before the course of the cosine's; the frames begin 2 ms after the motion."""
     acceleration = 3e-6 * (2 * np.pi * 60) ** 2 * np.array([0.6, 0.3, 0.7])
     law = newton_euler.vibration(-np.sin(0.3) * acceleration, -np.cos(0.3) * acceleration, 60.0)
-    result = diagnose(recording(law, 14.0, 1.0, 0.9), separate=False)
+    result = diagnose(recording(law, 14.0, 1.0, 0.9))
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
     fit = result.learned.fit
@@ -81,7 +81,7 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
 
 
 def test_a_law_below_a_nutation_is_told_with_the_nutation():
-    result = diagnose(recording(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6), separate=False)
+    result = diagnose(recording(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6))
     assert result.diagnosis.verdict == "unexplained"
     assert result.regimes is not None
     assert result.regimes.first is not None
@@ -102,7 +102,7 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
         bump = size * np.exp((np.cos(phi) - 1) / width**2) * np.sign(now.phidot)
         return newton_euler.ZERO, bump * now.m0, newton_euler.ZERO
 
-    result = diagnose(recording(law, 14.0, 1.0, 0.9), separate=False)
+    result = diagnose(recording(law, 14.0, 1.0, 0.9))
     assert result.learned is not None
     fit = result.learned.fit
     assert result.after.reduced_chi_square < 1.05
@@ -117,7 +117,7 @@ def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction()
     def law(disc, now):
         return newton_euler.ZERO, newton_euler.ZERO, disc.t * growing
 
-    result = diagnose(recording(law, 11.0, 0.6, 0.7), separate=False)
+    result = diagnose(recording(law, 11.0, 0.6, 0.7))
     assert result.learned is not None
     fit = result.learned.fit
     assert result.after.reduced_chi_square < 1.05
@@ -132,13 +132,13 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
 
     Pivoting friction beside it is truly there, and stays.
     """
-    alone = diagnose(unknown("quadratic_spring").trajectory, separate=False)
+    alone = diagnose(unknown("quadratic_spring").trajectory)
     assert alone.diagnosis.found == ()
     x, y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"
     forces = {"X_n": f"-k * {x} * sqrt(x * x + y * y)", "X_m": f"-k * {y} * sqrt(x * x + y * y)"}
     hidden, planted = effect_from_formulas("hidden_square", forces), {"hidden_square.k": 40.0, "kz.k_z": 6e-5}
     made = measured(planted, laws=[hidden], seed=5, n=250, declared_rate=500.0, theta_deg=11.0)
-    beside = diagnose(made, separate=False)
+    beside = diagnose(made)
     assert [found.candidate.name for found in beside.diagnosis.found] == ["kz"]
     for result in (alone, beside):
         assert result.learned is not None
@@ -153,7 +153,7 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
 def test_a_thread_that_twists_is_no_shaken_table():
     """Seven numbers, a frequency among them, leave noise of a moment that grows with the turn: a law leaves less."""
     made = unknown("twisted_thread")
-    result = diagnose(made.trajectory, separate=False)
+    result = diagnose(made.trajectory)
     assert result.diagnosis.found == ()
     assert result.learned is not None
     assert any("table_shaken" in note for note in result.notes)
@@ -165,7 +165,7 @@ def test_a_thread_that_twists_is_no_shaken_table():
 
 def test_friction_by_the_speed_of_slip_is_creep():
     """2 % of the coefficient: friction by Stribeck's law is not quite linear."""
-    result = diagnose(unknown("stribeck_slip").trajectory, separate=False)
+    result = diagnose(unknown("stribeck_slip").trajectory)
     assert [found.candidate.name for found in result.diagnosis.found] == ["creep"]
     assert result.diagnosis.verdict == "found"
     assert abs(result.after_fit.values["creep.c"] / 7.0e-4 - 1.0) < 0.02
@@ -173,7 +173,7 @@ def test_friction_by_the_speed_of_slip_is_creep():
 
 def test_a_contact_on_a_viscous_film_is_measured_to_its_sigma():
     """What follows its force within 1 to 3 ms, at 70 rad/s: as a series in that time it came out 4 to 12 sigma low."""
-    result = diagnose(unknown("viscous_contact").trajectory, separate=False)
+    result = diagnose(unknown("viscous_contact").trajectory)
     assert [found.candidate.name for found in result.diagnosis.found] == ["creep"]
     assert result.diagnosis.verdict == "found"
     fit = result.after_fit
@@ -182,7 +182,7 @@ def test_a_contact_on_a_viscous_film_is_measured_to_its_sigma():
 
 def test_a_table_that_sinks_is_told_with_its_course():
     """By 40 um over 0.7 s, with the square of time: three laws that left 4.5, before the height could change."""
-    result = diagnose(unknown("table_sinks").trajectory, separate=False)
+    result = diagnose(unknown("table_sinks").trajectory)
     assert [found.candidate.name for found in result.diagnosis.found] == ["table_settles"]
     assert result.diagnosis.verdict == "found"
     fit, second, lead = result.diagnosis.after, -2 * 40e-6 / 0.7**2, 0.002  # the frames begin 2 ms after the motion
@@ -192,7 +192,7 @@ def test_a_table_that_sinks_is_told_with_its_course():
 
 def test_a_rim_that_wears_is_no_hollow_of_the_table():
     """A curved table 6 um lower stood in for a height that falls by 3 um; what else wear does goes to a law."""
-    result = diagnose(unknown("wear").trajectory, separate=False)
+    result = diagnose(unknown("wear").trajectory)
     assert [found.candidate.name for found in result.diagnosis.found] == ["table_settles"]
     assert result.diagnosis.after.values["table_settles.v_z"] < 0
 
@@ -200,7 +200,7 @@ def test_a_rim_that_wears_is_no_hollow_of_the_table():
 def test_one_friction_in_another_s_place_competes_with_laws():
     """A drag along one direction: creep leaves noise of it, and a law of the same length leaves less; both are told."""
     made = unknown("drag_one_way")
-    result = diagnose(made.trajectory, separate=False)
+    result = diagnose(made.trajectory)
     assert result.learned is not None
     assert any("known effects" in note for note in result.notes)
     course = result.learned.course
@@ -210,7 +210,7 @@ def test_one_friction_in_another_s_place_competes_with_laws():
 
 def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
     """A step of the table is wider than any hill of the library: its derivatives are taken inwards."""
-    result = diagnose(unknown("seam").trajectory, separate=False)
+    result = diagnose(unknown("seam").trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is None or np.isfinite(result.learned.course.sigma).all()
 
@@ -222,7 +222,7 @@ def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
 def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
     """A ball in oil, a table that gives way, a brake over half of it: sums that come near to these are no finding."""
     made = unknown(name, 1)
-    result = diagnose(made.trajectory, separate=False)
+    result = diagnose(made.trajectory)
     assert not result.diagnosis.found
     assert any(f"[{beside}] helps the law" in note for note in result.notes)  # it does, by far more than noise
     course = result.learned.course

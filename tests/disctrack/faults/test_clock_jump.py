@@ -70,6 +70,6 @@ def test_frames_without_a_pose_at_the_loss_do_not_hide_it(rolling):
 
 @pytest.mark.statistical
 def test_a_diagnosis_counts_the_lost_pairs_before_it_looks_for_a_law():
-    result = diagnose(without(measured(seed=3, n=300), [100, 101]), separate=False)
+    result = diagnose(without(measured(seed=3, n=300), [100, 101]))
     assert "frame 100: the clock jumps by 2 frame(s)" in result.notes[0]
     assert result.diagnosis.verdict == "nothing missing"
