@@ -29,11 +29,11 @@ class Table:
     rows: Sequence[Sequence[str]]
     note: str = ""
 
-    def markdown(self) -> str:
-        """As people read it."""
+    def markdown(self, level: int = 2) -> str:
+        """As people read it, under a heading of this level."""
         lines = [self.head, ["---"] * len(self.head), *self.rows]
         text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-        return f"## {self.title}\n\n{text}\n" + (f"\n{self.note}\n" if self.note else "")
+        return f"{level * '#'} {self.title}\n\n{text}\n" + (f"\n{self.note}\n" if self.note else "")
 
 
 @dataclass(frozen=True)
@@ -90,5 +90,5 @@ def write_into(page: Path, validation: Validation, command: str) -> None:
     if begun and not ended:
         raise OutputError(f"{page}: '{begin}' without '{end}' below; expected both, or neither for a new section")
     source = f"Written by `{command}`, disctrack {__version__}, {date.today().isoformat()}."
-    tables = "\n".join(table.markdown() for table in validation.tables)
+    tables = "\n".join(table.markdown(3) for table in validation.tables)
     write_whole(page, f"{before}{begin}\n{validation.headline}\n\n{tables}\n{source}\n{end}{after or chr(10)}".encode())

@@ -6,7 +6,6 @@ one folder with the sample data in it. Commands that do not begin with disctrack
 
 import argparse
 import ast
-import json
 import os
 import re
 import shlex
@@ -233,47 +232,9 @@ def test_every_command_is_in_the_documentation():
         assert f"disctrack {command}" in everything or f"`{command}`" in everything, command
 
 
-def cells_of(notebook: Path) -> list[str]:
-    content = json.loads(text_of(notebook))
-    return ["".join(cell["source"]) for cell in content["cells"] if cell["cell_type"] == "code"]
-
-
-def test_the_notebook_is_one_and_its_cells_compile():
-    nbformat = json.loads(text_of(DOCS / "notebook.ipynb"))
-    assert nbformat["nbformat"] == 4
-    for cell in cells_of(DOCS / "notebook.ipynb"):
-        ast.parse(cell)
-
-
-def test_the_notebook_is_stored_with_what_its_cells_showed():
-    cells = [cell for cell in json.loads(text_of(DOCS / "notebook.ipynb"))["cells"] if cell["cell_type"] == "code"]
-    shown = [output for cell in cells for output in cell["outputs"]]
-    assert not any(output["output_type"] == "error" for output in shown)
-    assert sum("image/png" in output.get("data", {}) for output in shown) == 2
-    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
-
-
 def test_every_public_name_is_in_the_reference():
     shown = set(re.findall(r"^::: (?:\w+\.)*(\w+)$", text_of(DOCS / "reference.md"), re.MULTILINE))
     assert shown == set(disctrack.__all__)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of the figures, which no screen shows here
-def test_the_notebook_runs_and_its_last_lines_show_themselves(workplace, monkeypatch):
-    """Without Jupyter: each cell is executed, and what it ends with must show itself in a few lines."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    monkeypatch.chdir(workplace)
-    scope: dict[str, object] = {}
-    for cell in cells_of(DOCS / "notebook.ipynb"):
-        tree = ast.parse(cell)
-        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
-        exec(compile(tree, "notebook.ipynb", "exec"), scope)
-        if last is not None:
-            shown = eval(compile(ast.Expression(last.value), "notebook.ipynb", "eval"), scope)
-            assert len(repr(shown)) < 4000, cell
 
 
 @pytest.mark.statistical
