@@ -258,7 +258,7 @@ def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: rang
         images = _pairs_at(pairs, list(range(start, stop)), slip)
         yield PairBlock(np.arange(start, start + len(images)), images)
 
-    settings = TrackingSettings(refine_markers=False, first_pass=False, table="board")
+    settings = TrackingSettings(refine_markers=False, first_pass=False)
     return track(read_blocks, frames, rig, recording.disc, recording.frame_rate, gravity=recording.gravity,
                  settings=settings)  # fmt: skip
 

@@ -180,12 +180,14 @@ def measure(
         raise
     unreadable = [not_read[place] for place in sorted(not_read)]
     seconds = time.perf_counter() - began
-    lost = [f"{len(unreadable)} image(s) could not be read; their frames rest on one camera or none. The first: "
-            f"{unreadable[0].reason}"] if unreadable else []  # fmt: skip
+    lost: tuple[Finding, ...] = ()
+    if unreadable:
+        text = f"{len(unreadable)} images could not be read; their frames rest on one camera or none. The first"
+        lost = (Finding(Kind.UNREADABLE, Severity.WARNING, f"{text}: {unreadable[0].reason}"),)
     findings = (
         *pairs.findings,
         *of_kind(Kind.EXPOSURE, Severity.NOTE, headers),
-        *of_kind(Kind.UNREADABLE, Severity.WARNING, lost),
+        *lost,
         *tracking.findings,
     )
     details = {

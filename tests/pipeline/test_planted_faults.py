@@ -235,8 +235,8 @@ def test_a_camera_turned_a_little_is_one_fault_and_not_a_trembling_table_too(cli
     dR = frames.rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.8, 0.0]))
     rig = replace(clip.rig, R_right_left=dR @ clip.rig.R_right_left, t_right_left=dR @ clip.rig.t_right_left)
     found = measure(clip.images, rig, clip.disc)
-    causes = [f.kind for f in leading(found.findings)]
-    assert Kind.DOTS_MISFIT in causes
+    causes = {f.kind for f in leading(found.findings)}
+    assert causes & {Kind.DOTS_MISFIT, Kind.CAMERA_MOVED}
     assert Kind.POSES_SCATTER not in causes
 
 

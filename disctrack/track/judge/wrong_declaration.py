@@ -98,8 +98,11 @@ def _areas(seen: SeenDots, R: Array, rig: StereoRig, disc: Disc) -> Array:
 
 
 def _on_another_scale(scale: float) -> Finding:
-    units = [words for unit, words in UNITS.items() if abs(abs(np.log(scale)) / np.log(unit) - 1) < 0.02]
-    mixed = f": are {units[0]} mixed up?" if units else ""
+    mixed = ""
+    for unit, words in UNITS.items():
+        if abs(abs(np.log(scale)) / np.log(unit) - 1) < 0.02:
+            scale, mixed = unit ** np.sign(np.log(scale)), f": are {words} mixed up?"
+            break
     disc, board = (f"times {float(f'{factor:.3g}'):g}" for factor in (scale, 1 / scale))
     keys = "[calibration] square_mm", "every length of [disc] and [markers]"
     remedies = Remedy(keys[0], action=board), Remedy(keys[1], action=disc)
