@@ -5,7 +5,6 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from calibration.cameras.camera import StereoRig
@@ -44,17 +43,14 @@ from disctrack.trajectory import file as storage
 from disctrack.trajectory.file import Provenance
 from disctrack.trajectory.reuse import origin_of, remember
 
-Progress = Callable[[float], None]  # is told the share of the job that is done
-
 LOCK = ".batch.lock"
 BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again
-_TRACKED = 0.5  # share of the progress after tracking
 
 
-def do(job: Job, progress: Progress = lambda share: None) -> Result:
+def do(job: Job) -> Result:
     """Do a job. Never raises an Exception: what went wrong is in the result, and in the recording's record."""
     try:
-        return make_rig(job) if job.kind == "rig" else make_recording(job, progress)
+        return make_rig(job) if job.kind == "rig" else make_recording(job)
     except Busy:
         return Result(BUSY, Record(FAILED))
     except Exception as error:
@@ -77,12 +73,12 @@ def make_rig(job: Job) -> Result:
     return Result(MEASURED, Record(MEASURED))
 
 
-def make_recording(job: Job, progress: Progress) -> Result:
+def make_recording(job: Job) -> Result:
     """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Busy."""
     results = Path(job.results)
     with locked(results / LOCK, BUSY_FOR):
         try:
-            return _make_recording(job, results, progress)
+            return _make_recording(job, results)
         except Exception as error:
             result = Result.failed(reason_of(error))
             with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
@@ -90,7 +86,7 @@ def make_recording(job: Job, progress: Progress) -> Result:
             return result
 
 
-def _make_recording(job: Job, results: Path, progress: Progress) -> Result:
+def _make_recording(job: Job, results: Path) -> Result:
     began, used = time.perf_counter(), time.process_time()
     asked = stages_asked(job.options)
     recording = read_recording(job.folder)
@@ -106,8 +102,7 @@ def _make_recording(job: Job, results: Path, progress: Progress) -> Result:
         trajectory = storage.read_trajectory(path)
     else:
         with recorded_times() as tracking, timed("track"):
-            trajectory, provenance = _track(path, recording, rig, pairs, job, progress)
-    progress(_TRACKED)
+            trajectory, provenance = _track(path, recording, rig, pairs, job)
     with recorded_times() as times:
         record = _after_tracking(results, path, trajectory, provenance, job, asked)
     numbers = record.numbers | _origin(recording, provenance)
@@ -135,17 +130,10 @@ def _reusable(path: Path, recording: Recording, rig: StereoRig, pairs: ImagePair
 
 
 def _track(
-    path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs, job: Job, progress: Progress
+    path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs, job: Job
 ) -> tuple[Trajectory, Provenance]:
-    done = 0  # read and added to by several threads: a lost update spoils the bar for a moment, no more
-
-    def advance(n: int) -> None:
-        nonlocal done
-        done += n
-        progress(_TRACKED * done / len(pairs))
-
     boards = boards_in(Path(job.rig), recording)
-    found = measure(recording, rig, pairs, threads=job.threads, progress=advance, boards=boards)
+    found = measure(recording, rig, pairs, threads=job.threads, boards=boards)
     provenance = trajectory_provenance(recording, rig, pairs, None)
     storage.write_trajectory(path, found.trajectory, provenance, overwrite=True, details=found.details)
     return found.trajectory, provenance

@@ -12,9 +12,6 @@ from disctrack.calibrate.stage import source_of
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.measurement import open_pairs
 
-# Work in units of one tracked pair, from timings; it only sets how the progress bar is divided.
-_START, _NUMBERS, _REPORT, _DIAGNOSIS, _CALIBRATION = 100.0, 200.0, 1500.0, 4000.0, 2500.0
-
 
 @dataclass(frozen=True)
 class BatchOptions:
@@ -57,17 +54,8 @@ class Job:
     results: str  # folder for what comes out
     rig: str  # rig file: what a "rig" makes and a "recording" uses
     options: BatchOptions
-    pairs: int = 0
     threads: int = 1  # that read images
     adopt: tuple[str, ...] = ()  # rig files of earlier runs that may be the same
-
-    @property
-    def work(self) -> float:
-        """Expected work, in pairs."""
-        if self.kind == "rig":
-            return _CALIBRATION
-        o = self.options
-        return _START + self.pairs + _NUMBERS + _REPORT * o.report + _DIAGNOSIS * o.diagnose
 
 
 @dataclass(frozen=True)
@@ -122,15 +110,15 @@ def _has_views_of(place: Path, recording: Recording) -> bool:
 
 def _job(places: Places, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
     folder = recording.folder
-    n = len(open_pairs(recording))
+    open_pairs(recording)  # raises where there is nothing to measure
     results = places.results(folder)
     if recording.rig_file is not None:
-        return Job("recording", name, str(folder), str(results), str(recording.rig_file), options, pairs=n)
+        return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
     rig = _shared_rig(places, recording, options)
     earlier = str(results / "rig.h5")
     job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
     rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
-    return Job("recording", name, str(folder), str(results), str(rig), options, pairs=n)
+    return Job("recording", name, str(folder), str(results), str(rig), options)
 
 
 def _shared_rig(places: Places, recording: Recording, options: BatchOptions) -> Path:

@@ -19,7 +19,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from ctypes import c_double
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from types import FrameType, ModuleType
@@ -58,9 +57,6 @@ class Pool(Protocol):
     def result(self, future: Future[Result]) -> Result:
         """Result of a job that was begun. Raises Died, and ClusterError where nothing further can be done."""
 
-    def share(self, future: Future[Result]) -> float:
-        """How much of a job is done, from 0 to 1."""
-
     def close(self) -> None:
         """End in order what still runs."""
 
@@ -96,10 +92,6 @@ class Processes:
             result = Result.failed(reason_of(error))
         self._idle.append(self._busy.pop(future))
         return result
-
-    def share(self, future: Future[Result]) -> float:
-        """See Pool."""
-        return self._busy[future].share.value
 
     def close(self) -> None:
         """See Pool."""
@@ -144,10 +136,6 @@ class Cluster:
         except Exception as error:  # its machines were lost too often, or could not even begin
             text = " ".join(str(error).split())[:300]
             return Result.failed(f"the cluster could not do it ({type(error).__name__}: {text}).")
-
-    def share(self, future: Future[Result]) -> float:
-        """See Pool."""
-        return 0.0
 
     def close(self) -> None:
         """See Pool."""
@@ -196,9 +184,8 @@ class _Worker:
     def __init__(self, said: Path) -> None:
         """Said : file for whatever its libraries print"""
         context = _Spawn()
-        self.share: c_double = context.RawValue("d", 0.0)  # without a lock: one writes, and nobody waits for the dead
         with _STARTING, _quietly():  # with the first one Python starts its process that clears up semaphores
-            self.executor = ProcessPoolExecutor(1, context, _prepare, (self.share, said))
+            self.executor = ProcessPoolExecutor(1, context, _prepare, (said,))
         self._context, self._said = context, said
 
     @property
@@ -208,7 +195,6 @@ class _Worker:
 
     def begin(self, job: Job) -> Future[Result]:
         """Give it a job. Raises OSError where the process cannot be started."""
-        self.share.value = 0.0
         try:
             return self.executor.submit(_do, job)
         except BrokenProcessPool as error:  # it died while it had nothing to do
@@ -262,13 +248,8 @@ def _quietly() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-_share: c_double = c_double()
-
-
-def _prepare(share: c_double, said: Path) -> None:
+def _prepare(said: Path) -> None:
     """In a new process: what its libraries print goes into a file, and it ends with the batch that started it."""
-    global _share
-    _share = share
     signal.signal(signal.SIGTERM, _stop)
     output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (1, 2):
@@ -293,7 +274,7 @@ def _end_with_the_batch() -> None:
 
 def _do(job: Job) -> Result:
     try:
-        return do(job, lambda share: setattr(_share, "value", share))
+        return do(job)
     except SystemExit:  # half-written files are gone; the executor would keep the process
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.raise_signal(signal.SIGTERM)

@@ -13,7 +13,7 @@ from disctrack.batch.columns import Row, copies
 from disctrack.batch.find import find_recordings
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
 from disctrack.batch.pool import Cluster, Pool, Processes
-from disctrack.batch.records import FAILED, NOT_MEASURED, SKIPPED, Record, Result
+from disctrack.batch.records import FAILED, NOT_MEASURED, Record, Result
 from disctrack.batch.summary import counts, line_of, rows_of, write_summary
 from disctrack.batch.together import FOLDER, diagnose_all
 from disctrack.batch.work import do_all
@@ -123,7 +123,7 @@ def _do(plan: BatchPlan, results: dict[str, Result], pool: Pool) -> str:
         bar.done(job, result)
 
     try:
-        do_all(plan.rigs, plan.recordings, pool, done, bar.share)
+        do_all(plan.rigs, plan.recordings, pool, done)
     except KeyboardInterrupt:
         return INTERRUPTED
     except ClusterError as error:
@@ -164,38 +164,20 @@ def _summed_up(
 
 
 class _Bar:
-    """One bar for the whole batch, on stderr, where that is a terminal. What was skipped does not spoil the rate."""
+    """One bar for the whole batch, on stderr, where that is a terminal, and a line a recording."""
 
     def __init__(self, plan: BatchPlan, n_failed: int) -> None:
-        self._share: dict[Job, float] = {}
         self._n, self._n_failed, self._finished = len(plan.recordings) + n_failed, n_failed, n_failed
-        self._bar = tqdm(
-            total=sum(job.work for job in (*plan.rigs, *plan.recordings)),
-            bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]",
-            disable=None,
-            leave=False,
-            smoothing=0.1,
-        )
-        self._tell()
+        self._bar = tqdm(total=self._n, initial=n_failed, unit=" recordings", disable=None, leave=False)
 
     def close(self) -> None:
         self._bar.close()
 
-    def share(self, job: Job, share: float) -> None:
-        self._bar.update((share - self._share.get(job, 0.0)) * job.work)
-        self._share[job] = share
-
     def done(self, job: Job, result: Result) -> None:
-        if result.status in (SKIPPED, FAILED) and not self._bar.disable:
-            self._bar.total -= (1.0 - self._share.get(job, 0.0)) * job.work
-        else:
-            self.share(job, 1.0)
-        if job.kind == "recording":
-            self._finished += 1
-            self._n_failed += result.status == FAILED
-            tqdm.write(f"{self._finished:4d} of {self._n}  {job.name}: {result.status}", file=sys.stderr)
-        self._tell()
-
-    def _tell(self) -> None:
-        failed = f", {self._n_failed} failed" if self._n_failed else ""
-        self._bar.set_description_str(f"{self._finished} of {self._n} recordings{failed}")
+        if job.kind != "recording":
+            return
+        self._finished += 1
+        self._n_failed += result.status == FAILED
+        self._bar.update()
+        tqdm.write(f"{self._finished:4d} of {self._n}  {job.name}: {result.status}", file=sys.stderr)
+        self._bar.set_description_str(f"{self._n_failed} failed" if self._n_failed else "")

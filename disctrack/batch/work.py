@@ -9,13 +9,12 @@ from disctrack.batch.pool import Died, Pool
 from disctrack.batch.reasons import reason_of
 from disctrack.batch.records import BUSY, FAILED, Result
 
-LOOK = 0.1  # [s] between looks at what is done so far: as often as people see a bar move
+LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
 
 Done = Callable[[Job, Result], None]
-Share = Callable[[Job, float], None]
 
 
-def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Pool, done: Done, share: Share) -> None:
+def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Pool, done: Done) -> None:
     """Do every job; `done` is called with each that is finished for good. Raises ClusterError.
 
     Rigs come first, and what needs one waits for it. A job at which another batch works is asked for again until that
@@ -54,15 +53,11 @@ def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Pool, done: Don
             else:
                 died.add(job)
                 alone.append(job)
-                share(job, 0.0)
 
     while ready or alone or running:
         while ready and len(running) < pool.size:
             begin(ready.popleft())
         if alone and not running:
             begin(alone.popleft())
-        ended, still = wait(running, LOOK, FIRST_COMPLETED)
-        for future in still:
-            share(running[future], pool.share(future))
-        for future in ended:
+        for future in wait(running, LOOK, FIRST_COMPLETED).done:
             settle(running.pop(future), future)

@@ -136,15 +136,10 @@ class Pool:
             raise answer
         return answer
 
-    def share(self, future):
-        return 0.0
-
 
 def done_by(pool, recordings, rigs=()):
     results = {}
-    do_all(
-        rigs, recordings, pool, lambda job, result: results.__setitem__((job.kind, job.name), result), lambda *_: None
-    )
+    do_all(rigs, recordings, pool, lambda job, result: results.__setitem__((job.kind, job.name), result))
     return {name: result for (kind, name), result in results.items() if kind == "recording"}
 
 
