@@ -35,6 +35,16 @@ class Disc(Brief):
     radius_tolerance: float | None = None
     thickness_tolerance: float | None = None
 
+    def __post_init__(self) -> None:
+        sizes = {"radius": "m", "half_thickness": "m", "mass": "kg", "marker_diameter": "m"}
+        for name, unit in sizes.items():
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ModelError(f"a disc's {name} is {value} {unit}: expected a number above 0")
+        shape = np.shape(self.marker_centres_body)
+        if len(shape) != 2 or shape[1] != 3:
+            raise ModelError(f"marker_centres_body has the shape {shape}: expected (dots, 3), in metres")
+
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
         size = f"{2e3 * self.radius:g} mm, thickness {2e3 * self.half_thickness:g} mm"

@@ -6,6 +6,7 @@ from calibration.kit.errors import CalibrationError, DiscTrackError, RigFileErro
 
 __all__ = [
     "AnalysisError",
+    "ArgumentError",
     "CalibrationError",
     "ClusterError",
     "DiscTrackError",
@@ -20,6 +21,10 @@ __all__ = [
 
 class AnalysisError(DiscTrackError):
     """A trajectory does not hold enough for what was asked of it."""
+
+
+class ArgumentError(DiscTrackError, TypeError, ValueError):
+    """A function was given something else than it takes."""
 
 
 class ClusterError(DiscTrackError):

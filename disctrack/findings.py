@@ -7,6 +7,7 @@ stages read kinds, severities and numbers, never text. `causes` folds what anoth
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -237,10 +238,13 @@ class DoubtWarning(UserWarning):
     """A result that may be wrong by more than its sigmas; for Python, as commands have words of their own."""
 
 
-def warn_of_doubts(findings: Iterable[Finding], stacklevel: int = 3) -> None:
-    """A Python warning for each cause that puts the result in doubt."""
+def warn_of_doubts(findings: Iterable[Finding]) -> None:
+    """A Python warning for each cause that puts the result in doubt, at the line that called one of the packages."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] in ("disctrack", "calibration"):
+        level, frame = level + 1, frame.f_back
     for finding in doubts(findings):
-        warnings.warn(finding.sentence, DoubtWarning, stacklevel=stacklevel)
+        warnings.warn(finding.sentence, DoubtWarning, stacklevel=level)
 
 
 def with_sigma(value: float, sigma: float | None = None, unit: str = "") -> str:

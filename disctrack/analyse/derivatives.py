@@ -23,6 +23,7 @@ from disctrack.analyse.smoothing import (
     joined,
     moving_weights,
 )
+from disctrack.arguments import checked
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.frames import (
@@ -98,6 +99,7 @@ class MeasuredMotion(Outline):
         return np.asarray(turned @ C @ turned.swapaxes(1, 2))
 
 
+@checked
 def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> MeasuredMotion:
     """Velocities and accelerations of a measured trajectory.
 

@@ -12,6 +12,7 @@ from disctrack.analyse.derivatives import GROUP_NAMES, STATE
 from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.propagation import DerivedSeries, shared_sigma
 from disctrack.analyse.report import report_of
+from disctrack.arguments import Seconds, checked
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
@@ -39,11 +40,12 @@ class AnalyseOutcome(Brief):
 
 
 @one_blas_thread
+@checked
 def run_analyse(
     path: str | Path,
     output: str | Path | None = None,
-    window: float = WINDOW,
-    circle_duration: float = CIRCLE_DURATION,
+    window: Seconds = WINDOW,
+    circle_duration: Seconds = CIRCLE_DURATION,
     overwrite: bool = False,
     figures: bool = False,
 ) -> AnalyseOutcome:

@@ -17,6 +17,7 @@ from calibration.board.target import Board, Target
 from calibration.fit import normal_equations
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
 from disctrack.analyse.declaration import Boards
+from disctrack.arguments import checked
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
@@ -89,6 +90,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
     )
 
 
+@checked
 def calibrate_recording(
     recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:

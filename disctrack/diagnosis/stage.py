@@ -8,6 +8,7 @@ import numpy as np
 
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
+from disctrack.arguments import checked
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc_system import DiscSystem
@@ -54,6 +55,7 @@ class DiagnoseOutcome(Brief):
 
 
 @one_blas_thread
+@checked
 def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None) -> DiscDiagnosis:
     """What does the model lack? Fit, trace, refit, judge.
 

@@ -27,6 +27,8 @@ class Model:
     laws: tuple[type[Effect], ...] = ()  # by formula, that parameters may name beside those of the catalogue
 
     def __post_init__(self) -> None:
+        if not isinstance(self.disc, Disc):
+            raise ModelError(f"the disc of a model is {self.disc!r}: expected a Disc")
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "laws", tuple(self.laws))
         names = [effect.name for effect in self.effects]

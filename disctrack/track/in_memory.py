@@ -12,26 +12,29 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.cameras.camera import StereoRig
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import contradictions
+from disctrack.arguments import FrameRate, Gravity, checked, grey_values
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.findings import warn_of_doubts
+from disctrack.frames import CAMERAS
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.follow.tracking import TrackingSettings, prepare, stretch_edges, track
 from disctrack.track.measurement import Measurement, Progress, details_of
 
-Images = NDArray[Any]  # uint8 or uint16
+Images = NDArray[Any]  # of any real type; uint8 and uint16 are measured where they are
 
 BLOCK, COPIED_BLOCK = 256, 16  # pairs
 
 
 @one_blas_thread
+@checked
 def measure_pairs(
     images: Images | tuple[Images, Images],
     rig: StereoRig,
     disc: Disc,
-    frame_rate: float,
+    frame_rate: FrameRate,
     *,
-    gravity: float = 9.81,
+    gravity: Gravity = 9.81,
     settings: TrackingSettings | None = None,
     timestamps: ArrayLike | None = None,
     threads: int = 1,
@@ -39,18 +42,19 @@ def measure_pairs(
 ) -> Measurement:
     """Measure the disc's pose in every pair; every frame is measured (no rest is left out).
 
-    images     : (n, 2, height, width) uint8 or uint16, left and right; or the pair of arrays (n, height, width)
+    images     : (n, 2, height, width) grey values, left and right; or the pair of arrays (n, height, width)
+    rig, disc  : or what holds them: the path of a rig file, a calibration, a recording
     frame_rate : [Hz]; timestamps (n,) [s], increasing, where the camera wrote them
     gravity    : [m/s^2], kept with the trajectory for the physics
     Raises TrackingError if the arrays are not such images, do not belong to the rig, or show the disc in no pair.
     """
+    if not isinstance(images, tuple | list):
+        images = grey_values(images, "images")
     left, right = _sides(images)
     # pairs that lie together are measured where they are: of their pixels the dots' alone are looked at
     whole = images if isinstance(images, np.ndarray) and images.flags.carray else None
     block = BLOCK if whole is not None else COPIED_BLOCK
     n = len(left)
-    if not (np.isfinite(frame_rate) and frame_rate > 0):
-        raise TrackingError(f"frame_rate is {frame_rate}; expected frames per second, above 0")
     times = None if timestamps is None else np.asarray(timestamps, float)
     if times is not None and (times.shape != (n,) or not np.all(np.diff(times) > 0)):
         raise TrackingError(f"timestamps of shape {times.shape} for {n} pairs; expected ({n},), increasing, in seconds")
@@ -71,7 +75,7 @@ def measure_pairs(
         range(n),
         rig,
         disc,
-        float(frame_rate),
+        frame_rate,
         gravity=gravity,
         settings=settings,
         timestamps=times,
@@ -80,14 +84,14 @@ def measure_pairs(
     )
     seconds = time.perf_counter() - began
     found = (*contradictions(tracking.trajectory, disc), *tracking.findings)
-    warn_of_doubts(found, stacklevel=4)
+    warn_of_doubts(found)
     return Measurement(replace(tracking.trajectory, findings=found), (), details_of(tracking), seconds)
 
 
 def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
-    expected = "expected (n, 2, height, width), or two arrays (n, height, width), of uint8 or uint16"
+    expected = "expected (n, 2, height, width), or two arrays (n, height, width) of one type"
     if isinstance(images, tuple | list) and len(images) == 2:
-        left, right = (np.asarray(side) for side in images)
+        left, right = (grey_values(side, f"{name} images") for side, name in zip(images, CAMERAS, strict=True))
     else:
         whole = np.asarray(images)
         if whole.ndim != 4 or whole.shape[1] != 2:
@@ -95,8 +99,6 @@ def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
         left, right = whole[:, 0], whole[:, 1]
     if left.shape != right.shape or left.ndim != 3 or left.dtype != right.dtype:
         raise TrackingError(f"images of shape {left.shape} {left.dtype} and {right.shape} {right.dtype}; {expected}")
-    if left.dtype not in (np.uint8, np.uint16):
-        raise TrackingError(f"images of type {left.dtype}; {expected}")
     if not len(left):
         raise TrackingError("no image in the arrays")
     return left, right

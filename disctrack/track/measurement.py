@@ -15,6 +15,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions_of
+from disctrack.arguments import checked
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
@@ -79,6 +80,7 @@ class Measurement(Brief):
         return told | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else told
 
 
+@checked
 def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:
     """Open both cameras. frames: first and one past the last frame to measure, None for the recording's ends.
 
@@ -123,6 +125,7 @@ def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
 
 
 @one_blas_thread
+@checked
 def measure(
     recording: Recording,
     rig: StereoRig,
@@ -202,7 +205,7 @@ def measure(
         trajectory.frame_status[still] = FrameStatus.STILL
     contradicted = contradictions_of(recording, trajectory, findings, boards)
     trajectory = dataclasses.replace(trajectory, findings=(*contradicted, *findings))
-    warn_of_doubts(trajectory.findings, stacklevel=4)
+    warn_of_doubts(trajectory.findings)
     return Measurement(trajectory, tuple(unreadable), details, seconds)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.brief import Outline
 from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import TrajectoryFileError
@@ -47,8 +48,8 @@ _CONVENTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class Provenance:
+@dataclass(frozen=True, repr=False)
+class Provenance(Outline):
     """What a result was made from; equal fingerprints mean that making it again would give it again."""
 
     recording: str  # name

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import disctrack
-from disctrack.errors import TrackingError
+from disctrack.errors import ArgumentError, TrackingError
 from disctrack.findings import DoubtWarning, Kind, in_doubt
 from disctrack.trajectory import FrameStatus
 
@@ -45,7 +45,6 @@ def test_what_puts_a_result_in_doubt_is_told_of_arrays_too(taken):
     ("change", "words"),
     [
         (lambda i: i[:, 0], "expected"),
-        (lambda i: i.astype(float), "type float64"),
         (lambda i: (i[:, 0], i[:-1, 1]), "expected"),
         (lambda i: i[:0], "no image"),
         (lambda i: i[..., :-8], "calibrated at"),
@@ -58,6 +57,50 @@ def test_arrays_that_are_no_pairs_are_refused_with_what_is_expected(taken, chang
         disctrack.measure_pairs(change(images), rig, declared.disc, declared.frame_rate)
     with pytest.raises(TrackingError, match="timestamps"):
         disctrack.measure_pairs(images, rig, declared.disc, 1000.0, timestamps=np.zeros(len(images)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("images", np.full((1, 2, 8, 8), np.nan), "not every grey value is a number"),
+        ("images", np.full((1, 2, 8, 8), -1.0), "grey values -1 to -1"),
+        ("images", np.zeros((1, 2, 8, 8), complex), "type complex128"),
+        ("rig", 3, "rig is 3; expected a StereoRig or the path"),
+        ("disc", "a disc", "disc is 'a disc'; expected a Disc"),
+        ("frame_rate", 1e12, "above 0 and at most 1e\\+08, in Hz"),
+        ("frame_rate", True, "frame_rate is True"),
+        ("frame_rate", float("nan"), "frame_rate is nan"),
+        ("gravity", -9.81, "gravity is -9.81; expected a number above 0"),
+        ("colour", 1, "unexpected keyword argument 'colour'"),
+    ],
+)
+def test_an_argument_of_another_kind_is_refused_with_what_is_wanted(taken, name, value, words):
+    declared, rig, images, _ = taken
+    given = {"images": images, "rig": rig, "disc": declared.disc, "frame_rate": 1000.0, name: value}
+    with pytest.raises(ArgumentError, match=words):
+        disctrack.measure_pairs(**given)
+
+
+def test_files_and_results_stand_for_what_they_hold(taken, short_recording, rig_file, tmp_path):
+    declared, rig, images, by_files = taken
+    expected = disctrack.measure_pairs(images[:4], rig, declared.disc, declared.frame_rate).trajectory.q
+    found = disctrack.measure_pairs(images[:4], rig_file, declared, declared.frame_rate)
+    assert np.array_equal(found.trajectory.q, expected)
+    assert len(disctrack.open_pairs(short_recording)) == len(images)
+    file = tmp_path / "trajectory.h5"
+    disctrack.write_trajectory(file, by_files.trajectory, disctrack.Provenance("r", {}, {}))
+    assert len(disctrack.differentiate(file)) == len(disctrack.differentiate(by_files)) == len(images)
+
+
+def test_images_of_any_real_type_are_measured(taken):
+    """Fractions of one: a grey value is a 257th part of a step of 16 bits; what is rounded is a thousandth of it."""
+    declared, rig, images, _ = taken
+    expected = disctrack.measure_pairs(images[:4], rig, declared.disc, declared.frame_rate).trajectory
+    for same in (images[:4].astype(int), images[:4].astype(np.float32), images[:4] / 255.0):
+        found = disctrack.measure_pairs(same, rig, declared.disc, declared.frame_rate).trajectory
+        assert np.abs((found.q - expected.q) / expected.coordinate_sigma).max() < 0.1
+    with pytest.raises(ArgumentError, match="both of one type"):
+        disctrack.Tracker(rig, declared.disc).next(images[0, 0], images[0, 1].astype(np.uint16))
 
 
 def test_the_live_loop_gives_the_poses_of_the_recording(taken):
@@ -108,7 +151,8 @@ def test_results_show_a_few_facts_and_not_their_arrays(taken):
     model = disctrack.Model(declared.disc)
     rolled = disctrack.simulate(model, disctrack.steady_precession(0.1, declared.disc), duration=0.01)
     results = (by_files, by_files.trajectory, rig, tracker.next(*images[0]), tracker)
-    for thing in (*results, declared, declared.disc, declared.views, motion, rolled, model):
+    provenance = disctrack.trajectory_provenance(declared, rig, disctrack.open_pairs(declared), None)
+    for thing in (*results, provenance, declared, declared.disc, declared.views, motion, rolled, model):
         assert len(repr(thing)) < 400, type(thing)
         assert "array(" not in repr(thing)
     assert f"position {len(motion)} x 3" in repr(motion)

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array, Image, Mask
 from disctrack import frames
+from disctrack.arguments import checked, grey_values
 from disctrack.disc import Disc
+from disctrack.errors import ArgumentError
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
@@ -60,6 +62,7 @@ class Tracker:
     about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
     """
 
+    @checked
     def __init__(self, rig: StereoRig, disc: Disc, settings: TrackingSettings | None = None) -> None:
         self.rig, self.disc = rig, disc
         self.frame = -1
@@ -78,9 +81,9 @@ class Tracker:
         return f"Tracker({self.disc.n_markers} dots, {self.frame + 1} pairs seen, {state})"
 
     def next(self, left: Image, right: Image) -> LivePose:
-        """Pose in the next pair; images (height, width) uint8 or uint16.
+        """Pose in the next pair; images (height, width) of one real type.
 
-        Raises TrackingError if the images do not have the size that the rig was calibrated at.
+        Raises ArgumentError if they are no images, TrackingError if the rig was calibrated at another size.
         """
         self.frame += 1
         images = self._as_block(left, right)
@@ -106,6 +109,12 @@ class Tracker:
         return done
 
     def _as_block(self, left: Image, right: Image) -> NDArray:
+        left, right = grey_values(left, "left"), grey_values(right, "right")
+        if left.dtype != right.dtype or left.shape != right.shape or left.ndim != 2:
+            raise ArgumentError(
+                f"left is an image of shape {left.shape} {left.dtype}, right of {right.shape} {right.dtype}; expected "
+                "(height, width), both of one type"
+            )
         if self._pair.shape[2:] != left.shape or self._pair.dtype != left.dtype:
             self._pair = np.empty((1, 2, *left.shape), left.dtype)
             check_images(self._pair, self.rig)
