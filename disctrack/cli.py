@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The command line: a shell round the stages, and the one place where an error becomes a line and an exit code.
 
 A new subcommand is a line in COMMANDS, its arguments in `disctrack.commands.options`, and a module of its name in
@@ -13,7 +14,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from warnings import catch_warnings, simplefilter
 
@@ -30,15 +31,17 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 # In the order of the measurement: name -> (its arguments, what it does).
 COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str]] = {
+    "sample": (options.add_sample, "a small recording with known truth, to try the other commands on"),
     "init": (options.add_init, "folder of frames -> a commented recording.toml"),
     "print": (options.add_print, "declared dots and board -> PDF to print, true to scale"),
-    "check": (options.add_check, "what would a run trip over? seconds"),
+    "check": (options.add_check, "problems that a run would meet, within seconds"),
     "run": (options.add_run, "calibrate and track a recording: folder in, trajectory and pictures out"),
     "calibrate": (options.add_calibrate, "views of a chessboard -> stereo rig with covariance"),
     "track": (options.add_track, "recording and rig -> trajectory with covariance"),
     "analyse": (options.add_analyse, "trajectory -> velocities, contact, energy, scaling laws and a report"),
     "diagnose": (options.add_diagnose, "trajectory -> which effect the model lacks, before and after"),
     "batch": (options.add_batch, "many recordings side by side: a report of each, and one summary"),
+    "open": (options.add_open, "the page of results that was written last, in a browser"),
     "simulate": (options.add_simulate, "rolling model: scene -> motion, energies, contact forces"),
     "render": (options.add_render, "scene -> recording as the cameras would write it, and its truth"),
     "convert": (options.add_convert, "trajectory or rig from and to the formats of other programs"),
@@ -60,8 +63,10 @@ def _answer(words: Sequence[str], received: Sequence[int]) -> int:
     try:
         _print_what_the_terminal_knows()
         _keep_compiled_loops_somewhere()
-        parser = _parser()
-        arguments = parser.parse_args(words)
+        parser, commands = _parser()
+        arguments, unknown = parser.parse_known_args(words)
+        if unknown:
+            commands.get(arguments.command, parser).error(f"unrecognized arguments: {' '.join(unknown)}")
         if arguments.command is None:
             parser.print_help()
             return USAGE
@@ -165,8 +170,8 @@ def _say(message: str, code: int) -> int:
     return code
 
 
-def _parser() -> argparse.ArgumentParser:
-    """Parser of all subcommands."""
+def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """Parser of all, and that of each subcommand; a shell completes their words where argcomplete is installed."""
     parser = argparse.ArgumentParser(
         prog="disctrack",
         description="Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.",
@@ -175,9 +180,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"disctrack {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands = {}
     for name, (add_arguments, summary) in COMMANDS.items():
-        add_arguments(subparsers.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + "."))
-    return parser
+        description = f"{summary[0].upper()}{summary[1:]}."
+        commands[name] = subparsers.add_parser(name, help=summary, description=description)
+        add_arguments(commands[name])
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks
+        with suppress(ImportError):
+            importlib.import_module("argcomplete").autocomplete(parser)
+    return parser, commands
 
 
 if __name__ == "__main__":

@@ -35,6 +35,17 @@ def add_init(parser: argparse.ArgumentParser) -> None:
         )
 
 
+def add_sample(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack sample`."""
+    parser.add_argument("folder", type=Path, help="new folder for the recording")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+
+
+def add_open(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `disctrack open`."""
+    parser.add_argument("recording", type=Path, help="folder of a recording, of its results, or of a batch")
+
+
 def add_print(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack print`."""
     parser.add_argument(

@@ -22,23 +22,28 @@ def run(arguments: argparse.Namespace) -> int:
         raise SceneError("no scene given: name a TOML file, or ask for one with --defaults")
 
     folder = arguments.output or arguments.scene.parent / arguments.scene.stem
-    with tqdm(unit="image", file=sys.stderr, disable=arguments.quiet or None) as bar:
+    rendered(arguments.scene, folder, arguments.truth, arguments.quiet)
+    return DONE
+
+
+def rendered(file: Path, folder: Path, truth_file: Path | None, quiet: bool) -> None:
+    """Render the scene file into the folder, with a bar, and say what was written."""
+    with tqdm(unit="image", file=sys.stderr, disable=quiet or None) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        truth = run_render(arguments.scene, folder, arguments.truth, progress)
+        truth = run_render(file, folder, truth_file, progress)
     written = [f"{name} {len(files)}" for name, files in _files(folder).items()]
     print(
         f"{folder}: {len(truth.time)} frames at {truth.frame_rate:g} Hz ({', '.join(written)} images), "
         f"{len(truth.R_world_board)} views of the chessboard"
     )
-    scene = load_scene(arguments.scene)
+    scene = load_scene(file)
     if scene.motion.kind == "rolling":
         print(f"effects: {effects_in_words(scene)}")
-    print(f"truth, for comparison only: {arguments.truth or folder / 'truth.h5'}")
-    return DONE
+    print(f"truth, for comparison only: {truth_file or folder / 'truth.h5'}")
 
 
 def _files(folder: Path) -> dict[str, list[Path]]:

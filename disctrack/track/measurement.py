@@ -106,6 +106,9 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
         *of_kind(Kind.READING, Severity.NOTE, (*left.notes, *right.notes)),
     )
     start, stop, _ = slice(*frames).indices(len(left))
+    if frames[1] is not None and frames[1] > len(left):
+        cut = f"--frames {frames[0] or 0}:{frames[1]} is cut: the recording has the frames 0 to {len(left) - 1}"
+        findings += (Finding(Kind.READING, Severity.NOTE, cut),)
     if stop <= start:
         raise RecordingError(
             f"{recording.folder}: --frames {frames[0]}:{frames[1]} holds no frame; the recording has {len(left)}."

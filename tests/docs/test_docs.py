@@ -129,7 +129,7 @@ def test_every_command_exists_with_its_options(page, monkeypatch):
         if command[1] == "COMMAND":
             continue
         assert command[1] in COMMANDS, command
-        parser = disctrack.cli._parser()
+        parser = disctrack.cli._parser()[0]
         sub = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[command[1]]
         known = {option for action in sub._actions for option in action.option_strings}
         for word in command[2:]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from disctrack import open_pairs
 from disctrack.cli import COMMANDS, main
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_details, read_trajectory
@@ -194,3 +195,39 @@ def test_help_is_there_for_every_command_and_comes_at_once():
     for name in COMMANDS:
         assert f"usage: disctrack {name} " in done.stdout
     assert done.stdout.rstrip().endswith("loaded []")
+
+
+@pytest.mark.statistical
+def test_the_sample_is_the_recording_of_the_repository(sample_clip, tmp_path):
+    assert main(["sample", str(tmp_path / "clip"), "--quiet"]) == 0
+    same = [file.relative_to(sample_clip) for file in sample_clip.rglob("*.png") if "results" not in file.parts]
+    assert len(same) == 636
+    drawn, stored = (cv2.imread(str(folder / same[0]), -1).astype(int) for folder in (tmp_path / "clip", sample_clip))
+    assert np.abs(drawn - stored).max() <= 1  # processors round differently
+    assert (tmp_path / "clip/recording.toml").read_text() == (sample_clip / "recording.toml").read_text()
+
+
+def test_open_shows_the_page_written_last(tmp_path, monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert main(["open", str(tmp_path)]) == 1
+    assert "no page of results" in capsys.readouterr().err
+    for age, name in ((20, "trajectory_diagnosis/diagnosis.html"), (10, "trajectory_analysis/report.html")):
+        page = tmp_path / "results" / name
+        page.parent.mkdir(parents=True)
+        page.touch()
+        os.utime(page, (1e9 - age, 1e9 - age))
+    assert main(["open", str(tmp_path)]) == 0
+    assert opened == [page.as_uri()]
+
+
+def test_an_unknown_option_is_told_with_the_usage_of_its_command(capsys):
+    with pytest.raises(SystemExit):
+        main(["analyse", "x", "--frobnicate"])
+    assert "usage: disctrack analyse" in capsys.readouterr().err
+
+
+def test_a_range_that_is_cut_says_so(recording):
+    (cut,) = open_pairs(recording, (5, 99)).findings
+    assert cut.text == "--frames 5:99 is cut: the recording has the frames 0 to 23"
+    assert not open_pairs(recording, (5, 24)).findings
