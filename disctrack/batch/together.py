@@ -21,7 +21,7 @@ def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> tuple[lis
     if len(trajectories) < 2:
         return [], f"together: {len(trajectories)} of the recordings measured; it takes two or more"
     try:
-        outcome = run_together(trajectories, folder / FOLDER, overwrite=True, reuse=True, processes=processes)
+        report = run_together(trajectories, folder / FOLDER, overwrite=True, reuse=True, processes=processes)
     except Exception as error:  # the single results are worth more than their combination
         return [], f"the recordings could not be diagnosed together: {reason_of(error)}"
-    return short(outcome.summary), ""
+    return short(report), ""

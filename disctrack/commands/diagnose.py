@@ -68,7 +68,7 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
     with compiling("the simulation of motions", 30):
         assembly.prepare()
     with steps(f"diagnose {len(paths)} recordings together") as step:
-        outcome = run_together(
+        report = run_together(
             paths,
             arguments.output,
             model=arguments.model,
@@ -78,7 +78,7 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
             processes=arguments.jobs or default_threads(),
             progress=step,
         )
-    code = outputs.tell(outcome.summary, arguments, outcome.files[0].parent)
-    if outcome.unusable:
-        print(f"disctrack: {len(outcome.unusable)} recording(s) could not be used (see above).", file=sys.stderr)
-    return INCOMPLETE if outcome.unusable else code
+    code = outputs.tell(report, arguments, report.files[0].parent)
+    if unusable := report.data["unusable"]:
+        print(f"disctrack: {len(unusable)} recording(s) could not be used (see above).", file=sys.stderr)
+    return INCOMPLETE if unusable else code

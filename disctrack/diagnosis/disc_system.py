@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence, Set
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,7 @@ from disctrack.diagnosis.motion import (
     state_of,
     state_quantities,
 )
-from disctrack.diagnosis.motion_start import STRETCHES, start_values
-from disctrack.diagnosis.sought import sought
+from disctrack.diagnosis.starts import STRETCHES, sought, start_values
 from disctrack.diagnosis.stretch import Stretch, free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
 from disctrack.discrepancy.fit import Fit
@@ -67,7 +67,7 @@ class StaticView:
     """Dots of k frames about their measured poses, and what would move them: no model of the motion."""
 
     residual: Array  # (k, 4 m) whitened
-    by_pose: Array  # (k, 4 m, 6) whitened
+    across: Array  # (k, 4 m, 4 m) takes off what a pose can take
     rig: Array  # (k, 4 m, r) by directions of the calibration's covariance, in their sigmas, whitened
     dots: Array  # (k, 4 m, 2 m) by the dots' places on the face [m], whitened
     faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by faults of the measurement, in their typical sizes
@@ -75,6 +75,15 @@ class StaticView:
     places: Array  # (k, 2, m, 2) [px]
     used: Mask  # (k, 2, m)
     whiten: Array  # (k, 2, m, 2, 2)
+
+    def across_poses(self, columns: Array) -> Array:
+        """(4 k m, c) of columns, given whitened, what no pose takes."""
+        free = self.across @ columns.reshape(*self.residual.shape, -1)
+        return np.asarray(free.reshape(self.residual.size, -1), float)
+
+    def whitened(self, shifts: Array) -> Array:
+        """The same of shifts of the dots (k, 2, m, 2, c) [px]."""
+        return self.across_poses(np.einsum("ncmab,ncmbk->ncmak", self.whiten, shifts))
 
 
 class DiscSystem(LawSystem):
@@ -116,11 +125,10 @@ class DiscSystem(LawSystem):
         self.rows = rows
         self.time = np.asarray(trajectory.time[rows], float)
         self.start_time = float(self.time[0])
-        seen = (trajectory.marker_status[rows] == MarkerStatus.MEASURED) & np.isfinite(trajectory.markers_px[rows]).all(
-            -1
-        )
-        self.used = seen & np.isfinite(trajectory.markers_covariance_px2[rows]).all((-1, -2))
-        self._observed = np.where(self.used[..., None], trajectory.markers_px[rows], 0.0)
+        self.used = trajectory.marker_status[rows] == MarkerStatus.MEASURED
+        self.used &= np.isfinite(trajectory.markers_px[rows]).all(-1)
+        self.used &= np.isfinite(trajectory.markers_covariance_px2[rows]).all((-1, -2))
+        self.observed = np.where(self.used[..., None], trajectory.markers_px[rows], 0.0)  # (n, 2, m, 2) [px]
         safe = np.where(self.used[..., None, None], trajectory.markers_covariance_px2[rows], np.eye(2))
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
@@ -242,9 +250,10 @@ class DiscSystem(LawSystem):
         nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
         n_rig = sum(name.startswith("rig.") for name in self._nuisance_column)
         whitened = (self._whiten[rows] @ by_pose[rows]).reshape(len(rows), -1, 6)
-        residual = self._rows_of(self._observed - pixels)
+        across = np.eye(whitened.shape[1]) - whitened @ np.linalg.pinv(whitened)
+        residual = self._rows_of(self.observed - pixels)
         return StaticView(
-            residual[rows], whitened, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
+            residual[rows], across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
             sizes, pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 
@@ -252,43 +261,33 @@ class DiscSystem(LawSystem):
         """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
         return start_values(self, self.known)
 
-    def again(
-        self,
-        candidates: tuple[Candidate, ...] | None = None,
-        *,
-        stretch: Stretch | None = None,
-        starts_in_slip: bool = False,
-        systematic: Systematic | None = None,
-        freed: tuple[Candidate, ...] = (),
-        known: Values | None = None,
-    ) -> DiscSystem:
-        """Another question to the same recording and model, with the same budget, and errors if none are given."""
-        system = DiscSystem(
-            self.trajectory,
-            self.model,
-            candidates,
-            stretch=stretch or self.stretch,
-            starts_in_slip=starts_in_slip,
-            systematic=systematic or self.systematic,
-            freed=freed,
-            known=self.known if known is None else known,
-        )
+    def again(self, candidates: tuple[Candidate, ...] | None = None, **other: Any) -> DiscSystem:
+        """Another question to the same recording and model, with the same budget; what is not given is as here.
+
+        But for the candidates, and what was taken for slip or freed: all of the catalogue, rolling, and none.
+        """
+        same = {"stretch": self.stretch, "systematic": self.systematic, "known": self.known}
+        system = DiscSystem(self.trajectory, self.model, candidates, **{**same, **other})
         system.budget = self.budget
         return system
 
-    def first_part(self, duration: float) -> DiscSystem:
-        """The same system with the frames of the first `duration` [s] only."""
-        part = copy(self)
-        n = int(np.searchsorted(self.time, self.time[0] + duration, side="right"))
-        part.rows = slice(self.rows.start, self.rows.start + n)
-        for name in ("time", "used", "_observed", "_whiten", "weights", "_nuisance_columns"):
-            setattr(part, name, getattr(self, name)[:n])
-        return part
-
     def beginnings(self) -> tuple[DiscSystem, ...]:
         """Parts over which a motion is followed that a fit of the whole would not find."""
-        span = float(self.time[-1] - self.time[0])
-        return tuple(self.first_part(stretch) for stretch in STRETCHES if stretch < span)
+        found = []
+        for stretch in STRETCHES:
+            n = int(np.searchsorted(self.time, self.time[0] + stretch, side="right"))
+            if n < len(self.time):
+                part = copy(self)
+                part.rows = slice(self.rows.start, self.rows.start + n)
+                for name in ("time", "used", "observed", "_whiten", "weights", "_nuisance_columns"):
+                    setattr(part, name, getattr(self, name)[:n])
+                found.append(part)
+        return tuple(found)
+
+    @property
+    def rate(self) -> float:
+        """Of the frames [Hz]."""
+        return float(1.0 / np.median(np.diff(self.time)))
 
     def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
         """See LawSystem; None where the disc slips."""
@@ -346,11 +345,6 @@ class DiscSystem(LawSystem):
                     derivative[..., column[name]] = self._rows_of(fault.column(part, sight))
         return residual, derivative
 
-    @property
-    def observed(self) -> Array:
-        """(n, 2, m, 2) measured dots [px]; 0 where not `used`."""
-        return self._observed
-
     def pixels(self, values: Values, with_nuisances: bool = False) -> Array:
         """Predicted images of the dots (n, 2, m, 2) [px], with the biases that nuisances stand for if wanted."""
         pixels = self._sight(self._path(values, ()), values).images.pixels
@@ -401,7 +395,7 @@ class DiscSystem(LawSystem):
 
     def _residual(self, pixels: Array, values: Values) -> Array:
         """Whitened rows of observed minus predicted dots, the nuisances' part taken off."""
-        residual = self._rows_of(self._observed - pixels)
+        residual = self._rows_of(self.observed - pixels)
         weights = self._nuisance_values(values)
         return residual - self._nuisance_columns @ weights if weights.any() else residual
 

@@ -1,35 +1,31 @@
-"""How far a fitted model is from the measurement, in the units of an experimenter."""
+"""How far a fitted model is from the measurement, what it leaves, and where in the recording it holds."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
-from disctrack.discrepancy.fit import Fit
+from disctrack.diagnosis.stretch import MIN_FRAMES
+from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.discrepancy.significance import Whiteness, whiteness
-from disctrack.discrepancy.system import Values
-from disctrack.frames import euler_jacobian, nodal_axes_world
+from disctrack.discrepancy.significance import Whiteness, ljung_box, no_memory, whiteness
+from disctrack.discrepancy.system import Subset, System, Values
+from disctrack.frames import euler_jacobian
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_power, kinematics
 
-HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last frame that the fit has seen
 HALF_WINDOW = 0.01  # [s] over which the error at a horizon is averaged: some frames, a fraction of a turn
+LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
+DOUBTFUL = 0.05  # probability of what is left of the poses, below which laws outside the catalogue compete
+MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks
+LIKE = 2.0  # times the excess of the numbers that no pose takes, up to which that of the poses is no motion's
 
-
-@dataclass(frozen=True)
-class Ahead:
-    """Error of a free run at one instant ahead, and what the noise of the measurement alone would give."""
-
-    horizon_s: float
-    theta_deg: float
-    psi_deg: float
-    position_mm: float
-    noise_theta_deg: float
-    noise_psi_deg: float
-    noise_position_mm: float
+Ahead = dict[str, float]  # errors of a free run some time ahead, and what the noise of the measurement alone would give
 
 
 @dataclass(frozen=True)
@@ -41,79 +37,61 @@ class Errors:
     rms_px: float  # per image coordinate
     rms_position_um: float  # rms of measured minus fitted position, per axis
     rms_theta_mdeg: float  # rms of measured minus fitted nutation angle
-    ahead: tuple[Ahead, ...]
     ratio_to_floor: float  # free run: rms of the residual over what noise and the fit's own uncertainty allow
     whiteness: Whiteness
 
 
-def errors(system: DiscSystem, fit_: Fit, held: HeldOut) -> Errors:
+def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
     """All errors of a fit, and of the free run after the shorter fit."""
     pixels = system.observed - system.pixels(fit_.values, with_nuisances=True)
-    rms = float(np.sqrt(np.mean(pixels[system.used] ** 2)))
     pose = system.pose_residual(fit_.values)
     present = system.weights >= 6
-    delta, _ = system.pose_difference(fit_.values)
-    tilt = np.sum(nodal_axes_world(*system.poses(fit_.values)[:, 3:5].T)[0] * delta[:, 3:], axis=1)
+    error = coordinate_errors(system, fit_.values)[0][present]
     # of the fitted quantities, those without a prior take their share of the pose's numbers
     freedom = 6 * present.sum() - sum(not np.isfinite(q.prior_sigma) for q in fit_.quantities)
     return Errors(
         reduced_chi_square=fit_.reduced_chi_square,
         reduced_chi_square_pose=float(np.sum(pose[present] ** 2) / max(freedom, 1)),
-        rms_px=rms,
-        rms_position_um=float(1e6 * np.sqrt(np.mean(delta[present, :3] ** 2))),
-        rms_theta_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(tilt[present] ** 2)))),
-        ahead=free_run(system, held),
-        ratio_to_floor=held.ratio_to_floor,
-        whiteness=whiteness(pose[present], _rate(system), frequencies(system, fit_.values)),
+        rms_px=float(np.sqrt(np.mean(pixels[system.used] ** 2))),
+        rms_position_um=float(1e6 * np.sqrt(np.mean(error[:, :3] ** 2))),
+        rms_theta_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(error[:, 4] ** 2)))),
+        ratio_to_floor=held.ratio_to_floor if held else np.nan,
+        whiteness=whiteness(pose[present], system.rate, frequencies(system, fit_.values)),
     )
 
 
-def _rate(system: DiscSystem) -> float:
-    return float(1.0 / np.median(np.diff(system.time)))
+def coordinate_errors(system: DiscSystem, values: Values) -> tuple[Array, Array]:
+    """Measured minus fitted coordinates and their standard deviations, both (n, 6); NaN without dots."""
+    delta, sigma = system.pose_difference(values)
+    to_angles = euler_jacobian(*system.poses(values)[:, 3:5].T)
+    delta[:, 3:] = (to_angles @ delta[:, 3:, None])[..., 0]
+    sigma[:, 3:] = np.sqrt((to_angles**2 @ sigma[:, 3:, None] ** 2)[..., 0])
+    return delta, sigma
 
 
 def frequencies(system: DiscSystem, values: Values) -> dict[str, float]:
     """Frequencies [Hz] at which effects show: mean precession, nutation, spin of the body about the vertical."""
     q = system.poses(values)
-    span = system.time[-1] - system.time[0]
-    precession = abs(q[-1, 3] - q[0, 3]) / span / (2 * np.pi)
-    spin = abs(q[-1, 5] - q[0, 5]) / span / (2 * np.pi)
-    turn = abs(q[-1, 3] + q[-1, 5] - q[0, 3] - q[0, 5]) / span / (2 * np.pi)
-    # between the thin disc's 0.775 and 0.84 at 40 degrees (corrected equations of Ma et al. 2014)
-    found = {"precession": precession, "spin": spin, "turn of the face": turn, "nutation": 0.79 * precession}
-    return found | {"twice the precession": 2 * precession, "half the frame rate": 0.5 * _rate(system)}
+    psi, phi = (q[-1, [3, 5]] - q[0, [3, 5]]) / (2 * np.pi * (system.time[-1] - system.time[0]))
+    # of nutation: between the thin disc's 0.775 and 0.84 at 40 degrees (corrected equations of Ma et al. 2014)
+    turning = {"precession": psi, "spin": phi, "turn of the face": psi + phi, "nutation": 0.79 * psi}
+    turning |= {"twice the precession": 2 * psi, "half the frame rate": 0.5 * system.rate}
+    return {name: abs(float(f)) for name, f in turning.items()}
 
 
-def free_run(system: DiscSystem, held: HeldOut, horizons: tuple[float, ...] = HORIZONS) -> tuple[Ahead, ...]:
-    """Errors of the free run at the horizons that the recording reaches."""
-    values = held.train.values
-    delta, sigma = system.pose_difference(values)
-    q = system.poses(values)
+def free_run(system: DiscSystem, held: HeldOut, horizon: float) -> Ahead | None:
+    """Errors of the free run at a horizon [s] after the last frame that was fitted; None beyond the recording."""
     last = system.time[~held.test_rows & (system.weights > 0)].max()
-    e1 = nodal_axes_world(q[:, 3], q[:, 4])[0]
-    to_psi = euler_jacobian(q[:, 3], q[:, 4])[:, 0]
-    theta, psi = np.sum(e1 * delta[:, 3:], axis=1), np.sum(to_psi * delta[:, 3:], axis=1)
-    theta_noise = np.sqrt(np.sum((e1 * sigma[:, 3:]) ** 2, axis=1))
-    psi_noise = np.sqrt(np.sum((to_psi * sigma[:, 3:]) ** 2, axis=1))
-    found = []
-    for horizon in horizons:
-        near = np.abs(system.time - last - horizon) <= HALF_WINDOW
-        near &= held.test_rows & (system.weights >= 6)
-        if not near.any() or system.time[-1] < last + horizon:
-            continue
-        rms = lambda x, near=near: float(np.sqrt(np.mean(np.sum(np.atleast_2d(x.T).T[near] ** 2, axis=1))))  # noqa: E731
-        found.append(
-            Ahead(
-                horizon,
-                float(np.degrees(rms(theta))),
-                float(np.degrees(rms(psi))),
-                1e3 * rms(delta[:, :3]),
-                float(np.degrees(rms(theta_noise))),
-                float(np.degrees(rms(psi_noise))),
-                1e3 * rms(sigma[:, :3]),
-            )
-        )
-    return tuple(found)
+    near = np.abs(system.time - last - horizon) <= HALF_WINDOW
+    near &= held.test_rows & (system.weights >= 6)
+    if not near.any() or system.time[-1] < last + horizon:
+        return None
+    found = {"horizon_s": horizon}
+    for kind, error in zip(("", "noise_"), coordinate_errors(system, held.train.values), strict=True):
+        rms = np.sqrt(np.mean(error[near] ** 2, axis=0))
+        found[f"{kind}theta_deg"], found[f"{kind}psi_deg"] = np.degrees(rms[[4, 3]]).tolist()
+        found[f"{kind}position_mm"] = 1e3 * float(np.linalg.norm(rms[:3]))
+    return found
 
 
 def simulated(system: DiscSystem, values: Values) -> Motion:
@@ -134,3 +112,110 @@ def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
         power = np.sum(motion.contact_force[:, :2] * motion.slip_velocity, axis=1)
         balance["by slip"] = float(-trapezoid(power, motion.time))
     return balance
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """Is what a fit leaves noise, and if not, is it of the motion or of the measurement?
+
+    A frame's dots are more numbers than a pose. What is missing in the motion shows in the six that a pose takes and in
+    no other; what is wrong with lenses, dots or light shows in all. Probabilities allow for the number of tests.
+    """
+
+    pose_chi_square: float  # per number of the poses, over the noise
+    other_chi_square: float  # per number that no pose takes, over the noise
+    pose_p_value: float  # of so much memory in the poses' part, if it were noise: Ljung-Box, and lines
+    other_p_value: float  # likewise, of the rest: Ljung-Box
+    n_tests: int
+
+    @property
+    def white(self) -> bool:
+        """Is nothing to be seen but noise?"""
+        return min(self.pose_p_value, self.other_p_value) >= LEVEL
+
+    @property
+    def of_the_motion(self) -> bool:
+        """Do the poses hold more than noise, and more than what the measurement is seen to do to all numbers?"""
+        return self.pose_p_value < LEVEL and not self.as_in_all
+
+    @property
+    def doubtful(self) -> bool:
+        """May an effect of the motion be missing, although chi-square is that of noise?
+
+        The poses' part is less like noise than that of one recording in twenty, and the numbers that no pose takes do
+        not show as much of it: what those show is the measurement's, and is in the poses as well.
+        """
+        return self.pose_p_value < DOUBTFUL and not (self.other_p_value < DOUBTFUL and self.as_in_all)
+
+    @property
+    def as_in_all(self) -> bool:
+        """Do the numbers that no pose takes exceed the noise as the poses do?"""
+        return self.pose_chi_square - 1.0 <= LIKE * max(self.other_chi_square - 1.0, 0.0)
+
+    @property
+    def of_the_measurement(self) -> bool:
+        """Is there more than noise, but as much in the numbers that no pose takes, and not much in all?"""
+        excess = self.other_chi_square - 1.0
+        return 0.05 < excess < MUCH and self.as_in_all
+
+
+def left_over(system: DiscSystem, fit_: Fit, noise: float) -> LeftOver | None:
+    """Tests of what the fit leaves; None where too few rows are complete. noise : variance over that stated."""
+    most = np.max(system.weights)
+    full = system.weights >= most
+    n = int(full.sum())
+    if n < MIN_FRAMES or most < 8:
+        return None
+    pose, other = (part[full] for part in system.parts_of_residual(fit_.values))
+    tested = whiteness(pose, system.rate, {})
+    lags, channels = min(20, max(1, n // 4)), other.shape[1]
+    moved = sum(not np.isfinite(q.prior_sigma) for q in fit_.quantities)
+    return LeftOver(
+        float(np.sum(pose**2) / max(6 * n - moved, 1) / noise),
+        float(np.sum(other**2) / max((most - 6) * n, 1) / noise),
+        min(1.0, 2 * tested.p_value, 2 * 6 * float(tested.peak_p_value.min())),
+        min(1.0, channels * no_memory(float(ljung_box(other, lags).max()), n, lags)),
+        12 + channels,
+    )
+
+
+Span = Mapping[str, float]  # frames that the model describes, and the nutation at the end that lies in the recording
+
+
+def regimes(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict[str, Span | None]:
+    """The longest beginning and the longest end that the base model describes to noise; None where it is too short.
+
+    judged : the system with its noise as found
+    """
+    frames = np.flatnonzero(system.weights > 0)
+    theta = np.degrees(system.trajectory.q[system.rows, 4])
+
+    def holds(rows: NDArray[np.intp]) -> bool:
+        trial = fit(Subset(judged, np.isin(np.arange(len(system.time)), rows)), base.quantities, base.values, 10)
+        limit = noise * (1.0 + 4.0 * np.sqrt(2.0 / max(trial.degrees_of_freedom, 1)))  # four sigmas of chi-square
+        return bool(trial.converged and trial.reduced_chi_square <= limit)
+
+    def longest(part: Callable[[int], NDArray[np.intp]], at: int) -> Span | None:
+        low, high = max(len(frames) // 5, MIN_FRAMES), len(frames)
+        if low >= high or not holds(part(low)):
+            return None
+        while high - low > max(len(frames) // 64, 1):
+            middle = (low + high) // 2
+            low, high = (middle, high) if holds(part(middle)) else (low, middle)
+        rows = part(low)
+        start, stop = system.time[rows[[0, -1]]].tolist()
+        return {"start": start, "stop": stop, "theta_deg": float(theta[rows[at]]), "frames": low}
+
+    return {"first": longest(lambda k: frames[:k], -1), "last": longest(lambda k: frames[-k:], 0)}
+
+
+def where_it_holds(parts: Mapping[str, Span | None]) -> str:
+    """The longest parts in words."""
+    said = []
+    if first := parts["first"]:
+        said.append(f"holds until {first['stop']:.3f} s (nutation {first['theta_deg']:.2f} deg) and fails after")
+    if last := parts["last"]:
+        said.append(f"holds from {last['start']:.3f} s on (nutation {last['theta_deg']:.2f} deg)")
+    if not said:
+        return "The model fails throughout the recording: what is missing acts all the time."
+    return f"The model {'; and, fitted anew, it '.join(said)}."

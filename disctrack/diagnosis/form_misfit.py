@@ -12,7 +12,7 @@ other kinds are that describe the data too. What a law's numbers could take up t
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.missing_force import WIDTH, Probed, probe
+from disctrack.diagnosis.missing_force import WIDTH, Course, Probed, probe
 from disctrack.diagnosis.motion import THETA_END, state_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import LearnedLaw, evidence
@@ -38,25 +38,6 @@ SWEEPS = 4  # over the parts, the size of each judged beside the others
 STEP = 1e-4  # of a number, for the derivative of the course
 WITHIN = 8  # instants of a probe, at which laws are looked at
 UNSEEN = 1e-10  # share of a column's length below which the data do not show it
-
-
-@dataclass(frozen=True)
-class LawCourse:
-    """Moment about the contact of all laws of the fitted model, forces at the centre included; along n0, m0, k."""
-
-    time: Array  # (k,) [s]
-    moment: Array  # (k, 3) [N m]
-    sigma: Array  # (k, 3) with what the law's form may be off by
-    misfit: float  # rms of that over the law's own, as the residual has it
-
-
-@dataclass(frozen=True)
-class WithForm:
-    """A fit with a law, with sigmas that know what the law's form may be off by."""
-
-    fit: Fit  # as probable as it is that the form is another's
-    of_another: Fit  # if it is: for whatever is to hold of any law
-    course: LawCourse | None  # None where the disc slips
 
 
 def moment_about_contact(
@@ -93,8 +74,11 @@ def with_form(
     noise: float,
     remembers: bool = False,
     beside: Collection[str] = (),
-) -> WithForm:
-    """Sigmas that know of the form's misfit, and the law's course; the fit as it is where the disc slips.
+) -> tuple[Fit, Fit, Course | None, float]:
+    """The fit with sigmas as probable as it is that the form is another's, and with those if it is; the laws' course.
+
+    The course is the moment about the contact of all laws of the fitted model, forces at the centre included, with what
+    the law's form may be off by; with it comes the rms of that over the law's own. Where the disc slips there is none.
 
     system : knows the law.   noise : variance of the residual's noise over that stated
     remembers : what the fit leaves is not noise
@@ -102,7 +86,7 @@ def with_form(
     """
     blocks = probe(system, fitted)
     if blocks is None:
-        return WithForm(fitted, fitted, None)
+        return fitted, fitted, None, 0.0
     n, k = blocks.n_fitted, len(blocks.time)
     R = np.vstack([blocks.data / np.sqrt(noise), blocks.prior])
     course, own, by_number = _courses(system, fitted, {law.candidate.effect, *beside}, blocks.time)
@@ -127,8 +111,8 @@ def with_form(
         misfit += probability * size**2
     variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_rivals(system, fitted, law, course, blocks.time)
     variance += wrong * _within_probes(system, fitted, blocks, course)
-    found = LawCourse(blocks.time, course, np.sqrt(variance), float(np.sqrt(misfit)))
-    return WithForm(replace(fitted, covariance=mixed), replace(fitted, covariance=another), found)
+    found = Course(blocks.time, course, np.sqrt(variance))
+    return replace(fitted, covariance=mixed), replace(fitted, covariance=another), found, float(np.sqrt(misfit))
 
 
 def form_is_another(law: LearnedLaw, beside: Collection[str] = ()) -> float:

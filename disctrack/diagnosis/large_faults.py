@@ -5,18 +5,19 @@ known of the motion: poses and fault are found in turn, from the dots alone. Whi
 on its table decides. A clock that is wrong by a good part shows in the precession, which gravity sets.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import candidate_of_fault
-from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.stretch import Stretch
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
+from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.search import Diagnosis, Found, beside
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, beside, explain
 from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.catalogue import faults_of, setup_of
@@ -44,7 +45,7 @@ class Assumed:
     system: DiscSystem
     base: Fit
     candidates: tuple[Candidate, ...]
-    gain: float  # of twice the log likelihood of the dots about free poses
+    gain: float  # of twice the log likelihood of the dots about free poses; infinite where the motion told
 
     @property
     def price(self) -> float:
@@ -53,30 +54,22 @@ class Assumed:
         return self.base.cost + free * float(np.log(max(self.base.n_data, 2)))
 
 
-def in_step(trajectory: Trajectory, delay: float) -> Array:
-    """Dots (n, 2, m, 2) with those of the right camera at the left one's instants, by a cubic in time."""
-    pixels = trajectory.markers_px.copy()
-    if not delay:
-        return pixels
-    for dot in range(pixels.shape[2]):
-        seen = np.asarray(np.isfinite(pixels[:, 1, dot]).all(axis=1))
-        if seen.sum() < 8:
-            pixels[:, 1, dot] = np.nan
-            continue
-        time = trajectory.time[seen]
-        moved = CubicSpline(time, pixels[seen, 1, dot])(trajectory.time - delay, extrapolate=False)
-        pixels[:, 1, dot] = np.where(seen[:, None], moved, np.nan)
-    return pixels
-
-
 def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
     """The trajectory with poses, and what they leave of the dots, as they are if these faults are true.
 
     Dots and rig stay as measured and as calibrated.
     """
     setup = setup_of(trajectory.disc, values)
+    pixels = trajectory.markers_px.copy()
+    for dot in range(pixels.shape[2]) if setup.delay else ():  # those of the right camera at the left one's instants
+        seen = np.asarray(np.isfinite(pixels[:, 1, dot]).all(axis=1))
+        moved = np.full_like(pixels[:, 1, dot], np.nan)
+        if seen.sum() >= 8:
+            course = CubicSpline(trajectory.time[seen], pixels[seen, 1, dot])
+            moved[seen] = course(trajectory.time[seen] - setup.delay, extrapolate=False)
+        pixels[:, 1, dot] = moved
     fits = fit_poses(
-        in_step(trajectory, setup.delay),
+        pixels,
         trajectory.markers_covariance_px2,
         setup.cameras_of(trajectory.rig),
         setup.centres(trajectory.disc),
@@ -86,8 +79,7 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
         with_sensitivity=False,
     )
     angles = np.full((len(trajectory), 3), np.nan)
-    good = fits.converged
-    angles[good] = unwrap_euler(euler_from_rotation(fits.R_world_body[good]))
+    angles[fits.converged] = unwrap_euler(euler_from_rotation(fits.R_world_body[fits.converged]))
     return replace(
         trajectory,
         q=np.column_stack([fits.t_world_body, angles]),
@@ -106,10 +98,10 @@ def find_large(trajectory: Trajectory, model: Model, first: Systematic, known: V
         return None
     best: Assumed | None = None
     for hypotheses in (SINGLE, DOUBLE):
-        seen = {names: _found_statically(trajectory, model, names, known) for names in hypotheses}
-        least = min(s.left for s in seen.values())
-        for names, static in seen.items():
-            found = _assumed(trajectory, model, names, static) if static.left < WORSE * least else None
+        seen = [_found_statically(trajectory, model, names, known) for names in hypotheses]
+        least = min(left for left, *_ in seen)
+        for names, (left, values, gain) in zip(hypotheses, seen, strict=True):
+            found = _assumed(trajectory, model, names, values, gain) if left < WORSE * least else None
             if found is not None and (best is None or found.price < best.price):
                 best = found
         if best is not None and best.base.reduced_chi_square < ENOUGH:
@@ -117,83 +109,68 @@ def find_large(trajectory: Trajectory, model: Model, first: Systematic, known: V
     return best
 
 
-@dataclass(frozen=True)
-class _Static:
-    values: dict[str, float]  # of the faults
-    left: float  # median reduced chi-square of the poses that they leave
-    gain: float
+def _candidates(disc: Disc, names: Sequence[str]) -> tuple[Candidate, ...]:
+    return tuple(candidate_of_fault(fault) for fault in faults_of(disc) if fault.name in names)
 
 
-def _found_statically(trajectory: Trajectory, model: Model, names: tuple[str, ...], known: Values) -> _Static:
-    """Amounts of these faults from the dots about free poses, which are found with them in turn."""
-    candidates = [candidate_of_fault(f) for f in faults_of(trajectory.disc) if f.name in names]
+def _found_statically(
+    trajectory: Trajectory, model: Model, names: Sequence[str], known: Values
+) -> tuple[float, dict[str, float], float]:
+    """Amounts of these faults from the dots about free poses, which are found with them in turn.
+
+    returns : median reduced chi-square of the poses that they leave, the amounts, gain of twice the log likelihood
+    """
+    quantities = [q for c in _candidates(trajectory.disc, names) for q in c.quantities]
     values, gain = dict(known), 0.0
     for _ in range(ITERATIONS):
-        seen, _ = with_noise_of_frames(poses_with(trajectory, values))
-        system = DiscSystem(seen, model, stretch=_all_frames(seen))
-        found = find_systematic(system, 1.0, values, beside=names)
-        gain = max(gain, found.gain)
-        for c in candidates:
-            for q in c.quantities:
-                moved = values.get(q.name, 0.0) + found.amounts.get(q.name, 0.0)
-                values[q.name] = float(np.clip(moved, 0.99 * q.lower, 0.99 * q.upper))
-        if all(abs(found.amounts.get(q.name, 0.0)) < 0.1 * q.scale for c in candidates for q in c.quantities):
+        seen = with_noise_of_frames(poses_with(trajectory, values))
+        good = np.flatnonzero(seen.measured)  # poses that are wrong by degrees tell no rest from motion
+        system = DiscSystem(seen, model, stretch=Stretch(slice(int(good[0]), int(good[-1]) + 1)))
+        found = find_systematic(system, values, beside=names)
+        gain, steps = max(gain, found.gain), [found.amounts.get(q.name, 0.0) for q in quantities]
+        for q, step in zip(quantities, steps, strict=True):
+            values[q.name] = float(np.clip(values.get(q.name, 0.0) + step, 0.99 * q.lower, 0.99 * q.upper))
+        if all(abs(step) < 0.1 * q.scale for q, step in zip(quantities, steps, strict=True)):
             break
     left = float(np.nanmedian(poses_with(trajectory, values).reduced_chi_square))
-    return _Static(values, left if np.isfinite(left) else np.inf, gain)
+    return left if np.isfinite(left) else np.inf, values, gain
 
 
-def _all_frames(trajectory: Trajectory) -> Stretch:
-    """Poses that are wrong by degrees tell no rest from motion."""
-    good = np.flatnonzero(trajectory.measured)
-    return Stretch(slice(int(good[0]), int(good[-1]) + 1))
-
-
-def _assumed(trajectory: Trajectory, model: Model, names: tuple[str, ...], static: _Static) -> Assumed | None:
+def _assumed(trajectory: Trajectory, model: Model, names: Sequence[str], known: Values, gain: float) -> Assumed | None:
     """The motion fitted with these faults among what moves; None where that fails."""
-    candidates = tuple(candidate_of_fault(f) for f in faults_of(trajectory.disc) if f.name in names)
-    seen, noise = with_noise_of_frames(poses_with(trajectory, static.values))
+    candidates = _candidates(trajectory.disc, names)
+    seen = with_noise_of_frames(poses_with(trajectory, known))
     try:
-        stretch = free_stretch(seen)
+        plain = DiscSystem(seen, model, known=known)
     except AnalysisError:
         return None
-    known = static.values
-    plain = DiscSystem(seen, model, stretch=stretch, known=known)
-    system = plain.again(systematic=find_systematic(plain, noise, known, beside=names), freed=candidates)
+    system = plain.again(systematic=find_systematic(plain, known, beside=names), freed=candidates)
     base = fit(system, system.base, system.start())
-    return Assumed(system, base, candidates, static.gain) if np.isfinite(base.cost) else None
+    return Assumed(system, base, candidates, gain) if np.isfinite(base.cost) else None
 
 
 def find_clock(system: DiscSystem) -> Assumed | None:
     """The same with the frame rate that the precession asks for; None where it is the declared one."""
-    speed = precession_over_steady(system)
-    if STEADY[0] < speed < STEADY[1]:
-        return None
-    (candidate,) = (candidate_of_fault(f) for f in faults_of(system.disc) if f.name == "frame_rate")
-    (q,) = candidate.quantities
-    change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q.lower, q.upper))
-    freed = system.again(freed=(candidate,), known={**system.known, q.name: change})
-    base = fit(freed, freed.base, freed.start())
-    return Assumed(freed, base, (candidate,), np.inf) if base.converged else None
-
-
-def precession_over_steady(system: DiscSystem) -> float:
-    """Median of psidot^2 sin(theta) over 4 g / r, which it has in the steady rolling of a thin disc."""
     q = system.trajectory.q[system.rows]
     good = np.isfinite(q).all(axis=1)
     psidot = np.gradient(q[good, 3], system.time[good])
-    ratio = psidot**2 * np.sin(q[good, 4]) * system.disc.radius / (4 * system.model.gravity)
-    return float(np.median(ratio))
+    # over what it is in the steady rolling of a thin disc
+    speed = np.median(psidot**2 * np.sin(q[good, 4])) * system.disc.radius / (4 * system.model.gravity)
+    if STEADY[0] < speed < STEADY[1]:
+        return None
+    candidates = _candidates(system.disc, ["frame_rate"])
+    (q_rate,) = candidates[0].quantities
+    change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q_rate.lower, q_rate.upper))
+    freed = system.again(freed=candidates, known={**system.known, q_rate.name: change})
+    base = fit(freed, freed.base, freed.start())
+    return Assumed(freed, base, candidates, np.inf) if base.converged else None
 
 
-def with_large(diagnosis: Diagnosis, assumed: Assumed) -> Diagnosis:
-    """The diagnosis with the large faults among what was found."""
+def diagnose_with_large(assumed: Assumed, settings: Settings) -> tuple[Diagnosis, tuple[str, ...]]:
+    """The diagnosis with the large faults among what was found, and a remark for people."""
+    diagnosis = explain(assumed.system, assumed.base.values, settings)
     found = [Found(c, assumed.gain, assumed.gain, 0.0, ()) for c in assumed.candidates]
-    return beside(diagnosis, found, ", from the dots about free poses")
-
-
-def in_words(assumed: Assumed) -> str:
-    """A remark for people."""
     said = " and ".join(c.title for c in assumed.candidates)
     how = "the precession, which gravity sets" if np.isinf(assumed.gain) else "the dots alone"
-    return f"{said}: so much that it was found from {how}, and before and after are both with it"
+    note = f"{said}: so much that it was found from {how}, and before and after are both with it"
+    return beside(diagnosis, found, ", from the dots about free poses"), (note,)

@@ -40,13 +40,12 @@ CHUNK = 240  # columns of the library that are held at a time
 
 
 @dataclass(frozen=True)
-class MissingMoment:
-    """Moment that the model fails to supply, smoothed over the distance of the probes."""
+class Course:
+    """A moment or a force over time."""
 
-    time: Array  # (k,) middles of the probes [s]
-    moment: Array  # (k, 3) M_n, M_m, M_z [N m]
+    time: Array  # (k,) [s]
+    values: Array  # (k, 3) along n0, m0, k [N m] or [N]
     sigma: Array  # (k, 3)
-    scale: float  # [N m] that its second differences were taken to have before the data
 
 
 @dataclass(frozen=True)
@@ -60,10 +59,11 @@ class Probed:
     spacing: float
 
 
-def missing_moment(blocks: Probed, scale: float | None = None) -> MissingMoment:
-    """Moment over time with the size and smoothness that make the data most probable (empirical Bayes).
+def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, float]:
+    """The moment that the model fails to supply, smooth over the distance of the probes, and its scale.
 
-    scale : [N m] of its second differences, in place of the most probable one
+    scale : [N m] that its second differences have before the data; if not given, that which makes the data most
+    probable (empirical Bayes)
     """
     R, k = np.vstack([blocks.data, blocks.prior]), len(blocks.time)
     right, fitted, probes = R[:, -1], R[:, : blocks.n_fitted], R[:, blocks.n_fitted : -1]
@@ -80,7 +80,7 @@ def missing_moment(blocks: Probed, scale: float | None = None) -> MissingMoment:
     variance = a**2 * (np.sum(root**2, axis=1) - np.sum(along**2 * known, axis=1))
     factor = WIDTH * np.sqrt(2 * np.pi)  # neighbouring probes add up to this
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    return MissingMoment(blocks.time, factor * moment.reshape(3, k).T, factor * sigma.reshape(3, k).T, a)
+    return Course(blocks.time, factor * moment.reshape(3, k).T, factor * sigma.reshape(3, k).T), a
 
 
 def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
@@ -88,8 +88,8 @@ def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
     blocks, scan = probe(system, fit_), scanned(system, fit_)
     if blocks is None or scan is None:
         return ""
-    missing = missing_moment(blocks)
-    rms, largest = np.sqrt(np.mean(missing.moment**2, axis=0)), int(np.argmax(np.sum(missing.moment**2, axis=1)))
+    missing, _ = missing_moment(blocks)
+    rms, largest = np.sqrt(np.mean(missing.values**2, axis=0)), int(np.argmax(np.sum(missing.values**2, axis=1)))
     gains = scan.gains(family for family in scan.library() if not family.shape and family.n_numbers <= 2)
     best = max(gains, key=lambda g: g.gain)
     text = (

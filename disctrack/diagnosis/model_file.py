@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from calibration.cameras.camera import StereoRig, placed_at, rotation_from_vector
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.scene_rig import scene_with_rig
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.catalogue import scene_faults, setup_of, values_in_scene
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
-from disctrack.synthetic.description import Scene, load_scene, scene_toml
+from disctrack.synthetic.description import RigSettings, Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
 
 PAPER = "paper"
@@ -58,39 +58,79 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
     The cameras are like those of the recording, so that `render` shows it from where it was filmed.
     """
     rig, values = _above_the_table(system, values)
-    model = system.model_with(values)
+    model, trajectory = system.model_with(values), system.trajectory
+    disc, rate = model.disc, float(round(trajectory.frame_rate, 9))
     state = {k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")}
-    scene = Scene(name=name, gravity_m_s2=model.gravity, air_density_kg_m3=model.air_density)
-    scene = scene_with_rig(scene, rig)
-    disc = model.disc
-    scene = replace(
-        scene,
-        cameras=replace(
-            scene.cameras, frame_rate_hz=float(round(system.trajectory.frame_rate, 9)), n_frames=len(system.time)
-        ),
-        disc=replace(
-            scene.disc,
-            radius_mm=_rounded(1e3 * disc.radius),
-            thickness_mm=_rounded(2e3 * disc.half_thickness),
-            mass_g=_rounded(1e3 * disc.mass),
-        ),
-        markers=replace(
-            scene.markers,
-            diameter_mm=_rounded(1e3 * disc.marker_diameter),
-            centres_mm=tuple((_rounded(1e3 * x), _rounded(1e3 * y)) for x, y in disc.marker_centres_body[:, :2]),
-        ),
-    )
-    scene = replace(scene, faults=scene_faults(disc, values, scene.cameras.frame_rate_hz))
+    bare = Scene(name=name, gravity_m_s2=model.gravity, air_density_kg_m3=model.air_density)
     rolling = replace(
-        scene.motion.rolling,
+        bare.motion.rolling,
         theta_deg=float(np.degrees(state["theta"])),
         nutation_deg=0.0,
         state=state,
         effects={e.name: dict(e.values) for e in model.effects},
         formulas={e.name: dict(e.formulas) for e in model.effects if e.formulas},
     )
-    scene = replace(scene, motion=replace(scene.motion, kind="rolling", rolling=rolling))
-    return "\n".join([*_header(name, system), scene_toml(scene)])
+    width, height = rig.left.image_size
+    sizes = {"radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness, "mass_g": disc.mass}
+    dots = tuple((_rounded(x), _rounded(y)) for x, y in disc.marker_centres_body[:, :2])
+    scene = replace(
+        bare,
+        rig=_settings_like(rig),
+        cameras=replace(
+            bare.cameras, frame_rate_hz=rate, n_frames=len(system.time), image_size=(int(width), int(height))
+        ),
+        disc=replace(bare.disc, **{key: _rounded(size) for key, size in sizes.items()}),
+        markers=replace(bare.markers, diameter_mm=_rounded(disc.marker_diameter), centres_mm=dots),
+        faults=scene_faults(disc, values, rate),
+        motion=replace(bare.motion, kind="rolling", rolling=rolling),
+    )
+    first, last = (int(trajectory.frame[i]) for i in (system.rows.start, system.rows.stop - 1))
+    header = (
+        f"# Fitted to frames {first} to {last} of {' '.join(name.split())}. "
+        "Read by disctrack simulate, render, and diagnose --model.\n"
+        "# motion.rolling: the motion and its effects. faults: what is wrong with cameras, dots and table.\n"
+    )
+    return header + scene_toml(scene)
+
+
+def _rounded(number: float) -> float:
+    """In mm, or g, without the noise of a conversion."""
+    return float(f"{1e3 * number:.12g}")
+
+
+def _settings_like(rig: StereoRig) -> RigSettings:
+    """Cameras like these, without seeded scatter.
+
+    Like, not equal: a scene's cameras look straight at one point, and their pixels are as large there. Principal points
+    off the middle and unequal focal lengths are lost, the view is the same to some pixels.
+    """
+    R = np.stack([R for R, _ in rig.camera_poses()])
+    eyes = np.stack([-R.T @ t for R, t in rig.camera_poses()])
+    across = np.eye(3) - R[:, 2, :, None] * R[:, 2, None, :]  # of the optical axes; their nearest point is the target
+    target = np.linalg.solve(across.sum(axis=0), np.einsum("cij,cj->i", across, eyes))
+    away = eyes - target
+    distance = np.linalg.norm(away, axis=1)
+    x, y, z = (away / distance[:, None]).T
+    # image x of an upright camera is horizontal; the roll turns it within the image
+    horizontal = np.stack([-y, x, 0 * x], axis=1) / np.hypot(x, y)[:, None]
+    seen = np.einsum("cij,cj->ci", R, horizontal)
+    focal = np.array([0.5 * (c.fx + c.fy) for c in rig.cameras])
+    lenses = zip(("k1", "k2", "p1", "p2", "k3"), zip(*(c.distortion for c in rig.cameras), strict=True), strict=True)
+    return RigSettings(
+        mm_per_px=float(np.mean(1e3 * distance / focal)),
+        distance_mm=_pair(1e3 * distance),
+        off_vertical_deg=_pair(np.degrees(np.arccos(z))),
+        azimuth_deg=_pair(np.degrees(np.arctan2(y, x))),
+        roll_deg=_pair(np.degrees(np.arctan2(seen[:, 1], seen[:, 0]))),
+        target_mm=(1e3 * float(target[0]), 1e3 * float(target[1]), 1e3 * float(target[2])),
+        **{name: _pair(np.array(both)) for name, both in lenses},
+        variation=0.0,
+    )
+
+
+def _pair(both: Array) -> tuple[float, float]:
+    left, right = both.tolist()
+    return left, right
 
 
 def _above_the_table(system: DiscSystem, values: Values) -> tuple[StereoRig, Values]:
@@ -105,16 +145,3 @@ def _above_the_table(system: DiscSystem, values: Values) -> tuple[StereoRig, Val
     turn, shift = rotation_from_vector(setup.table_turn), np.array([0.0, 0.0, setup.table_height])
     poses = [(R @ turn, t + R @ shift) for R, t in system.rig.camera_poses()]
     return replace(system.rig, **placed_at(poses)), {n: v for n, v in values.items() if n not in own}
-
-
-def _rounded(number: float) -> float:
-    return float(f"{number:.12g}")
-
-
-def _header(name: str, system: DiscSystem) -> list[str]:
-    first, last = (int(system.trajectory.frame[i]) for i in (system.rows.start, system.rows.stop - 1))
-    return [
-        f"# Fitted to frames {first} to {last} of {' '.join(name.split())}. "
-        "Read by disctrack simulate, render, and diagnose --model.",
-        "# motion.rolling: the motion and its effects. faults: what is wrong with cameras, dots and table.",
-    ]

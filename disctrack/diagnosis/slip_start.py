@@ -14,10 +14,10 @@ from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
 from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem
 from disctrack.diagnosis.errors import simulated
-from disctrack.diagnosis.large_faults import Assumed, find_clock, find_large, in_words, with_large
+from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
-from disctrack.diagnosis.motion_start import first_slip
-from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.starts import first_slip
+from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
@@ -30,7 +30,6 @@ from disctrack.rolling import CATALOGUE, Model, Regime
 from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
-FIRST_STEPS, MOST_LEFT = 4, 0.3  # towards another body or table, and the share of the misfit that they may leave
 MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
 CREEPS = (
     "slip with Coulomb's friction was given up: with so little of it the disc creeps, for longer than can be followed; "
@@ -46,27 +45,31 @@ SHOWN = 0.975  # probability of slip at the first frame from which on it is take
 
 
 @dataclass(frozen=True)
-class SlipStart:
-    """Slip at the beginning as a finding: what the model without it makes of the recording."""
-
-    without: Fit  # rolling from the first frame on
-    held_out: HeldOut
-    candidate: Candidate
-
-
-@dataclass(frozen=True)
-class SlipDiagnosis:
-    """Diagnosis of a motion that may begin in slip."""
+class MotionDiagnosis:
+    """Diagnosis of a motion that may begin in slip, or was measured with a large fault."""
 
     system: DiscSystem
     diagnosis: Diagnosis  # of the model with slip, where the disc slips
-    slip: SlipStart | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
+    rolling: tuple[Fit, HeldOut] | None = None  # what the model without it makes of a recording that begins in slip
+
+    def with_slip(self, diagnosis: Diagnosis) -> Diagnosis:
+        """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
+        if self.rolling is None:
+            return diagnosis
+        (without, held_without), held, noise = self.rolling, diagnosis.held_out_before, diagnosis.noise
+        gain = (without.cost - diagnosis.before.cost) / noise
+        held_gain = 2 * (held.log_density - held_without.log_density) / noise if held else np.nan
+        candidate = _candidate(self.system)
+        enough = threshold(self.system, diagnosis.settings, len(candidate.names))
+        found = Found(candidate, float(gain), float(held_gain), enough, ())
+        reason = f"with slip at the start, {diagnosis.reason}"
+        return replace(beside(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
 
 
 def diagnose_motion(
     trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings | None = None
-) -> SlipDiagnosis:
+) -> MotionDiagnosis:
     """Diagnose the motion, rolling or slipping at its start, with the times it has if pairs were lost.
 
     Raises AnalysisError.
@@ -74,29 +77,23 @@ def diagnose_motion(
     jumps = clock_jumps(trajectory)
     answer = _with_these_times(without_jumps(trajectory, jumps), model, faults, settings or Settings())
     lost = tuple(f"frame {trajectory.frame[jump.row]}: {jump.words}; counted with them" for jump in jumps)
-    return replace(answer, notes=(*lost, *answer.notes))
+    return replace(answer, notes=(*lost, *answer.system.stretch.notes, *answer.notes))
 
 
 def _with_these_times(
-    trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings
-) -> SlipDiagnosis:
-    as_tracked = trajectory
-    trajectory, noise = with_noise_of_frames(trajectory)
-    stretch = free_stretch(trajectory)
-    rolling = DiscSystem(trajectory, model, stretch=stretch, known=faults)
-    systematic = find_systematic(rolling, noise)
+    as_tracked: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings
+) -> MotionDiagnosis:
+    rolling = DiscSystem(with_noise_of_frames(as_tracked), model, known=faults)
+    systematic = find_systematic(rolling)
     # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
     settings = replace(settings, at_noise=settings.at_noise * systematic.left)
     assumed = find_large(as_tracked, model, systematic, faults)
-    if assumed is not None:
-        return _with_large(assumed, settings)
-    if systematic != rolling.systematic:
+    if assumed is None:
         rolling = rolling.again(systematic=systematic)
-    base = fit(rolling, rolling.base, rolling.start())
-    if not base.converged:
-        assumed = find_clock(rolling)
-        if assumed is not None:
-            return _with_large(assumed, settings)
+        base = fit(rolling, rolling.base, rolling.start())
+        assumed = None if base.converged else find_clock(rolling)
+    if assumed is not None:
+        return MotionDiagnosis(assumed.system, *diagnose_with_large(assumed, settings))
     rolling.budget = Budget(MOST_SLIP_STEPS * len(rolling.time))
     try:
         answer = _rolling_or_slipping(settings, rolling, base)
@@ -106,31 +103,25 @@ def _with_these_times(
         rolling.budget.without_end()
         # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
         rolling = rolling.again(_without_slip(rolling))
-        notes = (*stretch.notes, CREEPS)
-        return SlipDiagnosis(rolling, explain(rolling, base.values, settings), notes=notes)
+        return MotionDiagnosis(rolling, explain(rolling, base.values, settings), (CREEPS,))
 
 
-def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> SlipDiagnosis:
+def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> MotionDiagnosis:
     """The diagnosis of a motion without large faults. Raises GivenUp where slip would take too long to follow."""
-    trajectory, stretch = rolling.trajectory, rolling.stretch
+    q = rolling.trajectory.q[rolling.rows]
     large = not base.reduced_chi_square <= EXCESS * noise_variance(rolling, base)
     if large and _slips_slowly(settings, rolling):
         return _slipping(settings, rolling, base, None)
-    may_slip = first_slip(rolling.time, trajectory.q[stretch.rows], rolling.disc) > LEAST_SLIP
-    onset = _onset(trajectory, stretch) if may_slip and not _at_noise(rolling, base, settings) else None
-    if onset is not None and onset.probability > SHOWN and onset.low > rolling.time[0]:
-        if _contact_lies_elsewhere(rolling, base):
-            others = rolling.again(_without_slip(rolling))
-            diagnosis = explain(others, base.values, settings)
-            if diagnosis.verdict == "found":
-                return SlipDiagnosis(others, diagnosis, notes=stretch.notes)
-        return _slipping(settings, rolling, base, onset)
-    if onset is not None and onset.probability < 0.5:  # a disc that never rolls, or was measured wrongly
-        slipping = rolling.again(starts_in_slip=True)
-        alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
-        if _at_noise(slipping, alone, settings):
-            return _slipping(settings, rolling, base, onset)
-    return SlipDiagnosis(rolling, explain(rolling, base.values, settings), notes=stretch.notes)
+    may_slip = first_slip(rolling.time, q, rolling.disc) > LEAST_SLIP and not _at_noise(rolling, base, settings)
+    onset = _onset(rolling) if may_slip else None
+    if onset is None or onset.probability <= SHOWN or onset.low <= rolling.time[0]:
+        return MotionDiagnosis(rolling, explain(rolling, base.values, settings), ())
+    # the velocity at the contact is that of a rim as declared: where it is not round, what rolls seems to slip
+    others = rolling.again(_without_slip(rolling))
+    diagnosis = explain(others, base.values, settings)
+    if diagnosis.verdict == "found":
+        return MotionDiagnosis(others, diagnosis, ())
+    return _slipping(settings, rolling, base, onset)
 
 
 def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
@@ -151,48 +142,23 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     return bool((motion.regime[:LASTS] == Regime.SLIPPING).all())
 
 
-def _contact_lies_elsewhere(rolling: DiscSystem, base: Fit) -> bool:
-    """Do some steps towards another body or table remove most of what slip would have to explain?
-
-    The velocity at the contact is that of a point of the rim as declared. Where the rim is not round or the table
-    moves, the disc touches elsewhere, and what rolls seems to slip.
-    """
-    if not base.converged:
-        return False
-    for c in rolling.candidates:
-        if c.effect in CATALOGUE and (CATALOGUE[c.effect].adjust or c.sought):
-            names = [q.name for q in c.shape]
-            for start in rolling.starts(c, base.values) or [()]:
-                values = base.values | dict(zip(names, start, strict=False))
-                others = (q for q in base.quantities if q.name not in c.names)
-                few = fit(rolling, (*others, *c.quantities), values, FIRST_STEPS)
-                if few.chi_square - few.n_data < MOST_LEFT * (base.chi_square - base.n_data):
-                    return True
-    return False
-
-
 def _without_slip(system: DiscSystem) -> tuple[Candidate, ...]:
     return tuple(c for c in system.candidates if c.effect != "slip")
-
-
-def _with_large(assumed: Assumed, settings: Settings) -> SlipDiagnosis:
-    diagnosis = with_large(explain(assumed.system, assumed.base.values, settings), assumed)
-    return SlipDiagnosis(assumed.system, diagnosis, notes=(*assumed.system.stretch.notes, in_words(assumed)))
 
 
 def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:
     return fit_.converged and fit_.reduced_chi_square <= settings.at_noise * noise_variance(system, fit_)
 
 
-def _onset(trajectory: Trajectory, stretch: Stretch) -> RollingOnset | None:
+def _onset(rolling: DiscSystem) -> RollingOnset | None:
     """When rolling begins, from the contact's velocity; None where the velocities cannot be had."""
     try:
-        return analyse_contact(differentiate(part(trajectory, stretch.rows))).onset
+        return analyse_contact(differentiate(part(rolling.trajectory, rolling.rows))).onset
     except AnalysisError:
         return None
 
 
-def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> SlipDiagnosis:
+def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> MotionDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     system = rolling.again(starts_in_slip=True)
     crept: tuple[str, ...] = ()
@@ -206,28 +172,20 @@ def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: Rolling
         later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
             return later
-    if diagnosis.held_out_after is None or not _declares(system):
-        return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, *_in_words(system, diagnosis), *crept))
-    rows = training_rows(system)
-    judged = diagnosis.judged or system
-    slip = SlipStart(base, held_out(judged, base.quantities, base.values, rows), _candidate(system))
-    notes = (*system.stretch.notes, *_in_words(system, diagnosis), *crept)
-    return SlipDiagnosis(system, diagnosis, slip, notes)
-
-
-def _declares(system: DiscSystem) -> bool:
-    """Is friction part of what was fitted, and not of the model that was given?"""
-    return SLIP in {q.name for q in system.base}
+    notes = (*_in_words(system, diagnosis), *crept)
+    if diagnosis.held_out_after is None or SLIP not in {q.name for q in system.base}:  # friction was declared
+        return MotionDiagnosis(system, diagnosis, notes)
+    held = held_out(diagnosis.judged or system, base.quantities, base.values, training_rows(system))
+    return MotionDiagnosis(system, diagnosis, notes, (base, held))
 
 
 def _after_slip(
     settings: Settings, rolling: DiscSystem, onset: RollingOnset, slipping: Diagnosis
-) -> SlipDiagnosis | None:
+) -> MotionDiagnosis | None:
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
-        stretch = free_stretch(rolling.trajectory, onset.high)
         # the beginning has shown that its law is not Coulomb's
-        system = rolling.again(_without_slip(rolling), stretch=stretch)
+        system = rolling.again(_without_slip(rolling), stretch=free_stretch(rolling.trajectory, onset.high))
     except AnalysisError:
         return None
     diagnosis = explain(system, system.start(), settings)
@@ -238,12 +196,11 @@ def _after_slip(
         f"the disc slips until {onset.time:.4f} s (95 %: {onset.low:.4f} to {onset.high:.4f} s), and no coefficient of "
         f"friction describes that ({left}): this is the diagnosis of what comes after it"
     )
-    return SlipDiagnosis(system, diagnosis, notes=(*system.stretch.notes, note))
+    return MotionDiagnosis(system, diagnosis, (note,))
 
 
 def _candidate(system: DiscSystem) -> Candidate:
-    usual = slip_candidate(CATALOGUE["slip"])
-    fitted = {q.name: q for q in system.base}
+    usual, fitted = slip_candidate(CATALOGUE["slip"]), {q.name: q for q in system.base}
     quantities = tuple(fitted[name] for name in (SLIP, *SLIP_VELOCITY))
     title = "the disc slips at first, with Coulomb friction |F_t| = mu F_z"
     return Candidate("slip_start", usual.effect, "motion", title, usual.source, quantities)
@@ -257,14 +214,3 @@ def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:
     end = next((s.time for s in motion.switches if s.after is Regime.ROLLING), None)
     until = "to the end of the recording" if end is None else f"until {end:.4f} s, and rolls after it"
     return (f"the disc slips at first, with {1e3 * slip:.4g} mm/s at the contact, {until}",)
-
-
-def with_slip(system: DiscSystem, diagnosis: Diagnosis, slip: SlipStart) -> Diagnosis:
-    """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
-    gain = (slip.without.cost - diagnosis.before.cost) / diagnosis.noise
-    held = diagnosis.held_out_before
-    held_gain = 2 * (held.log_density - slip.held_out.log_density) / diagnosis.noise if held else np.nan
-    enough = threshold(system, diagnosis.settings, len(slip.candidate.names))
-    found = Found(slip.candidate, float(gain), float(held_gain), enough, ())
-    reason = f"with slip at the start, {diagnosis.reason}"
-    return replace(beside(diagnosis, [found]), reason=reason, before=slip.without, held_out_before=slip.held_out)

@@ -10,18 +10,17 @@ from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.arguments import checked
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
-from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.errors import energy_balance, errors
+from disctrack.diagnosis.errors import LeftOver, energy_balance, errors, left_over, regimes, where_it_holds
+from disctrack.diagnosis.evidence import evidence
 from disctrack.diagnosis.form_misfit import with_form
-from disctrack.diagnosis.left_over import LeftOver, left_over
 from disctrack.diagnosis.missing_force import what_is_missing
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.pages.output import as_json, write_diagnosis
 from disctrack.diagnosis.pages.report import report_of
 from disctrack.diagnosis.plan import open_questions, plan
-from disctrack.diagnosis.regimes import regimes
-from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
+from disctrack.diagnosis.recorded import read_recorded
+from disctrack.diagnosis.slip_start import diagnose_motion
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.laws import WithLaw, explained_by_law, judged_as
@@ -37,7 +36,7 @@ from disctrack.findings import Finding, Kind, doubts
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.file import read_details, read_provenance, read_trajectory, trajectory_in
+from disctrack.trajectory.file import trajectory_in
 from disctrack.trajectory.reuse import refuse_other
 
 
@@ -64,31 +63,27 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     """
     declared = declared_model(trajectory, model)
     answer = diagnose_motion(trajectory, declared.model, declared.faults, settings)
-    system, diagnosis = answer.system, answer.diagnosis
+    system, diagnosis, notes = answer.system, answer.diagnosis, answer.notes
     if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
-        return DiscDiagnosis(system, diagnosis, declared.name, None, None, {}, notes=answer.notes)
+        return DiscDiagnosis(system, diagnosis, declared.name, notes=notes)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
     found, diagnosis = _beyond_the_catalogue(system, diagnosis, left)
-    parts, notes = None, tuple[str, ...]()
-    if diagnosis.verdict == "unexplained" and diagnosis.before.converged:
-        parts = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
-        notes = (parts.text,) if found else (parts.text, what_is_missing(system, diagnosis.after))
-    learned = None
+    holds, learned, held, notes = {}, None, diagnosis.held_out_after, (*notes, *diagnosis.remarks)
+    if diagnosis.verdict == "unexplained":
+        holds = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
+        notes = (*notes, where_it_holds(holds), "" if found else what_is_missing(system, diagnosis.after))
     if found is not None:
         system, learned, diagnosis, doubted = _with_law(system, diagnosis, found)
-        left, notes = left_over(system, learned.fit, diagnosis.noise), (*notes, *doubted)
+        left, notes, held = left_over(system, learned.fit, diagnosis.noise), (*notes, *doubted), learned.held_out
     else:
         diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
-    if answer.slip is not None:
-        diagnosis = with_slip(system, diagnosis, answer.slip)
-    fit_, held_before = learned.fit if learned else diagnosis.after, diagnosis.held_out_before
-    assert held_before is not None
-    before = errors(system, diagnosis.before, held_before)
-    after = errors(system, fit_, learned.held_out if learned else diagnosis.held_out_after or held_before)
-    energy = energy_balance(system, fit_.values)
-    notes = tuple(note for note in (*answer.notes, *diagnosis.remarks, *notes) if note)
-    return DiscDiagnosis(system, diagnosis, declared.name, before, after, energy, learned, None, notes, parts, left)
+    diagnosis = answer.with_slip(diagnosis)
+    fit_ = learned.fit if learned else diagnosis.after
+    before = errors(system, diagnosis.before, diagnosis.held_out_before)
+    after = errors(system, fit_, held)
+    energy, said = energy_balance(system, fit_.values), tuple(note for note in notes if note)
+    return DiscDiagnosis(system, diagnosis, declared.name, before, after, energy, learned, said, holds, left)
 
 
 def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -111,19 +106,21 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
     """The verdict on the motion: what is left may be its, although chi-square is small, or the measurement's."""
     if left is None or not diagnosis.after.converged:
         return diagnosis
-    if diagnosis.verdict != "unexplained" and left.of_the_motion:
-        reason = (
-            f"{diagnosis.reason}; but what is left of the poses is not noise (p = {left.pose_p_value:.1g} over "
-            f"{left.n_tests} tests), while the numbers that no pose takes are"
+    verdict, but = diagnosis.verdict, ""
+    if verdict != "unexplained" and left.of_the_motion:
+        verdict = "unexplained"
+        but = (
+            f"is not noise (p = {left.pose_p_value:.1g} over {left.n_tests} tests), while the numbers that no pose "
+            "takes are"
         )
-        return replace(diagnosis, verdict="unexplained", reason=reason)
-    if diagnosis.verdict == "unexplained" and left.of_the_measurement:
-        reason = (
-            f"{diagnosis.reason}; but what is left in the poses ({left.pose_chi_square:.3g} of the noise) is no more "
-            f"than errors of the measurement leave in the numbers that no pose takes ({left.other_chi_square:.3g})"
+    elif verdict == "unexplained" and left.of_the_measurement:
+        verdict = "found" if diagnosis.found else "nothing missing"
+        but = (
+            f"({left.pose_chi_square:.3g} of the noise) is no more than errors of the measurement leave in the numbers "
+            f"that no pose takes ({left.other_chi_square:.3g})"
         )
-        return replace(diagnosis, verdict="found" if diagnosis.found else "nothing missing", reason=reason)
-    return diagnosis
+    reason = f"{diagnosis.reason}; but what is left in the poses {but}" if but else diagnosis.reason
+    return replace(diagnosis, verdict=verdict, reason=reason)
 
 
 def _beyond_the_catalogue(
@@ -149,8 +146,8 @@ def _with_law(
     """The system that knows the law, the law with its course, the diagnosis with it, and remarks."""
     law, fitted, kept, noise = found.law, found.fit, found.kept, diagnosis.noise
     known = system.knowing(law)
-    judged, rows = judged_as(diagnosis, known), training_rows(known)
-    held = held_out(judged, fitted.quantities, fitted.values, rows)
+    judged = judged_as(diagnosis, known)
+    held = held_out(judged, fitted.quantities, fitted.values, training_rows(known))
     assert diagnosis.held_out_before is not None
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / noise
     work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
@@ -161,12 +158,12 @@ def _with_law(
     )
     left = left_over(known, fitted, noise)
     as_found = known, with_memory(judged, fitted), law, noise, left is not None and not left.white
-    formed = with_form(*as_found, _of_motion(kept))
-    diagnosis, doubted = _beside_any_form(diagnosis, kept, formed.of_another, law.looked)
+    fit_, of_another, course, misfit = with_form(*as_found, _of_motion(kept))
+    diagnosis, doubted = _beside_any_form(diagnosis, kept, of_another, law.looked)
     if _of_motion(diagnosis.found):  # what holds beside any law does not stand in with this one
-        formed = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
+        fit_, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
     gain = (diagnosis.before.cost - fitted.cost) / noise
-    learned = Learned(law, formed.fit, held, gain, float(held_gain), power, formed.course)
+    learned = Learned(law, fit_, held, gain, float(held_gain), power, course, misfit)
     return known, learned, diagnosis, doubted
 
 
@@ -180,7 +177,7 @@ def _beside_any_form(
     holds the law that no catalogue names.   looked : chi-square that a law pays for having been looked for; so does an
     effect whose place or frequency was
     """
-    doubted, notes = list[Found](), list[str]()
+    established, notes = list[Found](), list[str]()
     for found in kept:
         candidate = found.candidate
         shape = {q.name for q in candidate.shape}  # an exponent or a frequency is no amount
@@ -189,14 +186,13 @@ def _beside_any_form(
         amounts = np.array([fitted.values[q.name] - q.null for q in sizes])
         gain = wald(amounts, fitted.covariance[np.ix_(index, index)])
         if gain > found.threshold + looked * candidate.sought:
+            established.append(found)
             continue
-        doubted.append(found)
         notes.append(
             f"{candidate.title} [{candidate.name}] helps the law to describe the data, and is not claimed: with what "
             f"the law's form may be off by it stands out by {np.sqrt(gain):.2g} sigma"
         )
-    established = tuple(found for found in diagnosis.found if found not in doubted)
-    return replace(diagnosis, found=established), tuple(notes)
+    return replace(diagnosis, found=tuple(established)), tuple(notes)
 
 
 def _of_motion(found: Iterable[Found]) -> set[str]:
@@ -219,36 +215,30 @@ def run_diagnose(
     figures : also write every figure of the page as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
     """
-    from disctrack.diagnosis.free_runs import evidence
     from disctrack.diagnosis.pages.figures import all_figures  # matplotlib is wanted here only
 
     path = trajectory_in(Path(path))
     keep(path)
     keep(Path(model))
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"
-    report = folder / "diagnosis.json"
+    report, page, toml = (folder / name for name in ("diagnosis.json", "diagnosis.html", "model.toml"))
     refuse_other(report, overwrite)
-    for name in (report.name, "model.toml"):
-        refuse_input(folder / name)
-    provenance = read_provenance(path)
-    trajectory = with_declared_dots(read_trajectory(path), read_details(path))
+    for file in (report, toml):
+        refuse_input(file)
+    recorded = read_recorded(path)
     try:
-        result = diagnose(trajectory, model)
+        result = diagnose(recorded.trajectory, model)
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
     result = with_plan(result) if settle else result
     beside = evidence(result) if result.before is not None else None
-    document = {"recording": provenance.recording, **as_json(result, beside)}
+    document = {"recording": recorded.name, **as_json(result, beside)}
     write_diagnosis(path, result, beside, document)
     write_whole(report, json_file(document))
-    toml = folder / "model.toml"
-    text = model_toml(result.system, result.after_fit.values, provenance.recording)
-    write_whole(toml, text.encode())
-    page = folder / "diagnosis.html"
-    drawn = all_figures(result, beside)
-    wrong = doubts(trajectory.findings)
+    write_whole(toml, model_toml(result.system, result.after_fit.values, recorded.name).encode())
     whole = report_of(
-        result, beside, provenance.recording, findings=wrong, drawn=drawn, files=(page, report, toml, path)
-    )
+        result, beside, recorded.name, all_figures(result, beside), doubts(recorded.trajectory.findings),
+        files=(page, report, toml, path),
+    )  # fmt: skip
     files = write_page(page, whole, ("png", "pdf") if figures else ())
     return DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document))

@@ -9,8 +9,9 @@ with these sizes as priors, then stand beside the motion, and take from it what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array, Mask
+from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
@@ -26,12 +28,13 @@ if TYPE_CHECKING:
 
 
 MIN_DIFFERENCES = 20  # third differences from which a noise is read
+OF_THE_REST = 0.7588  # variance of a standard normal number cut at its 95th percentile in size
 INFLATED = 0.8  # variance from frame to frame over that stated, below which the statement holds more than noise
 MARGIN = 0.6  # of a field's length, by which its grid exceeds the places
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
 LENS_LENGTHS = (0.3, 0.6, 0.17)  # of a camera's field, over the extent of the dots' places
 DOT_LENGTH = 0.5  # of the fields of single dots, likewise
-MIN_FRAMES, MAX_FRAMES = 30, 200  # that are looked at: fields move slowly
+MAX_FRAMES = 200  # that are looked at: fields move slowly
 ROUNDS = 3  # over the sizes
 WORTH = 20.0  # of twice the log likelihood, that a fault or a field must gain: odds of 2e4
 MOST_FAULTS = 2
@@ -55,25 +58,20 @@ def noise_over_stated(trajectory: Trajectory) -> float:
     difference = np.diff(scaled, 3, axis=1)[:, together]
     numbers = 2.0 * seen.sum(axis=(1, 2))
     free = np.mean(np.clip((numbers - 6.0) / np.maximum(numbers, 1.0), 0.0, 1.0)[numbers > 6])
-    # a heavy tail of single bad frames is no noise of the others
-    return float(_robust_variance(difference) / 20.0 / free)
-
-
-def _robust_variance(x: Array) -> float:
-    """Mean square without the twentieth that is largest, as of normal numbers."""
-    squares = np.sort(np.ravel(x) ** 2)
+    # without the twentieth that is largest: a heavy tail of single bad frames is no noise of the others
+    squares = np.sort(np.ravel(difference) ** 2)
     kept = squares[: int(0.95 * squares.size)]
-    return float(np.mean(kept) / 0.7588)  # of a standard normal number cut at its 95th percentile in size
+    return float(np.mean(kept) / OF_THE_REST / 20.0 / free)
 
 
-def with_noise_of_frames(trajectory: Trajectory) -> tuple[Trajectory, float]:
-    """The trajectory with its covariances brought down to the scatter from frame to frame, and by which factor.
+def with_noise_of_frames(trajectory: Trajectory) -> Trajectory:
+    """The trajectory with its covariances brought down to the scatter from frame to frame.
 
     A covariance that was enlarged to cover systematic errors says nothing of the noise: motions look like rests, and
     effects like chance.
     """
     ratio = noise_over_stated(trajectory)
-    return (with_noise(trajectory, ratio), ratio) if 0 < ratio < INFLATED else (trajectory, 1.0)
+    return with_noise(trajectory, ratio) if 0 < ratio < INFLATED else trajectory
 
 
 def with_noise(trajectory: Trajectory, ratio: float) -> Trajectory:
@@ -95,7 +93,6 @@ class Systematic:
     dot_px: float = 0.0  # rms of each dot's own field in each camera
     dot_length_px: float = 200.0
     print_m: float = 0.0  # rms of the dots' places on the face, per coordinate
-    noise: float = 1.0  # variance from frame to frame over that stated by the tracking
     gain: float = 0.0  # of twice the log likelihood, over noise alone
     beside: tuple[str, ...] = ()  # faults of the measurement that were fitted along
     beside_px: float = 0.0  # rms of what they do to the dots about free poses
@@ -196,11 +193,8 @@ class Evidence:
 
     def __init__(self, data: Array, groups: Mapping[str, Array]) -> None:
         """Groups : columns of each group, whitened as the data are."""
-        self._slices = {}
-        first = 0
-        for name, group in groups.items():
-            self._slices[name] = slice(first, first + group.shape[1])
-            first += group.shape[1]
+        ends = np.cumsum([0, *(group.shape[1] for group in groups.values())]).tolist()
+        self._slices = {name: slice(*pair) for name, pair in zip(groups, pairwise(ends), strict=True)}
         columns = np.concatenate(list(groups.values()), axis=1)
         self._gram, self._inner, self._power = columns.T @ columns, columns.T @ data, float(data @ data)
 
@@ -209,7 +203,7 @@ class Evidence:
 
         Groups without a size do not act.
         """
-        root, known, _, _ = self._solved(sizes)
+        root, known, *_ = self._solved(sizes)
         return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
 
     def left(self, sizes: Mapping[str, float]) -> float:
@@ -238,34 +232,27 @@ Sizes = dict[str, float]
 
 def _best_sizes(evidence: Evidence, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
     """Sizes of the groups in `grids` that make the data most probable: one after the other, up and down its grid."""
-    best = evidence.twice_log(sizes)
+    best, before = evidence.twice_log(sizes), -np.inf
     for _ in range(ROUNDS):
+        if best - before < 1.0:
+            break
         before = best
         for name, grid in grids.items():
-            if name in sizes:
-                here = int(np.argmin(np.abs(np.log(grid / sizes[name]))))
-                ways = [range(here + 1, len(grid)), range(here - 1, -1, -1)]
-            else:
-                ways = [range(len(grid))]
-            for way in ways:
-                for i in way:
-                    trial = sizes | {name: float(grid[i])}
+            here = int(np.argmin(np.abs(np.log(grid / sizes[name])))) if name in sizes else -1
+            for way in (grid[here + 1 :], grid[: max(here, 0)][::-1]):
+                for size in way.tolist():
+                    trial = sizes | {name: size}
                     value = evidence.twice_log(trial)
                     if value <= best:
                         break
                     best, sizes = value, trial
-        if best - before < 1.0:
-            break
     return best, sizes
 
 
-def _with_faults(
-    evidence: Evidence, sizes: Sizes, faults: Mapping[str, float], most: int
-) -> tuple[float, Sizes, tuple[str, ...]]:
+def _with_faults(evidence: Evidence, sizes: Sizes, faults: Mapping[str, float]) -> tuple[float, Sizes, tuple[str, ...]]:
     """The faults that make the data more probable beside these sizes, one after the other."""
-    best = evidence.twice_log(sizes)
-    chosen: tuple[str, ...] = ()
-    while len(chosen) < most:
+    best, chosen = evidence.twice_log(sizes), tuple[str, ...]()
+    while len(chosen) < MOST_FAULTS:
         trials = {name: evidence.twice_log(sizes | {name: size}) for name, size in faults.items() if name not in sizes}
         name = max(trials, key=lambda n: trials[n], default="")
         if not name or trials[name] < best + WORTH:
@@ -289,85 +276,50 @@ def _with_amounts(
     return replace(found, beside=names, beside_px=float(np.sqrt(powers)), amounts=amounts)
 
 
-@dataclass(frozen=True)
-class _Dots:
-    """What no pose takes of some frames' dots, and what it may be made of."""
-
-    data: Array  # (n,) whitened
-    groups: dict[str, Array]  # (n, k) columns by what they stand for, without the lenses' fields
-    faults: tuple[str, ...]  # those of the groups that are faults of the measurement
-    size: float  # rms of the data, one at least
-    per_px: float  # whitened units in a pixel
-    extent: float  # [px] of the dots' places
-    whitened: Callable[[Array], Array]  # shifts of the dots [px] as columns
-
-
-def _dots(view: StaticView) -> _Dots:
-    across = np.eye(view.residual.shape[1]) - view.by_pose @ np.linalg.pinv(view.by_pose)
-
-    def free(columns: Array) -> Array:
-        return np.asarray((across @ columns.reshape(*view.residual.shape, -1)).reshape(view.residual.size, -1), float)
-
-    def whitened(shifts: Array) -> Array:
-        return free(np.einsum("ncmab,ncmbk->ncmak", view.whiten, shifts))
-
-    data = free(view.residual)[:, 0]
-    size = max(float(np.sqrt(np.mean(data**2))), 1.0)
-    extent = float(np.max([np.ptp(view.places[:, c][view.used[:, c]], axis=0).max() for c in range(2)]))
-    faults = {name: whitened(columns) for name, columns in view.faults.items()}
-    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
-    groups = {"rig": free(view.rig), "print": free(view.dots), **faults}
-    groups["dot"] = whitened(dot_columns(view.places, view.used, DOT_LENGTH * extent, size))
-    per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))
-    return _Dots(data, groups, tuple(faults), size, per_px, extent, whitened)
-
-
-def find_systematic(
-    system: DiscSystem, noise: float = 1.0, known: Values | None = None, beside: Sequence[str] | None = None
-) -> Systematic:
+def find_systematic(system: DiscSystem, known: Values | None = None, beside: Sequence[str] | None = None) -> Systematic:
     """Sizes of the systematic errors of the dots, next to whatever fault of the measurement explains them better.
 
-    noise : variance from frame to frame over that stated, to be kept in the answer
     known : values of faults that the poses were found with
     beside : fit these faults along, and no others
     """
     rows = np.flatnonzero(system.weights >= np.max(system.weights))
     if len(rows) < MIN_FRAMES:
-        return Systematic(noise=noise)
+        return Systematic()
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_FRAMES, len(rows))).astype(int))]
     view = system.static_view(rows, known or {})
-    dots = _dots(view)
-    numbers, extent = float(np.sum(system.weights[rows] - 6.0)), dots.extent
-    steps: Array = dots.size / dots.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
+    data = view.across_poses(view.residual)[:, 0]
+    numbers = float(np.sum(system.weights[rows] - 6.0))
+    size = max(float(np.sqrt(np.mean(data**2))), 1.0)
+    extent = float(np.max([np.ptp(view.places[:, c][view.used[:, c]], axis=0).max() for c in range(2)]))
+    faults = {name: view.whitened(columns) for name, columns in view.faults.items()}
+    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
+    groups = {"rig": view.across_poses(view.rig), "print": view.across_poses(view.dots), **faults}
+    groups["dot"] = view.whitened(dot_columns(view.places, view.used, DOT_LENGTH * extent, size))
+    per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))
+    steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
-    given = tuple(name for name in beside or () if name in dots.faults)
+    given = tuple(name for name in beside or () if name in faults)
     start = {"rig": 1.0, "print": DOT_SIGMA} | dict.fromkeys(given, WIDE)
-    amounts = dict.fromkeys(dots.faults, 1.0) if beside is None else {}
-    best: Systematic | None = None
-    nothing = 0.0
+    amounts = dict.fromkeys(faults, 1.0) if beside is None else {}
+
+    alone = Evidence(data, groups)
+    nothing = alone.twice_log(start)
+    value, sizes, chosen = _with_faults(alone, start, amounts)
+    best = _with_amounts(Systematic(gain=value - nothing), alone, sizes, (*given, *chosen), view)
     for share in LENS_LENGTHS:
-        lens = dots.whitened(lens_columns(view.places, view.used, share * extent, dots.size))
-        evidence = Evidence(dots.data, {**dots.groups, "lens": lens})
-        if best is None:
-            nothing = evidence.twice_log(start)
-            value, sizes, chosen = _with_faults(evidence, start, amounts, MOST_FAULTS)
-            best = _with_amounts(
-                Systematic(noise=noise, gain=value - nothing), evidence, sizes, (*given, *chosen), view
-            )
-        trial, sizes = _best_sizes(evidence, dict(start), grids)
-        if trial < nothing + best.gain - 4 * WORTH and share != LENS_LENGTHS[0]:
-            continue
-        value, sizes, chosen = _with_faults(evidence, sizes, amounts, MOST_FAULTS)
+        evidence = Evidence(
+            data, {**groups, "lens": view.whitened(lens_columns(view.places, view.used, share * extent, size))}
+        )
+        value, sizes = _best_sizes(evidence, dict(start), grids)
+        value, sizes, chosen = _with_faults(evidence, sizes, amounts)
         if chosen:  # what a fault explains is no field
-            refitted = start | dict.fromkeys(chosen, 1.0)
-            value, sizes = _best_sizes(evidence, refitted, grids)
+            value, sizes = _best_sizes(evidence, start | dict.fromkeys(chosen, 1.0), grids)
         found = Systematic(
             sizes.get("lens", 0.0), share * extent, sizes.get("dot", 0.0), DOT_LENGTH * extent,
-            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, noise, value - nothing,
+            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, value - nothing,
             left=max(1.0, evidence.left(sizes) / numbers),
         )  # fmt: skip
         found = _with_amounts(found, evidence, sizes, (*given, *chosen), view)
         if found.present and found.gain > best.gain + WORTH:
             best = found
-    assert best is not None
     return best

@@ -15,7 +15,7 @@ import numpy as np
 
 from disctrack.cli import main as disctrack_cli
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.declared_dots import with_declared_dots
+from disctrack.diagnosis.recorded import with_declared_dots
 from disctrack.trajectory.file import read_details, read_trajectory
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import newton_euler, point_laboratory

@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.errors import simulated
-from disctrack.diagnosis.left_over import left_over
+from disctrack.diagnosis.errors import left_over, simulated
 from disctrack.rolling import Model
 from tests.oracles.required_wrench import required_wrench
 from tests.oracles.unknown_laws import UNKNOWN, Recording, recording
@@ -65,8 +64,12 @@ def _against(made: Recording, result) -> dict:
     found = {"rms_truth": rms(of(at)), "rms_error": rms(moment - of(at))}
     course = result.learned.course if result.learned else None
     if course is not None:
-        pull = (course.moment - of(course.time)) / course.sigma
-        found |= {"misfit": course.misfit, "pull": float(np.sqrt(np.mean(pull**2))), "rms_sigma": rms(course.sigma)}
+        pull = (course.values - of(course.time)) / course.sigma
+        found |= {
+            "misfit": result.learned.misfit,
+            "pull": float(np.sqrt(np.mean(pull**2))),
+            "rms_sigma": rms(course.sigma),
+        }
         found |= {"within_3": float(np.mean(np.abs(pull) < 3.0)), "worst": float(np.abs(pull).max())}
     return found
 

@@ -9,7 +9,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.diagnosis import diagnose
-from disctrack.diagnosis.free_runs import evidence, force_of
+from disctrack.diagnosis.evidence import evidence, force_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import simulate_scene
 from disctrack.trajectory.file import Provenance, read_group, read_trajectory, write_trajectory
@@ -71,14 +71,14 @@ def test_what_was_found_supplies_the_missing_force(diagnosed):
     result = diagnose(read_trajectory(diagnosed[0]))
     beside = evidence(result)
     added = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
-    missing = beside.measured.force - force_of(result.system, result.diagnosis.before)
+    missing, sigma = beside.force.values, beside.force.sigma
     inner = slice(30, -30)
-    pull = (missing - added)[inner] / beside.measured.force_sigma[inner]
+    pull = (missing - added)[inner] / sigma[inner]
     # neighbouring frames share noise: some ten independent values per axis, mean square 1 +- 0.25
     assert np.mean(pull**2) < 2
-    assert np.mean((missing[inner] / beside.measured.force_sigma[inner]) ** 2) > 4
+    assert np.mean((missing[inner] / sigma[inner]) ** 2) > 4
     of_law, moment = beside.moment_of_law, beside.moment
-    left = (moment.moment - of_law.moment)[2:-2] / moment.sigma[2:-2]
+    left = (moment.values - of_law.values)[2:-2] / moment.sigma[2:-2]
     assert np.mean(left**2) < 2
 
 

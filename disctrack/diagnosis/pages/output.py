@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.errors import Ahead, Errors
+from disctrack.diagnosis.evidence import Evidence
 from disctrack.diagnosis.law_library import locked
-from disctrack.diagnosis.pages import planned
+from disctrack.diagnosis.plan import Plan
 from disctrack.discrepancy.document import declared_json, document, effect_json, parameters_json
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
@@ -18,32 +21,31 @@ from disctrack.trajectory.file import write_group
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.answer import DiscDiagnosis, Learned
-    from disctrack.diagnosis.free_runs import ModelFreeEvidence
 
 GROUP = "diagnosis"
 
 
-def _errors(errors: Errors | None, longer: tuple[Ahead, ...] = ()) -> dict[str, Any]:
+def _errors(errors: Errors | None, ahead: list[Ahead]) -> dict[str, Any]:
     if errors is None:
         return {}
-    w = errors.whiteness
-    by_component = ("ljung_box", "peak_frequency", "peak_p_value", "peak_near")
-    tests = {name: dict(zip(POSE_COMPONENTS, plain(getattr(w, name)), strict=True)) for name in by_component}
-    plainly = ("reduced_chi_square", "reduced_chi_square_pose", "rms_px", "rms_position_um", "rms_theta_mdeg")
-    return {name: getattr(errors, name) for name in plainly} | {
-        "held_out": {
-            "ratio_to_noise_floor": errors.ratio_to_floor,
-            "free_run": [vars(ahead) for ahead in (*errors.ahead, *longer)],
-        },
-        "whiteness": {"p_value": w.p_value, "peak_frequency_hz": tests.pop("peak_frequency"), **tests},
+    found = asdict(errors)
+    tests, ratio = found.pop("whiteness"), found.pop("ratio_to_floor")
+    by_component = {
+        name: dict(zip(POSE_COMPONENTS, plain(values), strict=True))
+        for name, values in tests.items()
+        if name != "p_value"
+    }
+    by_component["peak_frequency_hz"] = by_component.pop("peak_frequency")
+    return found | {
+        "held_out": {"ratio_to_noise_floor": ratio, "free_run": ahead},
+        "whiteness": {"p_value": tests["p_value"], **by_component},
     }
 
 
 def _learned(learned: Learned) -> dict[str, Any]:
-    law, known = learned.law, learned.course
-    course = known and {
-        "time_s": known.time, "N_m": known.moment, "sigma_N_m": known.sigma, "misfit_of_form": known.misfit,
-    }  # fmt: skip
+    law, course = learned.law, {}
+    if (known := learned.course) is not None:
+        course = {"time_s": known.time, "N_m": known.values, "sigma_N_m": known.sigma, "misfit_of_form": learned.misfit}
     return {
         "name": law.candidate.effect,
         "candidate": law.candidate.name,
@@ -55,7 +57,7 @@ def _learned(learned: Learned) -> dict[str, Any]:
         "alike": list(law.alike),
         "phase_locked": locked(law),
         "mean_power_W": learned.power,
-        "moment_about_contact": {} if course is None else course,
+        "moment_about_contact": course,
         "parameters": parameters_json(law.candidate.quantities, learned.fit),
         "class": [],
         "score": learned.gain,
@@ -63,33 +65,49 @@ def _learned(learned: Learned) -> dict[str, Any]:
     }
 
 
-def as_json(result: DiscDiagnosis, beside: ModelFreeEvidence | None = None) -> dict[str, Any]:
+def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
-    d = result.diagnosis
+    d, frame, rows = result.diagnosis, result.system.trajectory.frame, result.system.rows
+    ahead = ([run[side] for run in beside.ahead] if beside else [] for side in range(2))
+    before, after = (_errors(e, runs) for e, runs in zip((result.before, result.after), ahead, strict=True))
     effects = [effect_json(f, d.after) for f in d.found]
-    rows, longer, holds = result.system.rows, beside.ahead if beside else (), result.regimes
     found = document(d, result.model, result.sentence) | {
         "notes": list(result.notes),
-        "frames": [int(result.system.trajectory.frame[i]) for i in (rows.start, rows.stop - 1)],
+        "frames": [int(frame[rows.start]), int(frame[rows.stop - 1])],
         "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
-        "before": _errors(result.before, tuple(b for b, _ in longer)) | {"parameters": declared_json(d.before)},
-        "after": _errors(result.after, tuple(a for _, a in longer)) | {"parameters": declared_json(result.after_fit)},
+        "before": before | {"parameters": declared_json(d.before)},
+        "after": after | {"parameters": declared_json(result.after_fit)},
         "chance": vars(d.chance) if d.chance else {},
-        "holds": {"first": holds.first and vars(holds.first), "last": holds.last and vars(holds.last)} if holds else {},
+        "holds": result.holds,
         "energy_J": result.energy,
         "energy_before_J": beside.energy_before if beside else {},
-        "plan": planned.as_json(result.plan),
+        "plan": plan_json(result.plan),
     }
     return dict(plain(found))
 
 
-def write_diagnosis(
-    path: Path, result: DiscDiagnosis, beside: ModelFreeEvidence | None, document: dict[str, Any]
-) -> None:
+def plan_json(plan: Plan | None) -> dict[str, Any] | None:
+    """Recordings that would answer what is open."""
+    if plan is None:
+        return None
+    return {
+        "questions": [
+            {"effect": q.effect.name, "rival": None if q.rival is None else q.rival.name, "now": x}
+            for q, x in zip(plan.questions, plan.now, strict=True)
+        ],
+        "recordings": [
+            {**vars(r.proposal), "text": r.proposal.text, "lasts_s": r.duration, "answers": list(r.answers)}
+            for r in plan.rows
+        ],
+        "meaning": "answers: sigmas between effect and rival; without a rival the standard deviation of the size",
+    }
+
+
+def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, document: dict[str, Any]) -> None:
     """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
-    system = result.system
-    n = len(system.trajectory)
-    variables = {}
+    system, n = result.system, len(result.system.trajectory)
+    variables, axes = dict[str, Variable](), {"coordinate": _axis("coordinate", COORDINATES, "coordinate")}
+    axes["contact_axis"] = _axis("contact_axis", ("n0", "m0", "k"), "axis of the contact frame")
     for name, fit in (("before", result.diagnosis.before), ("after", result.after_fit)):
         residual, predicted = np.full((2, n, 6), np.nan)
         if result.before is not None:
@@ -100,23 +118,25 @@ def write_diagnosis(
         variables[f"residual_{name}"] = Variable(residual, ("time", "pose_component"), "1", what)
         what = f"x, y, z, psi, theta, phi of the model {name}"
         variables[f"q_{name}"] = Variable(predicted, ("time", "coordinate"), "m and rad", what)
-    axes = {"coordinate": Variable(np.array(COORDINATES), ("coordinate",), "1", "coordinate")}
-    axes["contact_axis"] = Variable(np.array(["n0", "m0", "k"]), ("contact_axis",), "1", "axis of the contact frame")
-    if beside is not None and beside.measured is not None:
-        from disctrack.diagnosis.free_runs import force_of
-
+    if beside is not None and beside.force is not None:
         force, sigma = np.full((2, n, 3), np.nan)
-        force[system.rows] = beside.measured.force - force_of(system, result.diagnosis.before)
-        sigma[system.rows] = beside.measured.force_sigma
+        force[system.rows], sigma[system.rows] = beside.force.values, beside.force.sigma
         what = "mass times measured acceleration, minus the force of the model before"
-        variables["missing_force"] = Variable(force, ("time", "contact_axis"), "N", what)
-        variables["missing_force_sigma"] = Variable(sigma, ("time", "contact_axis"), "N", f"standard deviation: {what}")
-    if beside is not None and beside.moment is not None:
-        axes["probe_time"] = Variable(beside.moment.time, ("probe_time",), "s", "middle of a probe of the moment")
-        dims = ("probe_time", "contact_axis")
+        variables |= _with_sigma("missing_force", force, sigma, "time", "N", what)
+    if beside is not None and (missing := beside.moment) is not None:
+        axes["probe_time"] = Variable(missing.time, ("probe_time",), "s", "middle of a probe of the moment")
         what = "contact moment that the model before fails to supply"
-        variables["missing_moment"] = Variable(beside.moment.moment, dims, "N m", what)
-        variables["missing_moment_sigma"] = Variable(beside.moment.sigma, dims, "N m", f"standard deviation: {what}")
+        variables |= _with_sigma("missing_moment", missing.values, missing.sigma, "probe_time", "N m", what)
     effects = {effect["name"]: effect for effect in document["effects"]}
     attributes = {**document, "effects": effects, "diagnosis": json_text(document)}
     write_group(path, GROUP, variables, axes=axes, attributes=attributes)
+
+
+def _axis(name: str, labels: tuple[str, ...], what: str) -> Variable:
+    return Variable(np.array(labels), (name,), "1", what)
+
+
+def _with_sigma(name: str, values: Array, sigma: Array, over: str, unit: str, what: str) -> dict[str, Variable]:
+    dims = (over, "contact_axis")
+    of_sigma = Variable(sigma, dims, unit, f"standard deviation: {what}")
+    return {name: Variable(values, dims, unit, what), f"{name}_sigma": of_sigma}

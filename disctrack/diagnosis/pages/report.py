@@ -1,22 +1,22 @@
 """The report of a diagnosis."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from disctrack.diagnosis.answer import DiscDiagnosis
-from disctrack.diagnosis.errors import HORIZONS, Ahead, Errors
-from disctrack.diagnosis.free_runs import ModelFreeEvidence
+from disctrack.diagnosis.errors import Errors
+from disctrack.diagnosis.evidence import HORIZONS, Evidence
 from disctrack.diagnosis.model_file import NONE, PAPER
-from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.pages.words import accuracy_text, law_text, remarks, verdict_text
+from disctrack.diagnosis.plan import ENOUGH, Plan
 from disctrack.discrepancy.document import explanations_table, tried_table
 from disctrack.discrepancy.search import Found
+from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.report.blocks import Cell, Figures, Items, Listing, Report, Said, Says, Section, Text
-from disctrack.report.numbers import Measured, probability, rounded, score
+from disctrack.report.numbers import Measured, in_unit, measured, probability, rounded, score
 
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
@@ -29,52 +29,51 @@ WORDS = (
     "first part of the recording, continues alone over the rest, the held-out data; its noise floor is the error that "
     "it would have if it lacked nothing."
 )
+PLANNED = (
+    "Computed from the fitted model: each recording is simulated with the same cameras and noise, and added to "
+    "what there is; laws, cameras and dots are shared, the initial state is its own. Another disc has a k_m of its "
+    "own, laws in question keep their coefficient; air drag goes with the density as its law says. More dots and a "
+    "third view count as numbers of the same kind."
+)
+Row = tuple[str, Cell, Cell]
 
 
 def report_of(
     result: DiscDiagnosis,
-    beside: ModelFreeEvidence | None,
+    beside: Evidence | None,
     recording: str,
-    *,
-    findings: Sequence[Says] = (),
-    drawn: "Sequence[Drawn]" = (),
-    files: Sequence[Path] = (),
+    drawn: "Sequence[Drawn]",
+    findings: Sequence[Says],
+    files: Sequence[Path],
 ) -> Report:
-    """All of a diagnosis. findings : of the measurement that was diagnosed;  files : that were written"""
+    """All of a diagnosis. findings : of the measurement that was diagnosed;  files : that were written, page first"""
     d = result.diagnosis
-    by_chance = [] if d.chance is None else [
-        f"Probability that noise alone produces this improvement: p {probability(d.chance.p_value)} "
-        f"({d.chance.tests:.0f} independent candidates)."
-    ]  # fmt: skip
+    effects = [f"{effect_text(f, d)}. {significance_text(f)}. {_alternatives(f)}".rstrip() for f in d.found]
+    if (learned := result.learned) is not None:
+        power, gain = Measured(learned.power, unit="W"), score(learned.gain)
+        effects.append(f"{learned.text}; mean power {power}; chi-square falls by {gain}.")
+    if d.chance is not None:
+        effects.append(
+            f"Probability that noise alone produces this improvement: p {probability(d.chance.p_value)} "
+            f"({d.chance.tests:.0f} independent candidates)."
+        )
     return Report(
         f"{recording}: what does the model lack?",
-        verdict_text(result),
-        accuracy_text(result),
-        [*findings, *map(Said, remarks(result)), *(Said(f"{note[:1].upper()}{note[1:]}.") for note in result.notes)],
+        result.verdict_text,
+        result.accuracy_text,
+        [*findings, *map(Said, [*result.remarks, *(f"{note[:1].upper()}{note[1:]}." for note in result.notes)])],
         blocks=[
             Text(f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}."),
-            Section("Missing effects", [Items([*_effects(result), *by_chance])]),
-            planned.section(result.plan),
+            Section("Missing effects", [Items(effects)]),
+            planned_section(result.plan),
             Section("Explanations that compete", [explanations_table(d)]),
             Section("Before and after" if result.has_more else "The model", _before_after(result, beside)),
             Section("In pictures", [Figures(drawn)]),
             Section("What was tried", [tried_table(d)]),
         ],
         files=files,
-        page=next((file for file in files if file.suffix == ".html"), None),
+        page=files[0],
     )
-
-
-def _effects(result: DiscDiagnosis) -> list[str]:
-    d = result.diagnosis
-    items = [f"{effect_text(f, d)}. {significance_text(f)}. {_alternatives(f)}".rstrip() for f in d.found]
-    if result.learned is not None:
-        learned = result.learned
-        items.append(
-            f"{law_text(learned.law, learned.fit)}; mean power {Measured(learned.power, unit='W')}; "
-            f"chi-square falls by {score(learned.gain)}."
-        )
-    return items
 
 
 def _alternatives(found: Found) -> str:
@@ -85,35 +84,35 @@ def _alternatives(found: Found) -> str:
     )
 
 
-def _before_after(result: DiscDiagnosis, beside: ModelFreeEvidence | None) -> list[Listing | Text]:
+def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listing | Text]:
     before, after = result.before, result.after
     if before is None or after is None or beside is None:
         return []
-    both = (before, after)
-    rows: list[tuple[str, Cell, Cell]] = [
-        ("reduced chi-square of the dots", *_pair(rounded(e.reduced_chi_square, 4) for e in both)),
-        ("reduced chi-square of the poses", *_pair(rounded(e.reduced_chi_square_pose, 4) for e in both)),
-        ("rms of the dots [px]", *_pair(rounded(e.rms_px) for e in both)),
-        ("rms of the position [µm]", *_pair(rounded(e.rms_position_um) for e in both)),
-        ("rms of the nutation angle [mdeg]", *_pair(rounded(e.rms_theta_mdeg) for e in both)),
-        ("Ljung-Box: autocorrelation", *_pair(f"p {probability(e.whiteness.p_value)}" for e in both)),
-        ("highest line of the spectrum", *_pair(map(_line, both))),
-        ("free run over its noise floor", *_pair(rounded(e.ratio_to_floor, 4) for e in both)),
-        *(row for b, a in (*zip(before.ahead, after.ahead, strict=True), *beside.ahead) for row in _ahead(b, a)),
-        *_laws(result),
-        *_energy(result, beside),
-    ]
-    reached = {a.horizon_s for a in after.ahead} | {a.horizon_s for _, a in beside.ahead}
+    shown: dict[str, Callable[[Errors], str]] = {
+        "reduced chi-square of the dots": lambda e: rounded(e.reduced_chi_square, 4),
+        "reduced chi-square of the poses": lambda e: rounded(e.reduced_chi_square_pose, 4),
+        "rms of the dots [px]": lambda e: rounded(e.rms_px),
+        "rms of the position [µm]": lambda e: rounded(e.rms_position_um),
+        "rms of the nutation angle [mdeg]": lambda e: rounded(e.rms_theta_mdeg),
+        "Ljung-Box: autocorrelation": lambda e: f"p {probability(e.whiteness.p_value)}",
+        "highest line of the spectrum": _line,
+        "free run over its noise floor": lambda e: rounded(e.ratio_to_floor, 4),
+    }
+    rows: list[Row] = [(name, of(before), of(after)) for name, of in shown.items()]
+    for runs in beside.ahead:
+        for what in ("theta_deg", "psi_deg", "position_mm"):
+            words = what.replace("theta_deg", "nutation [deg]").replace("psi_deg", "precession [deg]")
+            words = words.replace("position_mm", "position [mm]")
+            noise, horizon = rounded(runs[0][f"noise_{what}"], 2), runs[0]["horizon_s"]
+            name = f"free run {horizon:g} s ahead: {words}, noise {noise}"
+            rows.append((name, rounded(runs[0][what]), rounded(runs[1][what])))
+    rows += [*_laws(result), *_energy(result, beside)]
+    reached = [runs[0]["horizon_s"] for runs in beside.ahead]
     short = [f"{h:g}" for h in HORIZONS if h not in reached]
     remark = f"The recording is too short for free runs of {' and '.join(short)} s." if short else ""
     one = [(name, value) for name, value, _ in rows if not name.startswith("change of ")]
     made = Listing(("", "before", "after"), rows) if result.has_more else Listing(("", "model"), one)
     return [made, Text(WORDS), Text(remark)]
-
-
-def _pair(made: Iterable[str]) -> tuple[str, str]:
-    before, after = made
-    return before, after
 
 
 def _line(errors: Errors) -> str:
@@ -124,21 +123,10 @@ def _line(errors: Errors) -> str:
     return f"{w.peak_frequency[i]:.4g} Hz{near}, p {probability(min(1.0, w.peak_p_value[i] * len(w.peak_p_value)))}"
 
 
-def _ahead(b: Ahead, a: Ahead) -> list[tuple[str, Cell, Cell]]:
-    quantities = (("nutation [deg]", "theta_deg"), ("precession [deg]", "psi_deg"), ("position [mm]", "position_mm"))
-    return [
-        (
-            f"free run {b.horizon_s:g} s ahead: {what}, noise {rounded(getattr(b, f'noise_{name}'), 2)}",
-            *_pair(rounded(getattr(x, name)) for x in (b, a)),
-        )
-        for what, name in quantities
-    ]
-
-
-def _laws(result: DiscDiagnosis) -> list[tuple[str, Cell, Cell]]:
+def _laws(result: DiscDiagnosis) -> list[Row]:
     """Parameters that the model had already, before and after (1 sigma)."""
     first, last = result.diagnosis.before, result.after_fit
-    rows: list[tuple[str, Cell, Cell]] = []
+    rows: list[Row] = []
     for q in first.quantities:
         if q.name in result.system.model.values:
             start, end = (Measured(f.values[q.name], f.sigma(q.name), q.unit) for f in (first, last))
@@ -147,14 +135,52 @@ def _laws(result: DiscDiagnosis) -> list[tuple[str, Cell, Cell]]:
     return rows
 
 
-def _energy(result: DiscDiagnosis, beside: ModelFreeEvidence) -> list[tuple[str, Cell, Cell]]:
+def _energy(result: DiscDiagnosis, beside: Evidence) -> list[Row]:
     """Energy balance of both models, and the loss that the poses alone show."""
-    sides = beside.energy_before, result.energy
-    rows: list[tuple[str, Cell, Cell]] = [
-        (f"energy {name} [mJ]", *_pair("" if name not in side else rounded(1e3 * side[name], 5) for side in sides))
-        for name in {**beside.energy_before, **result.energy}
-    ]
-    if beside.measured is not None:
-        lost = Measured(beside.measured.energy_lost, beside.measured.energy_lost_sigma, "J")
-        rows.append(("energy lost, from the poses alone (± 1 σ)", lost, ""))
+    before, after = (
+        {k: rounded(1e3 * v, 5) for k, v in side.items()} for side in (beside.energy_before, result.energy)
+    )
+    rows: list[Row] = [(f"energy {k} [mJ]", before.get(k, ""), after.get(k, "")) for k in {**before, **after}]
+    if beside.energy_lost is not None:
+        rows.append(("energy lost, from the poses alone (± 1 σ)", beside.energy_lost, ""))
     return rows
+
+
+def planned_section(plan: Plan | None) -> Section:
+    """What is open, the recording that would say most on each question, and all others."""
+    title = "Recordings that would settle what is open"
+    if plan is None or not plan.questions:
+        return Section(title, ())
+    best = [plan.best(i) for i in range(len(plan.questions))]
+    header, said = ["one more recording", "lasts [s]"], []
+    for q, now, proposed in zip(plan.questions, plan.now, best, strict=True):
+        between, unit = f"{q.effect.name} or {q.rival.name}" if q.rival else "", q.effect.quantities[0].unit
+        header.append(f"{between} [sigmas]" if between else in_unit(f"σ of {q.effect.name}", unit))
+        if proposed is None:
+            said.append(f"For {between or f'the size of {q.effect.name}'} no recording that was tried can be made.")
+            continue
+        i, text = len(said), proposed.proposal.text
+        if not between:
+            limit, at_present = _limit(proposed.answers[i], unit), _limit(now, unit)
+            said.append(
+                f"The size of {q.effect.name} is known to {at_present} (95 %), and would be to {limit}: {text}."
+            )
+        elif proposed.answers[i] < ENOUGH:
+            said.append(f"No recording that was tried separates {between.replace(' or ', ' from ')}.")
+        else:
+            sigmas = rounded(proposed.answers[i])
+            said.append(f"To separate {between.replace(' or ', ' from ')}: {text} ({sigmas} sigmas).")
+    different = {r.answers: r for r in reversed(plan.rows)}.values()  # a disc at rest is filmed to no purpose
+    rows = [(r in best, (r.proposal.text, rounded(r.duration, 2), *map(_cell, r.answers))) for r in different]
+    shown = [("none: what there is", "", *map(_cell, plan.now)), *(cells for is_best, cells in rows if is_best)]
+    others = [cells for is_best, cells in rows[::-1] if not is_best]
+    tables = Listing(header, shown), Listing(header, others, folded="All other recordings")
+    return Section(title, [Items(said), Text(PLANNED), *tables])
+
+
+def _cell(value: float) -> str:
+    return rounded(value, 2) if np.isfinite(value) else "not seen"
+
+
+def _limit(sigma: float, unit: str) -> str:
+    return measured(TWO_SIDED * sigma, unit=unit) if np.isfinite(sigma) else "nothing"

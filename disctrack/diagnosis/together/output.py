@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from disctrack.diagnosis.pages import planned
-from disctrack.diagnosis.together.discs import DiscsTogether
+from disctrack.diagnosis.answer import unnamed
+from disctrack.diagnosis.pages.output import plan_json
+from disctrack.diagnosis.pages.report import planned_section
 from disctrack.discrepancy.document import declared_json, document, fit_errors, tried_table
 from disctrack.discrepancy.joint.covariates import Hypothesis, alike
-from disctrack.discrepancy.joint.sharing import EACH
-from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording
+from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Quantity
 from disctrack.discrepancy.words import effect_text, significance_text
@@ -26,13 +25,16 @@ from disctrack.report.palette import AMBER, BLUE, MUTED
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
-SHOWN = 12  # effects whose standard deviations are tabled by number of recordings; all are in the JSON
+SHOWN = 12  # laws that are drawn; all are in the JSON
 NAMED = 8  # recordings that are named on an axis; more are counted
-UNSEEN = 1e3  # times its typical size: an effect whose standard deviation is larger is not seen at all
-AIR = "air"
+MANY = (
+    "Standard deviation of an effect's size from the first so many recordings, once initial states, laws, calibration "
+    "and dots have taken their share. It falls with the root of their number until what they have in common, "
+    "calibration or dots, sets the limit. What was not found is smaller than the last column says."
+)
 
 
-def verdict_text(answer: DiscsTogether) -> str:
+def verdict_text(answer: TogetherDiagnosis) -> str:
     """What is missing in all of them."""
     d, n, left_out = answer.diagnosis, len(answer.used), [r for r in answer.recordings if r.reason]
     of_all = f"{n} recordings together" + (f" ({len(left_out)} left out)" if left_out else "")
@@ -41,15 +43,11 @@ def verdict_text(answer: DiscsTogether) -> str:
         return f"{of_all}: no answer, {d.reason}."
     if d.verdict == "nothing missing":
         return f"{of_all}: nothing is missing."
-    if d.verdict == "found":
-        return f"{of_all}. Missing in the model: {effects}."
-    if effects:
-        return f"{of_all}. Something is missing that the catalogue does not name; nearest is {effects}."
-    return f"{of_all}. Something is missing that no effect of the catalogue describes."
+    return f"{of_all}. {f'Missing in the model: {effects}.' if d.verdict == 'found' else unnamed(effects)}"
 
 
-def accuracy_text(answer: DiscsTogether) -> str:
-    """What is left, and who does not fit the others."""
+def accuracy_text(answer: TogetherDiagnosis) -> str:
+    """What is left."""
     d = answer.diagnosis
     if d.held_out_after is None:
         return ""
@@ -58,24 +56,14 @@ def accuracy_text(answer: DiscsTogether) -> str:
     return f"Residuals: {after} of the expected variance{fell}."
 
 
-def misfits_text(answer: DiscsTogether) -> str:
+def misfits_text(answer: TogetherDiagnosis) -> str:
     """Recordings that do not fit the others; empty where all do."""
     apart = [r.name for r in answer.recordings if r.reason.startswith("does")]
     return f"{', '.join(apart)} {'does' if len(apart) == 1 else 'do'} not fit the others." if apart else ""
 
 
-def sentence(answer: DiscsTogether) -> str:
-    """The answer in one or a few sentences."""
-    texts = verdict_text(answer), accuracy_text(answer), misfits_text(answer)
-    return " ".join(text for text in texts if text)
-
-
 def _free(d: Diagnosis) -> list[Quantity]:
     return [q for q in d.after.quantities if not np.isfinite(q.prior_sigma)]
-
-
-def _law(d: Diagnosis, q: Quantity) -> Measured:
-    return Measured(d.after.values[q.name], d.after.sigma(q.name), q.unit)
 
 
 def _dependence(x: Dependence) -> str:
@@ -91,31 +79,27 @@ def _dependence(x: Dependence) -> str:
     return text + (f"; rejected: {'; '.join(refused)}" if refused else "")
 
 
-def _unit(number: str, x: Dependence) -> str:
-    return x.unit if number.startswith("constant") else "1"
-
-
 def _exponents(h: Hypothesis) -> str:
-    exponents = {k: vs for k, vs in h.numbers.items() if not k.startswith("constant")}
-    said = ", ".join(f"{k} {Measured(*vs)}" for k, vs in exponents.items())
-    return f" ({said})" if said else ""
+    said = [f"{k} {Measured(*vs)}" for k, vs in h.numbers.items() if not k.startswith("constant")]
+    return f" ({', '.join(said)})" if said else ""
 
 
-def as_json(answer: DiscsTogether) -> dict[str, Any]:
+def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
     """The keys of diagnosis.json as far as they apply; and recordings, bounds, dependences."""
     d = answer.diagnosis
     sides = {
         key: fit_errors(fit, held) | {"parameters": declared_json(fit)}
         for key, fit, held in (("before", d.before, d.held_out_before), ("after", d.after, d.held_out_after))
     }
-    found = document(d, "shared by all recordings", sentence(answer)) | {
+    texts = verdict_text(answer), accuracy_text(answer), misfits_text(answer)
+    found = document(d, "shared by all recordings", " ".join(text for text in texts if text)) | {
         **sides,
         "notes": list(answer.notes),
         "unusable": list(answer.unusable),
         "recordings": [_recording_json(r) for r in answer.recordings],
         "bounds": [_bound_json(b) for b in answer.bounds],
         "dependences": [_dependence_json(x) for x in answer.dependences],
-        "plan": planned.as_json(answer.plan),
+        "plan": plan_json(answer.plan),
     }
     return dict(plain(found))
 
@@ -141,20 +125,21 @@ def _recording_json(r: OfRecording) -> dict[str, Any]:
 
 
 def _bound_json(b: Bound) -> dict[str, Any]:
-    c, by_number = b.candidate, np.array(list(b.by_number.values()))
-    numbers = [
-        {"name": q.name, "unit": q.unit, "value": value, "sigma": sigma,
-         "sigma_by_number_of_recordings": dict(zip(b.by_number, sigmas, strict=True))}
-        for q, value, sigma, sigmas in zip(c.quantities, b.values, b.sigma, by_number.T, strict=True)
-    ]  # fmt: skip
+    c, numbers = b.candidate, []
+    for i, q in enumerate(c.quantities):
+        by_number = {k: sigmas[i] for k, sigmas in b.by_number.items()}
+        known = {"value": b.values[i], "sigma": b.sigma[i], "sigma_by_number_of_recordings": by_number}
+        numbers.append({"name": q.name, "unit": q.unit, **known})
     return {"candidate": c.name, "kind": c.kind, "title": c.title, "parameters": numbers, "upper_limit_95": b.upper}
 
 
-def report_of(answer: DiscsTogether, drawn: Sequence[Drawn] = (), files: Sequence[Path] = ()) -> Report:
-    """All of the answer."""
+def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence[Path]) -> Report:
+    """All of the answer. files : that were written, page first"""
     d = answer.diagnosis
     effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
+    laws = [(q.name, Measured(d.after.values[q.name], d.after.sigma(q.name), q.unit)) for q in _free(d)]
     tables = [table for x in answer.dependences for table in _dependence_tables(x)]
+    dependences = [Items([_dependence(x) for x in answer.dependences]), *tables]
     return Report(
         "Many recordings: what does the model lack?",
         verdict_text(answer),
@@ -163,35 +148,26 @@ def report_of(answer: DiscsTogether, drawn: Sequence[Drawn] = (), files: Sequenc
         blocks=[
             Text(f"Verdict: {d.verdict}, because {d.reason}."),
             Section("Missing effects", [Items(effects)]),
-            Section(
-                "Laws, all recordings together (± 1 σ)",
-                [Facts([(q.name, _law(d, q)) for q in _free(d)]), Figures(drawn)],
-            ),
-            Section(
-                "How the laws depend on what was declared",
-                [Items([_dependence(x) for x in answer.dependences]), *tables],
-            ),
+            Section("Laws, all recordings together (± 1 σ)", [Facts(laws), Figures(drawn)]),
+            Section("How the laws depend on what was declared", dependences),
             Section("Each recording against the others", [_recordings(answer)]),
-            Section("What many recordings bring", _by_number(answer)),
-            planned.section(answer.plan),
+            Section("What many recordings bring", [Text(MANY), _by_number(answer)]),
+            planned_section(answer.plan),
             Section("What was tried", [tried_table(d)]),
         ],
         files=files,
-        page=next((file for file in files if file.suffix == ".html"), None),
+        page=files[0],
     )
 
 
 def _dependence_tables(x: Dependence) -> list[Listing]:
-    rows = [
-        (
-            h.text,
-            ", ".join(f"{k} {Measured(*vs, _unit(k, x))}" for k, vs in h.numbers.items()),
-            f"{rounded(h.chi_square)} / {h.degrees}",
-            rounded(h.p_value, 2) if h.degrees > 0 else "",
-            "holds" if h.holds else "rejected",
-        )
-        for h in x.hypotheses
-    ]
+    rows = []
+    for h in x.hypotheses:
+        units = {k: x.unit if k.startswith("constant") else "1" for k in h.numbers}
+        numbers = ", ".join(f"{k} {Measured(*vs, units[k])}" for k, vs in h.numbers.items())
+        p = rounded(h.p_value, 2) if h.degrees > 0 else ""
+        holds = "holds" if h.holds else "rejected"
+        rows.append((h.text, numbers, f"{rounded(h.chi_square)} / {h.degrees}", p, holds))
     header = ("hypothesis", "numbers", "chi-square / degrees", "p", "")
     return [
         Listing((x.quantity, "value (± 1 σ)"), [(g, Measured(*vs, x.unit)) for g, vs in x.groups.items()]),
@@ -199,97 +175,49 @@ def _dependence_tables(x: Dependence) -> list[Listing]:
     ]
 
 
-def _recordings(answer: DiscsTogether) -> Listing:
+def _recordings(answer: TogetherDiagnosis) -> Listing:
     read = [r for r in answer.recordings if r.labels]
     kinds = [k for k in ("disc", "surface", "rig", "air") if len({r.labels[k] for r in read}) > 1]
-    rows, classes = [], []
+    rows = []
     for r in answer.recordings:
-        cells = [r.name, *(r.labels.get(k, "") for k in kinds)]
-        if r.fits_in is None or r.alone is None:
-            cells += ["", "", "", r.reason]
-        else:
-            f = r.fits_in
-            cells += [
-                rounded(f.chi_square / max(r.alone.degrees, 1), 4),
-                rounded(r.alone.chi_square / max(r.alone.degrees, 1), 4),
-                f"{rounded(f.statistic)} / {f.degrees} (p {probability(f.p_value)})",
-                "",
-            ]
-        rows.append(cells)
-        classes.append("failed" if r.reason else "")
+        cells = ["", "", "", r.reason]
+        if r.fits_in is not None and r.alone is not None:
+            f, degrees = r.fits_in, max(r.alone.degrees, 1)
+            cells = [rounded(chi_square / degrees, 4) for chi_square in (f.chi_square, r.alone.chi_square)]
+            cells += [f"{rounded(f.statistic)} / {f.degrees} (p {probability(f.p_value)})", ""]
+        rows.append([r.name, *(r.labels.get(k, "") for k in kinds), *cells])
     header = ["recording", *kinds, "chi-square, shared", "its own", "difference / degrees", ""]
     caption = "Chi-square per datum with the shared quantities, and with values of its own; their difference"
-    return Listing(header, rows, caption, classes=[c or "ok" for c in classes])
+    return Listing(header, rows, caption, classes=["failed" if r.reason else "ok" for r in answer.recordings])
 
 
-def _by_number(answer: DiscsTogether) -> list[Text | Listing]:
-    shown = _of_interest(answer)
-    numbers = sorted({k for b in shown for k in b.by_number})
+def _by_number(answer: TogetherDiagnosis) -> Listing:
+    numbers = sorted({k for b in answer.bounds for k in b.by_number})
     rows = []
-    for b in shown:
+    for b in answer.bounds:
         for i, q in enumerate(b.candidate.quantities):
-            sigma = [rounded(x, 2) if np.isfinite(x := float(b.by_number[k][i])) else "not seen" for k in numbers]
-            rows.append(["" if i else _short(b.candidate.title), in_unit(q.name, q.unit), *sigma, *_in_all(b, i, "1")])
+            sigmas = [float(b.by_number[k][i]) for k in numbers]
+            seen = [rounded(sigma, 2) if np.isfinite(sigma) else "not seen" for sigma in sigmas]
+            value = measured(float(b.values[i]), float(b.sigma[i])) if np.isfinite(b.sigma[i]) else "not seen"
+            most = "" if b.upper is None else measured(b.upper)
+            rows.append(["" if i else b.candidate.title, in_unit(q.name, q.unit), *seen, value, most])
     of = [f"{k}" if k > 1 else "σ from 1 recording" for k in numbers]
     header = ["effect", "number", *of, "all together (± 1 σ)", "at most (95 %)"]
-    said = (
-        "Standard deviation of an effect's size from the first so many recordings, once initial states, laws, "
-        "calibration and dots have taken their share. It falls with the root of their number until what they have in "
-        "common, calibration or dots, sets the limit. What was not found is smaller than the last column says."
-    )
-    others = [
-        ["" if i else b.candidate.title, q.name, *_in_all(b, i, q.unit)]
-        for b in answer.bounds
-        if b not in shown
-        for i, q in enumerate(b.candidate.quantities)
-    ]
-    rest = Listing(("effect", "number", *header[-2:]), others, folded="All other effects")
-    return [Text(said), Listing(header, rows), rest]
+    return Listing(header, rows, folded="All effects")
 
 
-def _short(title: str) -> str:
-    """Without the formula."""
-    return re.split(r", (?=\S+ (?:=|<=) )", title)[0]
-
-
-def _in_all(b: Bound, i: int, unit: str) -> list[str]:
-    """Size of its i-th number from all recordings, and the upper limit of a single one."""
-    value = measured(float(b.values[i]), float(b.sigma[i]), unit) if np.isfinite(b.sigma[i]) else "not seen"
-    return [value, "" if b.upper is None else measured(b.upper, unit=unit)]
-
-
-def _of_interest(answer: DiscsTogether) -> list[Bound]:
-    """What was found, and the effects that one recording sees worst for their usual size: those of the air first."""
-    found = {f.candidate.name for f in answer.diagnosis.found}
-
-    def rank(b: Bound) -> tuple[int, float]:
-        q = b.candidate.quantities[0]
-        first = min(b.by_number)
-        sigma = float(b.by_number[first][0])
-        share = sigma / q.typical if np.isfinite(q.typical) and np.isfinite(sigma) else 0.0
-        return (0 if b.candidate.name in found else 1 if AIR in q.belongs_to else 2, -share)
-
-    def seen(b: Bound) -> bool:
-        sigma, typical = b.by_number[max(b.by_number)][0], b.candidate.quantities[0].typical
-        return bool(np.isfinite(sigma)) and sigma <= UNSEEN * typical
-
-    usable = [b for b in answer.bounds if seen(b) and not (b.candidate.name.endswith(f"({EACH})") and rank(b)[0])]
-    return sorted(usable, key=rank)[:SHOWN]
-
-
-def figures(answer: DiscsTogether) -> tuple[Drawn, ...]:
+def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
     """Every shared law: what each recording says alone, and what all say together."""
     from matplotlib.ticker import MaxNLocator  # wanted on pages only
 
     from disctrack.report.figures import Drawn, panels
 
     sharing, after = answer.system.sharing, answer.diagnosis.after
-    alone = [r.alone for r in answer.recordings if not r.reason]
-    names = [r.name for r in answer.recordings if not r.reason]
+    used = [r for r in answer.recordings if not r.reason]
     drawn = []
     for number, q in enumerate(_free(answer.diagnosis)[:SHOWN], start=1):
         points = []
-        for i, a in enumerate(alone):
+        for i, a in enumerate(r.alone for r in used):
             for local in sharing.local_names(i, [q.name]):
                 sigma = 0.0 if a is None else a.sigmas.get(local, 0.0) * a.inflation.get(local, 1.0)
                 if a is not None and a.converged and np.isfinite(sigma) and sigma > 0:
@@ -298,13 +226,12 @@ def figures(answer: DiscsTogether) -> tuple[Drawn, ...]:
             continue
         figure, (axes,) = panels(9.5, 2.6)
         x, y, s = (np.array(c) for c in zip(*points, strict=True))
-        of_group = x if len(names) > NAMED else np.arange(len(x))
         value, sigma = after.values[q.name], after.sigma(q.name)
         axes.axhspan(value - 2 * sigma, value + 2 * sigma, color=AMBER, alpha=0.35, lw=0)
         axes.axhline(value, color=AMBER, lw=1)
-        axes.errorbar(of_group, y, s, fmt="o", ms=3, lw=1, color=BLUE, ecolor=MUTED)
-        if len(names) <= NAMED:
-            axes.set_xticks(of_group, [names[i] for i in x])
+        axes.errorbar(x, y, s, fmt="o", ms=3, lw=1, color=BLUE, ecolor=MUTED)
+        if len(used) <= NAMED:
+            axes.set_xticks(x, [used[i].name for i in x])
         else:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlabel("recording, from 0")

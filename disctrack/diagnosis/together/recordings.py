@@ -1,20 +1,20 @@
-"""Recordings of the rolling disc as members of a joint diagnosis."""
+"""Recordings of the rolling disc diagnosed together, and which further one would settle what they leave open."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
 from disctrack.analyse.declaration import contradictions, density
-from disctrack.diagnosis.declared_dots import with_declared_dots
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import find_large
-from disctrack.diagnosis.model_file import PAPER, Declared, declared_model
-from disctrack.diagnosis.plan import Plan, Question, plan
-from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.model_file import PAPER, declared_model
+from disctrack.diagnosis.plan import OPEN, Plan, Question, Say, plan
+from disctrack.diagnosis.recorded import Recorded
 from disctrack.diagnosis.systematic import (
     Systematic,
     find_systematic,
@@ -22,63 +22,97 @@ from disctrack.diagnosis.systematic import (
     smooth_field,
     with_noise,
 )
-from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.reduction import Reduced, Reduction
 from disctrack.discrepancy.joint.sharing import Member
-from disctrack.discrepancy.joint.together import Alone
+from disctrack.discrepancy.joint.together import Alone, TogetherDiagnosis, answer_together
 from disctrack.discrepancy.noise import THIRD, inflation
-from disctrack.discrepancy.system import Quantity, Values
+from disctrack.discrepancy.search import Settings
+from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError, DiscTrackError
+from disctrack.findings import Finding
 from disctrack.trajectory import MarkerStatus, Trajectory
-from disctrack.trajectory.file import read_details, read_provenance, read_trajectory
 
 SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
 SEEN_PLACES = 60  # frames of a recording whose dots tell where the lenses' fields are needed
+Item = tuple[Recorded, Mapping[str, str], str]  # what a process needs to know: a recording, its labels, the model
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """A measured trajectory with what was declared beside it."""
+def diagnose_together(
+    recordings: Sequence[Recorded],
+    model: str = PAPER,
+    settings: Settings | None = None,
+    processes: int = 1,
+    progress: Callable[[str], None] = lambda text: None,
+    settle: bool = False,
+    unread: Mapping[str, str] | None = None,
+) -> TogetherDiagnosis:
+    """What does the model lack, of all recordings together?
 
-    name: str
-    trajectory: Trajectory
-    surface: str = ""
-    disc: str = ""  # name of the disc, where sizes and mass do not tell it from others
+    model : as `diagnose`
+    unread : further recordings that are reported as left out, and why
+    processes : among which the recordings are dealt out; the answer does not depend on their number
+    settle : also compute which further recording would settle what is left open
+    Raises AnalysisError where fewer than two recordings can be used.
+    """
+    labels = labels_of(recordings)
+    items = [(recorded, label, model) for recorded, label in zip(recordings, labels, strict=True)]
+    described = [(recorded.name, label) for recorded, label, _ in items]
+    progress(f"{len(items)} recordings, each alone")
+    with Crew(build, items, processes) as crew:
+        answer = answer_together(crew, described, in_common, settings, progress, unread or {})
+        return replace(answer, plan=_plan(answer, crew)) if settle else answer
 
 
-def read_recorded(path: Path) -> Recorded:
-    """From a trajectory file. Raises TrajectoryFileError."""
-    provenance = read_provenance(path)
-    declared = provenance.settings.get("recording", {})
-    return Recorded(
-        provenance.recording,
-        with_declared_dots(read_trajectory(path), read_details(path)),
-        str(declared.get("surface", "")),
-        str(declared.get("disc", {}).get("name", "")),
-    )
-
-
-def rig_key(trajectory: Trajectory) -> bytes:
-    """Equal for recordings that were calibrated together."""
-    rig = trajectory.rig
-    cameras = [(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in rig.cameras]
-    parts = [np.ravel(cameras), rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance]
-    return b"".join(np.ascontiguousarray(np.ravel(part), float).tobytes() for part in parts)
+def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
+    """Recordings beside all these, with disc, surface and cameras of the longest of them."""
+    system, diagnosis = answer.system, answer.diagnosis
+    sharing, after = system.sharing, diagnosis.after
+    longest = int(np.argmax(system.weights))
+    local = {c.name for c in sharing.members[longest].candidates}
+    open_sizes = [b for b in answer.bounds if b.upper is not None and b.candidate.kind == "motion"]
+    open_sizes.sort(key=lambda b: -float(b.sigma[0]) / b.candidate.quantities[0].typical)
+    questions = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
+    questions += [Question(b.candidate) for b in open_sizes]
+    questions = [q for q in questions if {c.name for c in (q.effect, q.rival) if c is not None} <= local][:OPEN]
+    if not questions:
+        return None
+    tested = [q for x in questions for c in (x.effect, x.rival) if c is not None for q in c.quantities]
+    everything = {q.name: q for q in (*tested, *after.quantities)}
+    names = {there: shared for there, shared in sharing.shared_names(longest).items() if shared in everything}
+    others = [n for n in everything if n not in set(names.values())]
+    values = {n: q.null for n, q in everything.items()} | after.values
+    _, derivative = system.linearise(values, [*others, *names.values()])
+    rows = derivative.reshape(-1, derivative.shape[-1])
+    priors = np.zeros((len(others), rows.shape[1]))
+    priors[:, : len(others)] = np.diag([1.0 / everything[n].prior_sigma for n in others])
+    R = triangle(np.concatenate([rows, priors]))
+    said = tuple(names), R[len(others) :, len(others) :]
+    extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
+    found = crew.ask(longest, "planned", sharing.local_values(longest, after.values), extra, questions, said)
+    return found if isinstance(found, Plan) else None
 
 
 def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
     """Disc, surface, rig and air of every recording, in words that tell them apart."""
-    rigs = {key: i + 1 for i, key in enumerate(dict.fromkeys(rig_key(r.trajectory) for r in recordings))}
-    return [
-        {
-            "disc": r.disc or _disc_words(r.trajectory.disc),
-            "surface": r.surface,
-            "rig": f"rig {rigs[rig_key(r.trajectory)]}",
-            "air": f"{_density(r.trajectory):g} kg/m^3",
-        }
-        for r in recordings
-    ]
+    keys = [_rig_key(r.trajectory) for r in recordings]
+    rigs = {key: i + 1 for i, key in enumerate(dict.fromkeys(keys))}
+    found = []
+    for r, key in zip(recordings, keys, strict=True):
+        disc = r.trajectory.disc
+        sizes = f"{2e3 * disc.radius:g} x {2e3 * disc.half_thickness:g} mm, {1e3 * disc.mass:g} g"
+        labels = {"disc": r.disc or sizes, "surface": r.surface, "rig": f"rig {rigs[key]}"}
+        found.append(labels | {"air": f"{_density(r.trajectory):g} kg/m^3"})
+    return found
+
+
+def _rig_key(trajectory: Trajectory) -> bytes:
+    """Equal for recordings that were calibrated together."""
+    rig = trajectory.rig
+    cameras = np.array([(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in rig.cameras])
+    parts = [cameras, rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance]
+    return np.concatenate([np.ravel(part) for part in parts]).tobytes()
 
 
 def _density(trajectory: Trajectory) -> float:
@@ -86,63 +120,25 @@ def _density(trajectory: Trajectory) -> float:
     return float(f"{trajectory.air_density:.3g}")
 
 
-def _disc_words(disc: Disc) -> str:
-    return f"{2e3 * disc.radius:g} x {2e3 * disc.half_thickness:g} mm, {1e3 * disc.mass:g} g"
-
-
-@dataclass(frozen=True)
-class Item:
-    """What a process needs to know of one recording."""
-
-    recorded: Recorded
-    labels: Mapping[str, str] = field(default_factory=dict)
-    model: str = PAPER
-
-
-@dataclass(frozen=True)
-class Say:
-    """What all recordings say of some quantities, whatever the others are: rows of a least-squares problem."""
-
-    names: tuple[str, ...]
-    rows: Array  # (m, k)
-
-    def __call__(self, names: Sequence[str]) -> Array:
-        """(m, names) rows with columns for these; zero for those that nothing is known of."""
-        column = {n: j for j, n in enumerate(self.names)}
-        found = np.zeros((len(self.rows), len(names)))
-        for j, name in enumerate(names):
-            if name in column:
-                found[:, j] = self.rows[:, column[name]]
-        return found
-
-
 class DiscMember:
     """One recording of the disc: prepared, fitted alone, and then asked for what it says of the shared quantities."""
 
     def __init__(self, item: Item) -> None:
         """Raises AnalysisError where it cannot be fitted with the others."""
-        recorded = item.recorded
-        self.item = item
-        as_tracked = recorded.trajectory
-        self.noise = _noise(as_tracked)
-        trajectory = with_noise(as_tracked, self.noise)  # recordings are weighed by it
-        self.declared: Declared = declared_model(trajectory, item.model)
-        self.stretch: Stretch = free_stretch(trajectory)
-        self.trajectory = trajectory
-        system = DiscSystem(trajectory, self.declared.model, stretch=self.stretch, known=self.declared.faults)
-        systematic = find_systematic(system, self.noise)
-        assumed = find_large(as_tracked, self.declared.model, systematic, self.declared.faults)
+        recorded, self.labels, model = item
+        self.name, as_tracked = recorded.name, recorded.trajectory
+        trajectory = with_noise(as_tracked, _noise(as_tracked))  # recordings are weighed by it
+        declared = declared_model(trajectory, model)
+        self.system = DiscSystem(trajectory, declared.model, known=declared.faults)
+        systematic = find_systematic(self.system)
+        assumed = find_large(as_tracked, declared.model, systematic, declared.faults)
         if assumed is not None:
             names = ", ".join(c.title for c in assumed.candidates)
             raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
-        self.system = system
         self._prepare(systematic)
 
     def _prepare(self, systematic: Systematic) -> None:
-        self.systematic = systematic
-        if systematic != self.system.systematic:
-            self.system = self.system.again(systematic=systematic)
-        system = self.system
+        self.system = system = self.system.again(systematic=systematic)
         self.base = fit(system, system.base, system.start())
         if not self.base.converged:
             raise AnalysisError(
@@ -156,11 +152,11 @@ class DiscMember:
         """What the others need of it: itself as a member, its systematic errors, and places of dots per camera [px]."""
         rows = np.unique(np.linspace(0, len(self.system.time) - 1, SEEN_PLACES).astype(int))
         used, places = self.system.used[rows], self.system.observed[rows]
-        return self.member, self.systematic, [places[:, c][used[:, c]] for c in range(2)]
+        return self.member, self.system.systematic, [places[:, c][used[:, c]] for c in range(2)]
 
     def with_common(self, systematic: Systematic) -> Member:
         """The member with systematic errors that it has in common with others."""
-        if systematic != self.systematic:
+        if systematic != self.system.systematic:
             self._prepare(systematic)
         return self.member
 
@@ -171,18 +167,14 @@ class DiscMember:
 
     def reduce(self, values: Values, names: Sequence[str]) -> Reduced | None:
         """What it says of shared quantities."""
-        return self._reduction.reduce(self._with_faults(values), names)
-
-    def _with_faults(self, values: Values) -> dict[str, float]:
-        return {**self.declared.faults, **values}
+        return self._reduction.reduce({**self.system.known, **values}, names)
 
     def alone(self, values: Values, names: Sequence[str]) -> Alone:
         """The recording fitted alone with these of its candidates' quantities free, from the shared solution on."""
         system = self.system
         known = {q.name: q for c in system.candidates for q in c.quantities}
         extra = [known[n] for n in names if n in known]
-        start = {**self.base.values, **self._reduction.own_values(values), **self._with_faults(values)}
-        found = fit(system, (*system.base, *extra), start)
+        found = fit(system, (*system.base, *extra), self._everything(values))
         factors = dict(zip(found.names, inflation(system, found), strict=True))
         kept = [q.name for q in found.quantities if q.belongs_to and not np.isfinite(q.prior_sigma)]
         return Alone(
@@ -201,41 +193,34 @@ class DiscMember:
         """
         known = {q.name: q for c in self.system.candidates for q in c.quantities}
         quantities = (*self.system.base, *(known[n] for n in names))
-        everything = {**self.base.values, **self._reduction.own_values(values), **self._with_faults(values)}
         zero = np.zeros((len(quantities),) * 2)
-        fitted = Fit(quantities, everything, zero, 0.0, 0.0, 1, True, 0)
+        fitted = Fit(quantities, self._everything(values), zero, 0.0, 0.0, 1, True, 0)
         return plan(self.system, fitted, questions, said=said)
+
+    def _everything(self, shared: Values) -> dict[str, float]:
+        return {**self.base.values, **self._reduction.own_values(shared), **self.system.known, **shared}
 
     def _member(self) -> Member:
         system, disc = self.system, self.system.disc
-        directions = system.rig_directions
-        links = {
-            f"rig.{i}": {f"rig.common_{j}": float(x) for j, x in enumerate(row)} for i, row in enumerate(directions)
-        }
+        common = [f"rig.common_{j}" for j in range(system.rig_directions.shape[1])]
+        rows = enumerate(system.rig_directions.tolist())
         known = {q.name: q for q in system.base}
-        first = known.get("rig.0")
-        linked: dict[str, Quantity] = {}
-        if first is not None:
-            linked = {f"rig.common_{j}": replace(first, name=f"rig.common_{j}") for j in range(directions.shape[1])}
-        covariates = {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness}
-        covariates["density of the air"] = _density(self.trajectory)
-        start = {n: v for n, v in self.base.values.items() if n in known}
         return Member(
-            self.item.recorded.name,
+            self.name,
             system.base,
             system.candidates,
-            start,
+            {n: v for n, v in self.base.values.items() if n in known},
             int(np.sum(system.weights)),
-            self.item.labels,
-            covariates,
-            links,
-            linked,
+            self.labels,
+            covariates={
+                "mass": disc.mass,
+                "radius": disc.radius,
+                "thickness": 2 * disc.half_thickness,
+                "density of the air": _density(system.trajectory),
+            },
+            links={f"rig.{i}": dict(zip(common, row, strict=True)) for i, row in rows},
+            linked={name: replace(known["rig.0"], name=name) for name in common if "rig.0" in known},
         )
-
-    @property
-    def before(self) -> Fit:
-        """The declared model fitted to this recording alone."""
-        return self.base
 
 
 def _noise(trajectory: Trajectory) -> float:
@@ -258,7 +243,6 @@ def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Sy
         discs = [s for m, s, _ in told if m.labels["disc"] == member.labels["disc"]]
         lens = max((s for s, _ in rigs), key=lambda s: s.lens_px)
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
-        prints = max(s.print_m for s in discs)
         fields: tuple[Any, ...] = ()
         if lens.lens_px:
             # modes are kept down to where a field of ten sigmas of a single dot cannot be seen
@@ -267,26 +251,30 @@ def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Sy
             )
         common.append(
             replace(
-                mine, lens_px=lens.lens_px, lens_length_px=lens.lens_length_px, lens_fields=fields,
-                dot_px=dots.dot_px, dot_length_px=dots.dot_length_px, print_m=prints,
+                mine,
+                lens_px=lens.lens_px,
+                lens_length_px=lens.lens_length_px,
+                lens_fields=fields,
+                dot_px=dots.dot_px,
+                dot_length_px=dots.dot_length_px,
+                print_m=max(s.print_m for s in discs),
             )
-        )  # fmt: skip
+        )
     return common
 
 
 def build(item: Item) -> DiscMember:
     """For a crew. Raises AnalysisError where it cannot be used, with what was declared that may be why."""
-    trajectory = item.recorded.trajectory
+    trajectory = item[0].trajectory
     heavy = density(trajectory.disc)
     if heavy:  # laws in proportion to the load would fit it all the same
         raise AnalysisError(heavy[0].sentence)
     try:
         return DiscMember(item)
     except Exception as error:
-        try:
+        wrong: Sequence[Finding] = ()
+        with suppress(Exception):  # where nothing can be said of it, that is not why it could not be used
             wrong = contradictions(trajectory)
-        except Exception:  # nothing can be said of it, and that is not why it could not be used
-            wrong = ()
         if not wrong:
             raise
         reason = str(error) if isinstance(error, DiscTrackError) else "the rolling model cannot be fitted to it alone"

@@ -2,12 +2,13 @@
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from disctrack.diagnosis.model_file import PAPER
-from disctrack.diagnosis.together.discs import DiscsTogether, diagnose_together
-from disctrack.diagnosis.together.recordings import Recorded, read_recorded
+from disctrack.diagnosis.recorded import Recorded, read_recorded
+from disctrack.diagnosis.together.output import as_json, figures, report_of
+from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
@@ -20,16 +21,6 @@ from disctrack.trajectory.reuse import hash_of, refuse_other, remember, reusable
 FOLDER = "together_diagnosis"
 
 
-@dataclass(frozen=True)
-class TogetherOutcome:
-    """What `run_together` did."""
-
-    result: DiscsTogether | None  # None where an earlier result of the same files was complete
-    files: tuple[Path, ...]
-    summary: Report
-    unusable: tuple[str, ...] = ()  # recordings that could not be read, or not be fitted with the others
-
-
 def run_together(
     paths: Sequence[Path],
     output: Path | None = None,
@@ -40,25 +31,25 @@ def run_together(
     settle: bool = False,
     processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
-) -> TogetherOutcome:
+) -> Report:
     """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
 
     output : folder; without it `together_diagnosis` in the deepest folder that holds all files
     settle : also compute which further recordings would settle what is left open
     Files that cannot be read are left out, and told of.
     reuse : an earlier result that is complete and of the same files, model and version
+    returns : its report, with the page; `data["unusable"]` are recordings that could not be read, or not be fitted
     Raises TrajectoryFileError where there is no such file, AnalysisError, SceneError, ModelError, OutputError.
     """
-    from disctrack.diagnosis.together.output import as_json, figures, report_of
-
     paths = [Path(p) for p in paths]
     for p in paths:
         keep(p)
-    twice = sorted({str(p) for p in paths if sum(p.resolve() == q.resolve() for q in paths) > 1})
-    if twice:
+    whole = [p.resolve() for p in paths]
+    if twice := sorted(str(p) for p, q in zip(paths, whole, strict=True) if whole.count(q) > 1):
         raise AnalysisError(f"{twice[0]}: given more than once. A recording speaks once: name each file once.")
-    folder = Path(output) if output is not None else common_folder(paths) / FOLDER
-    report = folder / "diagnosis.json"
+    common = Path(os.path.commonpath([p.parent for p in whole]))  # the deepest folder that holds all files
+    folder = Path(output) if output is not None else common / FOLDER
+    report, html = folder / "diagnosis.json", folder / "diagnosis.html"
     known = Path(model).read_text(encoding="utf-8") if Path(model).is_file() else model
     progress("reading")
     read, unread = _read(paths)
@@ -66,20 +57,23 @@ def run_together(
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
     made_from = {"model": known, "plan": settle, "files": [read_setup(p).fingerprint for p in read], "unread": unread}
     origin = hash_of(made_from)
-    known_report = reusable(folder, origin) if reuse else None
-    if known_report is not None:
-        return TogetherOutcome(None, (report, folder / "diagnosis.html"), known_report, known_report.data["unusable"])
+    earlier = reusable(folder, origin) if reuse else None
+    if earlier is not None:
+        return earlier
     refuse_other(report, overwrite)
     refuse_input(report)
-    recordings = _told_apart(list(read.values()), list(read))
+    names = [r.name for r in read.values()]
+    recordings = [  # those of one name are called after their files
+        replace(r, name=p.resolve().relative_to(common).as_posix()) if names.count(r.name) > 1 else r
+        for p, r in read.items()
+    ]
     result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle, unread=unread)
-    html = folder / "diagnosis.html"
     document = {"files": [str(p) for p in paths], **as_json(result)}
-    whole = replace(report_of(result, figures(result), (html, report)), data=document)
-    files = write_page(html, whole, ["png"])
+    told = replace(report_of(result, figures(result), (html, report)), data=document)
+    files = write_page(html, told, ["png"])
     write_whole(report, json_file(document))
-    remember(folder, origin, whole, (report, html, *files))
-    return TogetherOutcome(result, (report, html, *files), whole, result.unusable)
+    remember(folder, origin, told, (report, html, *files))
+    return told
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:
@@ -93,18 +87,3 @@ def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:
                 raise
             unread[str(path)] = str(error).removeprefix(f"{path}: ")
     return read, unread
-
-
-def common_folder(paths: Sequence[Path]) -> Path:
-    """The deepest folder that holds all files."""
-    return Path(os.path.commonpath([p.resolve().parent for p in paths]))
-
-
-def _told_apart(recordings: Sequence[Recorded], paths: Sequence[Path]) -> list[Recorded]:
-    """Recordings of one name are called after their files."""
-    names = [r.name for r in recordings]
-    base = common_folder(paths)
-    return [
-        replace(r, name=p.resolve().relative_to(base).as_posix()) if names.count(r.name) > 1 else r
-        for r, p in zip(recordings, paths, strict=True)
-    ]

@@ -92,6 +92,7 @@ class TogetherDiagnosis:
     dependences: tuple[Dependence, ...]
     notes: tuple[str, ...]
     unusable: tuple[str, ...] = ()  # recordings that were left out unheard, as they could not be read or fitted
+    plan: Any = None  # recordings that would settle what is open, where the system's own room knows them
 
     @property
     def used(self) -> tuple[str, ...]:

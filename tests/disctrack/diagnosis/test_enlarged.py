@@ -10,7 +10,7 @@ from calibration.cameras.camera import rotation_from_vector
 from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model, model_toml
 from disctrack.diagnosis.motion import measurement_candidates
-from disctrack.diagnosis.motion_start import first_state
+from disctrack.diagnosis.starts import first_state
 from disctrack.faults.catalogue import setup_of
 from disctrack.faults.dots import predict
 from disctrack.faults.keys import Faults

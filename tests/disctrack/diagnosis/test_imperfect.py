@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import DiscSystem, diagnose
-from disctrack.diagnosis.left_over import LeftOver
+from disctrack.diagnosis.errors import LeftOver
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stretch import at_rest
 from disctrack.diagnosis.systematic import find_systematic, noise_over_stated, with_noise_of_frames
@@ -37,8 +37,8 @@ def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
 
 
 def systematic_of(trajectory):
-    trajectory, noise = with_noise_of_frames(trajectory)
-    return find_systematic(DiscSystem(trajectory, declared_model(trajectory).model), noise)
+    trajectory = with_noise_of_frames(trajectory)
+    return find_systematic(DiscSystem(trajectory, declared_model(trajectory).model))
 
 
 def test_the_noise_is_what_changes_from_frame_to_frame():
@@ -47,7 +47,7 @@ def test_the_noise_is_what_changes_from_frame_to_frame():
     # 300 frames of 18 numbers: 2 %, and 4 % for third differences that share their frames
     assert noise_over_stated(trajectory) * inflated == pytest.approx(1.0, rel=0.08)
     ideal = measured(seed=2, n=200)
-    assert with_noise_of_frames(ideal)[0] is ideal
+    assert with_noise_of_frames(ideal) is ideal
 
 
 def test_a_camera_that_turned_does_not_make_the_motion_look_like_rest():
@@ -57,7 +57,7 @@ def test_a_camera_that_turned_does_not_make_the_motion_look_like_rest():
     assert inflated > 1e4
     measured_rows = np.flatnonzero(trajectory.measured)
     assert at_rest(trajectory, measured_rows).all()
-    assert not at_rest(with_noise_of_frames(trajectory)[0], measured_rows).any()
+    assert not at_rest(with_noise_of_frames(trajectory), measured_rows).any()
 
 
 @pytest.mark.statistical

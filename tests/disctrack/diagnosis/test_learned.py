@@ -61,12 +61,12 @@ def test_the_moment_of_what_was_found_is_the_missing_one():
     tilt = next(c for c in system.candidates if c.name == "table_tilt")
     start = before.values | dict.fromkeys(tilt.names, 0.0)
     after = fit(system, (*before.quantities, *tilt.quantities), start)
-    missing = missing_moment(probe(system, before))
-    added = missing_moment(probe(system, before, after.values), missing.scale)
+    missing, scale = missing_moment(probe(system, before))
+    added, _ = missing_moment(probe(system, before, after.values), scale)
     inner = slice(2, -2)  # nothing but its neighbours holds the first and last bell
-    pull = ((missing.moment - added.moment) / missing.sigma)[inner]
+    pull = ((missing.values - added.values) / missing.sigma)[inner]
     assert np.all(np.mean(pull**2, axis=0) < 2)  # along n0, m0 and k
-    of_all = np.mean((missing.moment / missing.sigma)[inner] ** 2, axis=0)
+    of_all = np.mean((missing.values / missing.sigma)[inner] ** 2, axis=0)
     assert min(of_all[0], of_all[2]) > 3  # there is something to agree on
 
 
@@ -76,14 +76,14 @@ def test_missing_moment_is_the_hidden_one():
     trajectory = hiding("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z", 1e-6, seed=7, n=400)
     system = DiscSystem(trajectory, declared_model(trajectory).model)
     base = fit(system, system.base, system.start())
-    moment = missing_moment(probe(system, base))
+    moment, _ = missing_moment(probe(system, base))
     law = learn(system, base, 1.0)
     system = system.knowing(law)
     values = with_law(system, base, law).values
     truth = moment_about_contact(system, values, simulated(system, values), {law.candidate.effect})
     expected = np.interp(moment.time, system.time, truth[:, 2])
     inner = slice(3, -3)  # at the ends the initial state absorbs a moment
-    error = moment.moment[inner, 2] - expected[inner]
+    error = moment.values[inner, 2] - expected[inner]
     size = np.abs(expected).max()
     # the fitted k_m and initial state take a part of any moment with them: the shape is left, to a tenth
     assert np.sqrt(np.mean((error - error.mean()) ** 2)) < 0.1 * size

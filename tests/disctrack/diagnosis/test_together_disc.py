@@ -9,8 +9,8 @@ import pytest
 from disctrack.cli import main
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.plan import Planner, Proposal
-from disctrack.diagnosis.together.discs import diagnose_together
-from disctrack.diagnosis.together.recordings import Recorded
+from disctrack.diagnosis.recorded import Recorded
+from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles import newton_euler

@@ -83,10 +83,10 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
 def test_a_law_below_a_nutation_is_told_with_the_nutation():
     result = diagnose(recording(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6))
     assert result.diagnosis.verdict == "unexplained"
-    assert result.regimes is not None
-    assert result.regimes.first is not None
+    assert result.holds
+    assert result.holds["first"] is not None
     # the friction sets in over 5 % of the nutation, and must grow beyond the noise
-    assert 2.2 < result.regimes.first.theta_deg < 2.8
+    assert 2.2 < result.holds["first"]["theta_deg"] < 2.8
     assert any("holds until" in note for note in result.notes)
     assert result.learned is not None
     edges = [v for k, v in result.learned.fit.values.items() if ".edge_" in k]
@@ -159,7 +159,7 @@ def test_a_thread_that_twists_is_no_shaken_table():
     assert any("table_shaken" in note for note in result.notes)
     course = result.learned.course
     true = np.stack([np.interp(course.time, made.time, made.moment[:, i]) for i in range(3)], axis=1)
-    assert (np.abs(course.moment - true) < 3 * course.sigma).all()
+    assert (np.abs(course.values - true) < 3 * course.sigma).all()
     assert np.sqrt(np.mean(course.sigma[:, 2] ** 2)) < np.sqrt(np.mean(true[:, 2] ** 2))
 
 
@@ -205,7 +205,7 @@ def test_one_friction_in_another_s_place_competes_with_laws():
     assert any("known effects" in note for note in result.notes)
     course = result.learned.course
     true = np.stack([np.interp(course.time, made.time, made.moment[:, i]) for i in range(3)], axis=1)
-    assert np.mean(np.abs(course.moment - true) < 3 * course.sigma) > 0.85
+    assert np.mean(np.abs(course.values - true) < 3 * course.sigma) > 0.85
 
 
 def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
@@ -227,4 +227,4 @@ def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
     assert any(f"[{beside}] helps the law" in note for note in result.notes)  # it does, by far more than noise
     course = result.learned.course
     truth = np.stack([np.interp(course.time, made.time, made.moment[:, i]) for i in range(3)], axis=1)
-    assert np.mean(np.abs(course.moment - truth) < 3 * course.sigma) > 0.95
+    assert np.mean(np.abs(course.values - truth) < 3 * course.sigma) > 0.95

@@ -1,0 +1,103 @@
+"""What a report shows beside the answer: rates and forces from the poses alone, the missing moment, free runs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.kit.arrays import Array
+from disctrack.analyse.contact import CONTACT, K, contact_quantities
+from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.energy import analyse_energy
+from disctrack.analyse.propagation import RATES, MotionState, propagate, rates
+from disctrack.diagnosis.answer import DiscDiagnosis
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.errors import HALF_WINDOW, Ahead, energy_balance, free_run, simulated
+from disctrack.diagnosis.missing_force import Course, missing_moment, probe
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.held_out import held_out
+from disctrack.errors import AnalysisError
+from disctrack.frames import nodal_axes_world
+from disctrack.report.numbers import Measured
+from disctrack.trajectory import part
+
+HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last frame that the fit has seen
+SHORTEST = 0.05  # [s] of frames from which a longer free run may start
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Beside the answer; None where it cannot be had."""
+
+    psidot: Array | None  # (n,) [rad/s] from the poses alone, NaN where they say nothing
+    energy_lost: Measured | None  # likewise
+    force: Course | None  # [N] from the poses alone, minus that of the model before
+    moment: Course | None  # [N m] that the model before fails to supply
+    moment_of_law: Course | None  # that the effects found add, read in the same way
+    energy_before: dict[str, float]  # [J]
+    ahead: tuple[tuple[Ahead, Ahead], ...]  # of the models before and after: errors of free runs
+
+
+def evidence(result: DiscDiagnosis) -> Evidence:
+    """All that a report shows beside a diagnosis whose base fit converged."""
+    system, before = result.system, result.diagnosis.before
+    moment, of_law = None, None
+    # a fit that fails by whole turns has no linear response to ask for
+    if before.converged and not any(f.candidate.name == "slip_start" for f in result.diagnosis.found):
+        blocks = probe(system, before)
+        added = probe(system, before, result.after_fit.values) if result.has_more else None
+        if blocks is not None:
+            moment, scale = missing_moment(blocks)
+            of_law = None if added is None else missing_moment(added, scale)[0]
+    energy = energy_balance(system, before.values) if before.converged else {}
+    return Evidence(*_measured(system, before), moment, of_law, energy, _ahead(result))
+
+
+def _measured(system: DiscSystem, before: Fit) -> tuple[Array | None, Measured | None, Course | None]:
+    """The rate of precession, the energy lost and the missing force, as accelerations of the poses have them."""
+    psidot, first = [name for name, *_ in RATES].index("psidot"), [name for name, *_ in CONTACT].index("force_n")
+
+    def quantities(state: MotionState) -> Array:
+        contact = contact_quantities(state, system.disc, system.model.gravity)
+        return np.column_stack([rates(state)[:, psidot], contact[:, first : first + 3]])
+
+    try:
+        motion = differentiate(part(system.trajectory, system.rows))
+        energy = analyse_energy(motion)
+    except AnalysisError:
+        return None, None, None
+    found = propagate(motion, quantities)
+    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    missing = Course(system.time, found.value[:, 1:] - force_of(system, before), sigma[:, 1:])
+    lost = Measured(energy.loss, float(np.hypot(energy.loss_sigma, energy.loss_sigma_calibration)), "J")
+    return found.value[:, 0], lost, missing
+
+
+def force_of(system: DiscSystem, fit: Fit) -> Array:
+    """(n, 3) on the centre in the fitted motion along n0, m0, k, gravity taken off [N]; NaN after its end."""
+    motion = simulated(system, fit.values)
+    n0, _, _ = nodal_axes_world(motion.q[:, 3], motion.q[:, 4])
+    total = system.disc.mass * (motion.acceleration_world + system.model.gravity * K)
+    found = np.full((len(system.time), 3), np.nan)
+    for i, axis in enumerate((n0, np.cross(K, n0), K)):
+        found[: len(motion), i] = np.sum(total * axis, axis=1)
+    return found
+
+
+def _ahead(result: DiscDiagnosis) -> tuple[tuple[Ahead, Ahead], ...]:
+    """Errors at the horizons that the part held out reaches, and else after fits that end in time for it."""
+    system, found = result.system, []
+    seen = system.time[system.weights > 0]
+    for horizon in HORIZONS:
+        until, runs = seen[-1] - horizon - HALF_WINDOW, list[Ahead]()
+        for fit, held in (
+            (result.diagnosis.before, result.diagnosis.held_out_before),
+            (result.after_fit, result.after_held_out),
+        ):
+            run = None if held is None else free_run(system, held, horizon)
+            if run is None and until >= seen[0] + SHORTEST:
+                shorter = held_out(system, fit.quantities, fit.values, np.asarray(system.time <= until, bool))
+                run = free_run(system, shorter, horizon)
+            runs += [] if run is None else [run]
+        if len(runs) == 2:
+            found.append((runs[0], runs[1]))
+    return tuple(found)

@@ -1,0 +1,139 @@
+"""Where fits begin: a motion at its first poses, and numbers of an effect's shape that have to be looked for.
+
+An angle on the rim and a frequency of the table have no derivative at an effect's null, and the data are far from
+quadratic in them. So the effect's amounts are fitted to first order at many angles round the rim, or at peaks in the
+spectrum of what is left of the positions, and refits begin where they gain most.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from calibration.kit.arrays import Array
+from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
+from disctrack.diagnosis.stretch import FIRST_WINDOW
+from disctrack.disc import Disc
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.score import cleared, span
+from disctrack.discrepancy.system import Candidate, Values
+from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_rotation
+
+if TYPE_CHECKING:
+    from disctrack.diagnosis.disc_system import DiscSystem
+
+
+STRETCHES = (0.03, 0.08, 0.2, 0.5)  # [s] a linear step from one stretch's fit stays in the next one's basin
+FRICTIONS = (0.03, 1.0)  # coefficients to begin with are sought between these
+ANGLES = 48  # round the rim: 7.5 deg apart, half the width of a flat
+PEAKS = 6  # of the spectrum, padded ...
+PADDED = 8  # ... to this many times the length of the recording, for peaks between its frequencies
+REFITS = 2  # begin at so many of them
+NEAR = 10.0  # [sigma of a number], rms between two motions: micrometres of the centimetres by which they move
+SLOW = 3.0  # periods in the recording that a vibration has at least
+
+
+def first_state(time: Array, q: Array) -> dict[str, float]:
+    """Initial state from poses (n, 6), some of them NaN, by a cubic in time through the first ones.
+
+    A quarter turn of nutation at 12 Hz is a cubic. Returns state.x ... state.omega3, and the centre's velocity as
+    state.v_x, state.v_y, which a rolling disc does not need.
+    """
+    coefficients, (psi, theta, phi) = _cubic(time, q)
+    velocity, omega = coefficients[1, :2], coefficients[1, 3:]
+    rates = [omega @ axis for axis in nodal_axes_world(psi, theta)]
+    names = (*(q.name for q in state_quantities()), *SLIP_VELOCITY)
+    return dict(zip(names, map(float, (*coefficients[0, :2], psi, theta, phi, *rates, *velocity)), strict=True))
+
+
+def first_friction(time: Array, q: Array, gravity: float) -> float:
+    """Horizontal over vertical contact force at the first instant, from the centre's acceleration: mu in slip."""
+    x, y, z = 2 * _cubic(time, q)[0][2, :3]
+    return float(np.clip(np.hypot(x, y) / max(gravity + z, 0.1 * gravity), *FRICTIONS))
+
+
+def first_slip(time: Array, q: Array, disc: Disc) -> float:
+    """Horizontal speed [m/s] of the disc's point at the contact at the first instant; rolling has none."""
+    coefficients, (psi, theta, _) = _cubic(time, q)
+    _, e2, e3 = nodal_axes_world(psi, theta)
+    slip = coefficients[1, :3] + np.cross(coefficients[1, 3:], disc.arm_to_contact(e2, e3))
+    return float(np.hypot(*slip[:2]))
+
+
+def _cubic(time: Array, q: Array) -> tuple[Array, Array]:
+    """Coefficients (4, 6) of the first poses' displacement and turn by powers of time [s], and the first angles."""
+    interval = float(np.median(np.diff(time)))
+    good = np.flatnonzero(np.isfinite(q).all(axis=1) & (time <= time[0] + max(FIRST_WINDOW, 10 * interval)))
+    t, poses = time[good] - time[0], q[good]
+    R = rotation_from_euler(*poses[:, 3:].T)
+    turned = vector_from_rotation(R @ R[0].T)
+    span_ = max(float(t[-1]), interval)
+    terms = np.vander(t / span_, min(4, max(2, len(t) // 3)), increasing=True)
+    coefficients = np.linalg.lstsq(terms, np.column_stack([poses[:, :3], turned]), rcond=None)[0]
+    found = np.zeros((4, 6))
+    found[: len(coefficients)] = coefficients / span_ ** np.arange(len(coefficients))[:, None]
+    return found, poses[0, 3:]
+
+
+def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
+    """Values of state and declared effects from which the fit of the whole recording converges; `known` are kept."""
+    q = system.trajectory.q[system.rows]
+    names = {quantity.name for quantity in system.base}
+    times = system.instants(known)
+    values = dict(known) | {k: v for k, v in first_state(times, q).items() if k in names}
+    laws = model_quantities(system.model)
+    values |= {law.name: system.model.values[law.name] for law in laws}
+    if SLIP in names:
+        values[SLIP] = 1.0 / first_friction(times, q, system.model.gravity)
+    state = tuple(quantity for quantity in system.base if quantity.is_initial or quantity.name == SLIP)
+    for stretch, part in zip(STRETCHES, system.beginnings(), strict=False):
+        # a law of friction shows only over several turns: held until the stretch is long enough
+        moved = state if stretch < 0.1 else (*state, *laws)
+        values = fit(part, moved, values).values
+    return values
+
+
+def sought(system: DiscSystem, candidate: Candidate, values: Values, least: float) -> list[tuple[float, ...]]:
+    """Values of the candidate's shape to begin with, the best first; empty where none has to be looked for.
+
+    least : gain to first order, below which none is worth a refit
+    """
+    if not candidate.sought:
+        return []
+    first, *rest = candidate.shape
+    places = 2 * np.pi * np.arange(ANGLES) / ANGLES if first.unit == "rad" else _frequencies(system, values)
+    residual, derivative = system.linearise(values, [q.name for q in system.base])
+    priors = np.diag([1.0 / q.prior_sigma for q in system.base])
+    basis = span(np.concatenate([derivative.reshape(-1, len(priors)), priors]))
+    r, no_prior = residual.ravel(), np.zeros((len(priors), len(candidate.names)))
+    by_amounts = system.columns_known.get((candidate.name, r.size))
+    # the same for motions so near to each other that a small effect does the same to both
+    if by_amounts is None or float(np.mean((r - by_amounts[0]) ** 2)) >= NEAR**2:
+        null = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values)
+        by_amounts = r, [system.linearise({**null, first.name: float(x)}, candidate.names)[1] for x in places]
+        if first.unit == "rad":  # the same places whatever is left
+            system.columns_known[candidate.name, r.size] = by_amounts
+    gains = []
+    for derivatives in by_amounts[1]:
+        left = cleared(np.concatenate([derivatives.reshape(len(r), -1), no_prior]), basis)[: len(r)]
+        amounts, *_ = np.linalg.lstsq(left, r, rcond=1e-10)
+        inside = all(q.lower <= q.null + a <= q.upper for q, a in zip(candidate.quantities, amounts, strict=True))
+        gains.append(float(r @ r - np.sum((r - left @ amounts) ** 2)) if inside else 0.0)
+    best = np.argsort(gains)[::-1][:REFITS]
+    return [(float(places[i]), *(q.null for q in rest)) for i in best if gains[i] > least]
+
+
+def _frequencies(system: DiscSystem, values: Values) -> Array:
+    """Peaks [Hz] in the spectrum of measured less predicted positions, in units of their noise, and beside them."""
+    difference, sigma = (x[:, :3] for x in system.pose_difference(values))
+    left = np.nan_to_num(difference / sigma)
+    n, rate = len(left), system.rate
+    spectrum = np.abs(np.fft.rfft(left - left.mean(axis=0), PADDED * n, axis=0))
+    power, frequency = np.sum(spectrum**2, axis=1), np.fft.rfftfreq(PADDED * n, 1 / rate)
+    power[frequency < SLOW * rate / n] = 0.0
+    peaks, _ = find_peaks(power)
+    highest = frequency[peaks[np.argsort(power[peaks])[::-1][:PEAKS]]]
+    # noise moves and splits peaks by as much
+    return np.ravel(highest[:, None] + 0.5 * rate / n * np.array([0.0, -1.0, 1.0]))
