@@ -185,7 +185,7 @@ def _along(modes: Array, camera: int, dots: slice, shape: tuple[int, ...]) -> li
     return columns
 
 
-class Evidence:
+class Likelihood:
     """Likelihood of numbers (n,) that are noise of unit variance plus columns (n, k_i) times numbers of unit variance.
 
     Everything is in inner products, so that sizes of the groups of columns are tried without touching the data.
@@ -230,7 +230,7 @@ class Evidence:
 Sizes = dict[str, float]
 
 
-def _best_sizes(evidence: Evidence, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
+def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
     """Sizes of the groups in `grids` that make the data most probable: one after the other, up and down its grid."""
     best, before = evidence.twice_log(sizes), -np.inf
     for _ in range(ROUNDS):
@@ -249,7 +249,9 @@ def _best_sizes(evidence: Evidence, sizes: Sizes, grids: Mapping[str, Array]) ->
     return best, sizes
 
 
-def _with_faults(evidence: Evidence, sizes: Sizes, faults: Mapping[str, float]) -> tuple[float, Sizes, tuple[str, ...]]:
+def _with_faults(
+    evidence: Likelihood, sizes: Sizes, faults: Mapping[str, float]
+) -> tuple[float, Sizes, tuple[str, ...]]:
     """The faults that make the data more probable beside these sizes, one after the other."""
     best, chosen = evidence.twice_log(sizes), tuple[str, ...]()
     while len(chosen) < MOST_FAULTS:
@@ -262,7 +264,7 @@ def _with_faults(evidence: Evidence, sizes: Sizes, faults: Mapping[str, float]) 
 
 
 def _with_amounts(
-    found: Systematic, evidence: Evidence, sizes: Sizes, names: tuple[str, ...], view: StaticView
+    found: Systematic, evidence: Likelihood, sizes: Sizes, names: tuple[str, ...], view: StaticView
 ) -> Systematic:
     """With the faults fitted along, their most probable amounts, and what these do to the dots."""
     amounts: dict[str, float] = {}
@@ -302,12 +304,12 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     start = {"rig": 1.0, "print": DOT_SIGMA} | dict.fromkeys(given, WIDE)
     amounts = dict.fromkeys(faults, 1.0) if beside is None else {}
 
-    alone = Evidence(data, groups)
+    alone = Likelihood(data, groups)
     nothing = alone.twice_log(start)
     value, sizes, chosen = _with_faults(alone, start, amounts)
     best = _with_amounts(Systematic(gain=value - nothing), alone, sizes, (*given, *chosen), view)
     for share in LENS_LENGTHS:
-        evidence = Evidence(
+        evidence = Likelihood(
             data, {**groups, "lens": view.whitened(lens_columns(view.places, view.used, share * extent, size))}
         )
         value, sizes = _best_sizes(evidence, dict(start), grids)
