@@ -11,7 +11,7 @@ from disctrack.recording.declaration import read_recording
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw both sheets; returns the exit code."""
+    """Draw both sheets, and say what to declare of them; returns the exit code."""
     disc, corners, square_mm = MA_2014, (9, 6), 20.0
     if arguments.recording is not None:
         recording = read_recording(arguments.recording)
@@ -28,4 +28,8 @@ def run(arguments: argparse.Namespace) -> int:
     for path, figure in sheets.items():
         print(f"{'sheet':<13} {outputs.relative(write_sheet(path, figure))}")
     print(f"{'':<13} print at 100 %, and measure the bar of 100 mm on each sheet")
+    centres = ", ".join(f"[{1e3 * x:.4f}, {1e3 * y:.4f}]" for x, y, _ in disc.marker_centres_body)
+    print(f"{'declare':<13} [markers] diameter_mm = {1e3 * disc.marker_diameter:g}")
+    print(f"{'':<13} centres_mm = [{centres}]")
+    print(f"{'':<13} [calibration] inner_corners = [{corners[0]}, {corners[1]}], square_mm = {square_mm:g}")
     return DONE

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose
 
 from disctrack import open_pairs
 from disctrack.cli import COMMANDS, main
+from disctrack.disc import MA_2014
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_details, read_trajectory
 
@@ -231,3 +232,9 @@ def test_a_range_that_is_cut_says_so(recording):
     (cut,) = open_pairs(recording, (5, 99)).findings
     assert cut.text == "--frames 5:99 is cut: the recording has the frames 0 to 23"
     assert not open_pairs(recording, (5, 24)).findings
+
+
+def test_print_says_what_to_declare_of_its_sheets(tmp_path, capsys):
+    assert main(["print", "-o", str(tmp_path)]) == 0
+    (centres,) = re.findall(r"centres_mm = (\[\[.*\]\])", capsys.readouterr().out)
+    assert_allclose(json.loads(centres), 1e3 * MA_2014.marker_centres_body[:, :2], atol=1e-4)  # digits that it prints
