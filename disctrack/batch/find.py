@@ -8,8 +8,13 @@ from pathlib import Path
 from disctrack.errors import RecordingError
 from disctrack.files.text import printable
 from disctrack.recording.declaration import FILE_NAME
-from disctrack.recording.readers.base import CINE_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, VIDEO_SUFFIXES
-from disctrack.recording.readers.files import natural_key
+from disctrack.recording.readers.files import (
+    CINE_SUFFIXES,
+    IMAGE_SUFFIXES,
+    MRAW_SUFFIXES,
+    VIDEO_SUFFIXES,
+    natural_key,
+)
 
 RESULTS = "results"  # beside a recording's images
 FOLDER = "batch_results"  # of a batch, for what belongs to no single recording

@@ -12,13 +12,12 @@ from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.brief import Outline
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import MOST_IMAGE, read_regular
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import IMAGE_SUFFIXES, FrameReader, split_member
+from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
-from disctrack.recording.readers.files import file_number, match_files
+from disctrack.recording.readers.files import IMAGE_SUFFIXES, content_of, file_number, match_files, split_member
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
 from disctrack.recording.readers.part import ImagePart, ImageParts, image_parts
 
@@ -73,7 +72,7 @@ class TargetImages(Outline):
                 digest.update(str(part).encode())
             for view in side:
                 if not isinstance(view, FrameView):
-                    digest.update(hashlib.sha256(_content(view)).digest())
+                    digest.update(hashlib.sha256(content_of(view, str(view))).digest())
                 elif view.index == 0:
                     digest.update(view.reader.content_sha256(0, len(side)).encode())
         return digest.hexdigest()
@@ -174,7 +173,10 @@ def calibrate_views(
 
 def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArray:
     """Grey values or colours of a view. Raises RecordingError, which begins with the file or names the frame."""
-    image = view.reader.read(view.index) if isinstance(view, FrameView) else decode(_content(view), str(view))
+    if isinstance(view, FrameView):
+        image: NDArray = view.reader.read(view.index)
+    else:
+        image = decode(content_of(view, str(view)), str(view))
     whole = flat.corrected(image) if flat is not None and flat.fits(image) else image
     if part is None:
         return whole
@@ -182,10 +184,3 @@ def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArr
     if (width, height) != (part.width, part.height) and not part.lies_in(width, height):
         raise RecordingError(f"{view}: {width} x {height} px do not hold the part {part} that [cameras] declares.")
     return part.of(whole)
-
-
-def _content(file: Path) -> bytes:
-    try:
-        return read_regular(file, MOST_IMAGE)
-    except OSError as error:
-        raise RecordingError(f"{file}: cannot be read: {error.strerror}. Copy it again.") from error

@@ -22,10 +22,9 @@ from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
 from disctrack.recording.declaration import FILE_NAME, OPTIONAL
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import FrameReader, split_member
-from disctrack.recording.readers.camera_header import header_of
+from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
-from disctrack.recording.readers.files import match_files
+from disctrack.recording.readers.files import match_files, split_member
 
 
 @dataclass(frozen=True)
@@ -207,7 +206,7 @@ def _length(folder: Path, sequence: Sequence) -> int:
 
 def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, str]:
     for camera, reader in (("left", left), ("right", right)):
-        header = header_of(reader)
+        header = reader.header
         if header is not None:
             return header.frame_rate, f"says {Path(header.file).name}"
         if reader.timestamps is not None and len(reader.timestamps) > 2:

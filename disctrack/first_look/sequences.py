@@ -9,8 +9,8 @@ from pathlib import Path
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, FrameReader
-from disctrack.recording.readers.files import natural_key
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.files import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, natural_key
 
 DEEPEST = 4  # folders below the recording that are looked into
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")

@@ -24,7 +24,7 @@ from disctrack.recording.declaration import Recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
-from disctrack.recording.readers.camera_header import check_headers, header_of, other_exposure
+from disctrack.recording.readers.camera_header import check_headers, other_exposure
 from disctrack.recording.readers.file_numbers import check_same_numbers
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.part import frames_in_parts, image_parts
@@ -54,8 +54,8 @@ class ImagePairs:
 
     def camera_headers(self) -> dict[str, Any]:
         """Under "camera_headers" what the cameras wrote about themselves (exposure, trigger, ...), if anything."""
-        found = {name: header_of(reader) for name, reader in zip(CAMERAS, (self.left, self.right), strict=True)}
-        told = {name: header.as_dict() for name, header in found.items() if header is not None}
+        both = zip(CAMERAS, (self.left.header, self.right.header), strict=True)
+        told = {name: header.as_dict() for name, header in both if header is not None}
         return {"camera_headers": told} if told else {}
 
     def inputs(self) -> dict[str, str]:
@@ -97,9 +97,8 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     headers += other_exposure(left, right, recording.exposure, str(recording.file))
     check_pair(left, right)
     stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)
-    assumed = [doubt for reader in (left, right) for doubt in getattr(reader, "doubts", ())]
     findings = (
-        *of_kind(Kind.READING, Severity.DOUBT, (*assumed, *check_same_numbers(left, right))),
+        *of_kind(Kind.READING, Severity.DOUBT, (*left.doubts, *right.doubts, *check_same_numbers(left, right))),
         *of_kind(Kind.TIME_STAMPS, Severity.DOUBT, stamp_doubts),
         *of_kind(Kind.TIME_STAMPS, Severity.WARNING, stamp_warnings),
         *of_kind(Kind.HEADERS, Severity.WARNING, headers),
@@ -253,7 +252,7 @@ def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, fl
     """Of both cameras [s], None where nobody tells it; and where it is from, to be told."""
     if recording.exposure is not None:
         return (recording.exposure, recording.exposure), ()
-    headers = [header_of(reader) for reader in (pairs.left, pairs.right)]
+    headers = pairs.left.header, pairs.right.header
     left, right = (None if header is None else header.exposure for header in headers)
     if left is None or right is None:
         return None, ()

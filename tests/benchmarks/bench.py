@@ -49,7 +49,6 @@ from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vec
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import ONE_THREAD
-from disctrack.recording.readers.file_numbers import NumberedFiles
 from disctrack.recording.readers.images import ImageSequence
 from disctrack.track.in_memory import measure_pairs
 from disctrack.track.measurement import ImagePairs, measure, open_pairs
@@ -334,7 +333,7 @@ class Played:
     def compressed(self, n: int) -> ImagePairs:
         """The files, opened anew, so that nothing is known of them yet."""
         left, right = (
-            ImageSequence(NumberedFiles(tuple(map(Path, names)), 0, 1), camera, reader.image_size, reader.dtype)
+            ImageSequence(files=list(map(Path, names)), camera=camera, image_size=reader.image_size, dtype=reader.dtype)
             for names, camera, reader in zip(
                 self.files(n), ("left", "right"), (self.pairs.left, self.pairs.right), strict=True
             )
@@ -345,7 +344,7 @@ class Played:
 class MappedFrames:
     """Frames of one camera in a file that is mapped into memory; see disctrack.recording.readers.FrameReader."""
 
-    timestamps, notes, random_access = None, (), True
+    timestamps, notes, doubts, header, random_access = None, (), (), None, True
 
     def __init__(self, file: Path, frames: np.ndarray, order: np.ndarray) -> None:
         if not file.exists():

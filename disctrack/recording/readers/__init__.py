@@ -4,25 +4,25 @@ from importlib import import_module
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import (
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.files import (
     CINE_SUFFIXES,
     HDF5_SUFFIXES,
     IMAGE_SUFFIXES,
     MRAW_SUFFIXES,
     NUMBER,
     VIDEO_SUFFIXES,
-    FrameReader,
+    match_files,
     split_member,
 )
-from disctrack.recording.readers.files import match_files
 
-# Suffixes of a format, the module that reads it, and its function (files, camera) -> FrameReader.
-FORMATS: tuple[tuple[frozenset[str], str, str], ...] = (
-    (IMAGE_SUFFIXES, "images", "open_images"),
-    (VIDEO_SUFFIXES, "video", "open_video"),
-    (MRAW_SUFFIXES, "mraw", "open_mraw"),
-    (CINE_SUFFIXES, "cine", "open_cine"),
-    (HDF5_SUFFIXES, "hdf5", "open_hdf5"),
+# Suffixes of a format, and the module that reads it by `open_MODULE`: (files, camera) -> FrameReader.
+FORMATS: tuple[tuple[frozenset[str], str], ...] = (
+    (IMAGE_SUFFIXES, "images"),
+    (VIDEO_SUFFIXES, "video"),
+    (MRAW_SUFFIXES, "mraw"),
+    (CINE_SUFFIXES, "cine"),
+    (HDF5_SUFFIXES, "hdf5"),
 )
 
 
@@ -37,9 +37,9 @@ def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     pattern, member = split_member(pattern)
     files = match_files(pattern, Path(folder), camera)
     suffix = files[0].suffix.lower()
-    module, function = next((module, function) for suffixes, module, function in FORMATS if suffix in suffixes)
+    module = next(module for suffixes, module in FORMATS if suffix in suffixes)
     if NUMBER in member and suffix not in IMAGE_SUFFIXES:
         raise RecordingError(f"{files[0]}: {NUMBER} in a pattern numbers images of a file each; leave it out here.")
-    opener = getattr(import_module(f"disctrack.recording.readers.{module}"), function)
+    opener = getattr(import_module(f"disctrack.recording.readers.{module}"), f"open_{module}")
     reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
     return reader

@@ -25,10 +25,3 @@ def unpack_10(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compi
         out[4 * i + 1] = ((b & np.uint16(0x3F)) << np.uint16(4)) | (c >> np.uint16(4))
         out[4 * i + 2] = ((c & np.uint16(0xF)) << np.uint16(6)) | (d >> np.uint16(2))
         out[4 * i + 3] = ((d & np.uint16(0x3)) << np.uint16(8)) | e
-
-
-@njit(nogil=True, cache=True)
-def look_up(table: NDArray, values: NDArray) -> None:  # pragma: no cover (compiled)
-    """Replace values (n,) uint16 by table[values], in place; every value must be an index of the table."""
-    for i in range(values.size):
-        values[i] = table[values[i]]

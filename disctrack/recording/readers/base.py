@@ -1,73 +1,72 @@
-"""The interface of all readers, and which files they read."""
+"""What all readers have in common; a format says where a frame lies, and how its bytes become grey values."""
+
+from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 
-IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
-VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
-MRAW_SUFFIXES = frozenset({".cih", ".cihx", ".mraw"})  # Photron
-CINE_SUFFIXES = frozenset({".cine", ".cin", ".cci"})  # Phantom
-HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
-SUFFIXES = IMAGE_SUFFIXES | VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES | HDF5_SUFFIXES
-NUMBER = "{number}"  # in a pattern: these digits count the frames
+if TYPE_CHECKING:
+    from disctrack.recording.readers.camera_header import CameraHeader
 
 
-@runtime_checkable
-class FrameReader(Protocol):
+@dataclass(eq=False, kw_only=True)
+class FrameReader:
     """Frames of one camera in order. Opening it reads no more than headers; frames are read when asked for.
 
-    `read` raises disctrack.errors.RecordingError naming file, frame, what was found and what to do. It may be called
-    from several threads at once.
+    `read` may be called from several threads at once.
     """
 
+    camera: str  # left or right
     image_size: tuple[int, int]  # width, height [px]
-    bit_depth: int  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16)
-    timestamps: Array | None  # (n,) [s] by the camera's clock, where the file has them
-    frame_rate: float | None  # [Hz] where the file states the camera's own, not that of a player
-    notes: tuple[str, ...]  # what the user should know about how the frames were read, one sentence each
-    random_access: bool  # False where frames are read fastest in order, by one thread
+    dtype: np.dtype  # of grey values in memory
+    bit_depth: int = 0  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16); 0 stands for all of the type's
+    timestamps: Array | None = None  # (n,) [s] by the camera's clock, where the file has them
+    frame_rate: float | None = None  # [Hz] where the file states the camera's own, not that of a player
+    header: CameraHeader | None = None  # where the format has one
+    numbers: range | None = None  # of the frames, where they have some
+    notes: tuple[str, ...] = ()  # what the user should know about how the frames are read, one sentence each
+    doubts: tuple[str, ...] = ()  # what had to be assumed of the frames' instants
+    random_access: bool = True  # False where frames are read fastest in order, by one thread
+    _coding = ""  # by what, beside size and type, stored bytes become grey values
+    _digests: dict[int, bytes] = field(default_factory=dict)  # of frames whose content was seen
 
-    def __len__(self) -> int: ...
+    def __post_init__(self) -> None:
+        self.bit_depth = self.bit_depth or 8 * self.dtype.itemsize
+        self.notes = tuple(f"{self.camera} camera: {note}" for note in self.notes)
+        self.doubts = tuple(f"{self.camera} camera: {doubt}" for doubt in self.doubts)
 
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned."""
-        ...
-
-    def describe(self, index: int) -> str:
-        """Where frame `index` lies, for messages: a file name, or a file name and an offset."""
-        ...
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 (hex) of what frames start..stop-1 were made from; equal if and only if the input is the same."""
-        ...
-
-
-class Frames:
-    """What readers have in common (see FrameReader); each says in which file a frame lies, and decodes it."""
-
-    random_access = True
-    timestamps: Array | None = None
-    frame_rate: float | None = None
-    camera: str
-    image_size: tuple[int, int]
-    dtype: np.dtype
-    bit_depth: int
+    def __len__(self) -> int:
+        raise NotImplementedError
 
     def _place(self, index: int) -> str:
+        """The file of frame `index`."""
         raise NotImplementedError
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        raise NotImplementedError  # in `out` or anywhere else; RecordingErrors begin with `where`
+        """Frame `index`, in `out` or anywhere else. RecordingErrors begin with `where`."""
+        raise NotImplementedError
+
+    def _stored(self, index: int) -> bytes | memoryview:
+        """What frame `index` is made from. Raises RecordingError."""
+        return np.ascontiguousarray(self.read(index)).reshape(-1).data
+
+    def describe(self, index: int) -> str:
+        """Where frame `index` lies, for messages."""
+        return f"{self._place(index)}, frame {index}"
 
     def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width), into `out` if given. Raises RecordingError with file, camera and frame."""
+        """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned.
+
+        Raises RecordingError with file, camera, frame, what was found and what to do.
+        """
         where = f"{self._place(index)} ({self.camera} camera, frame {index})"
         image = self._decoded(index, out, where)
         if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
@@ -76,10 +75,22 @@ class Frames:
                 f"{where}: {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit, but the first frame has "
                 f"{width} x {height} px of {8 * self.dtype.itemsize} bit. Export it again."
             )
-        if out is None or image is out:
-            return image
-        out[...] = image
-        return out
+        return _into(out, image)
+
+    def content_sha256(self, start: int, stop: int) -> str:
+        """SHA-256 (hex) of what frames start..stop-1 are made from; equal if and only if the input is the same."""
+        total = hashlib.sha256(f"{self.image_size} {self.dtype} {self.bit_depth} {self._coding}".encode())
+        for index in range(start, stop):
+            total.update(self._digest(index))
+        return total.hexdigest()
+
+    def _digest(self, index: int) -> bytes:
+        if index not in self._digests:
+            try:
+                self._digests[index] = hashlib.sha256(self._stored(index)).digest()
+            except RecordingError:
+                return b"unreadable"
+        return self._digests[index]
 
     def _buffer(self, out: Image | None) -> Image:
         """`out` where a frame can be decoded straight into it; another array of a frame's size and type otherwise."""
@@ -89,22 +100,35 @@ class Frames:
         return np.empty(shape, self.dtype)
 
 
-class Changed:
+class Changed(FrameReader):
     """Frames of another reader that are changed after they are read; in all else that reader."""
 
-    def __init__(self, reader: FrameReader, by: str) -> None:
-        """By : all that tells how they are changed, for the digest of the content."""
-        self._reader, self._by = reader, by
+    def __init__(self, reader: FrameReader, change: Callable[[Image], Image], by: str, **different: Any) -> None:
+        """By : all that tells how they are changed, for the digest of the content; different : other fields."""
+        vars(self).update({f.name: getattr(reader, f.name) for f in fields(FrameReader)} | different)
+        self._reader, self._change, self._by = reader, change, by
 
     def __len__(self) -> int:
         return len(self._reader)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._reader, name)
+    def describe(self, index: int) -> str:
+        """As of the other reader."""
+        return self._reader.describe(index)
+
+    def read(self, index: int, out: Image | None = None) -> Image:
+        """Frame `index`, changed."""
+        return _into(out, self._change(self._reader.read(index)))
 
     def content_sha256(self, start: int, stop: int) -> str:
         """Of the frames and of how they are changed."""
         return hashlib.sha256(f"{self._reader.content_sha256(start, stop)} {self._by}".encode()).hexdigest()
+
+
+def _into(out: Image | None, image: Image) -> Image:
+    if out is None or image is out:
+        return image
+    out[...] = image
+    return out
 
 
 _T = TypeVar("_T")
@@ -126,16 +150,3 @@ def only_file(files: Sequence[Path], camera: str) -> Path:
     if len(files) != 1:
         raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one recording.")
     return files[0]
-
-
-def split_member(pattern: str) -> tuple[str, str]:
-    """Pattern of the files and what else a pattern says, "" for most.
-
-    "frames.h5:/left" is ("frames.h5", "/left"), "a/{number}.png" is ("a/*.png", "a/{number}.png").
-    """
-    if NUMBER in pattern:
-        return pattern.replace(NUMBER, "*"), pattern
-    file, colon, member = pattern.rpartition(":")
-    if colon and Path(file).suffix.lower() in HDF5_SUFFIXES:
-        return file, member
-    return pattern, ""

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from disctrack.errors import RecordingError
-from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
@@ -57,110 +56,94 @@ class CameraHeader:
         return {**fields, "recorded": self.recorded.isoformat() if self.recorded else None}
 
 
-def header_of(reader: FrameReader) -> CameraHeader | None:
-    """The camera's header, where the format has one."""
-    return getattr(reader, "header", None)
-
-
 def check_headers(left: FrameReader, right: FrameReader, frame_rate: float, declared_in: str) -> tuple[str, ...]:
     """Compare the cameras' headers with each other and with the declared frame rate [Hz]; returns warnings.
 
     Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at the declared
-    rate. Formats without a header pass.
+    rate. Formats without a header pass, with a warning where they state another rate: it may be that of a player.
     """
-    ours, theirs = header_of(left), header_of(right)
-    for camera, header in zip(CAMERAS, (ours, theirs), strict=True):
+    warnings = []
+    for reader in (left, right):
+        header, camera, rate = reader.header, reader.camera, reader.frame_rate
+        declared = f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}"
+        if header is None and rate is not None and abs(rate - frame_rate) > RATE_ROUNDING_HZ:
+            warnings.append(f"{declared}, the {camera} file states {rate:g} Hz")
         if header is not None:
-            _check_rate(header, camera, frame_rate, declared_in)
-    warnings = _stated_rates(left, right, frame_rate, declared_in)
-    if ours is None or theirs is None:
-        return warnings
-    _check_same_rate(ours, theirs)
-    doubts = _first_frames(ours, theirs)
-    _check_start(ours, theirs)
-    return (*warnings, *doubts, *_exposures(ours, theirs), *_takes(ours, theirs))
+            stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
+            if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
+                raise RecordingError(
+                    f"{declared}, but the {camera} camera's frames were recorded with {header.rate}, says "
+                    f"{header.file}. Every velocity would be wrong by their ratio: correct that."
+                )
+    if left.header is not None and right.header is not None:
+        _check_instants(left.header, right.header)
+        warnings += _doubtful(left.header, right.header)
+    return tuple(warnings)
 
 
-def _check_rate(header: CameraHeader, camera: str, frame_rate: float, declared_in: str) -> None:
-    stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
-    if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
-        raise RecordingError(
-            f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}, but the {camera} camera's frames were recorded "
-            f"with {header.rate}, says {header.file}. Every velocity would be wrong by their ratio: correct that."
-        )
-
-
-def _stated_rates(left: FrameReader, right: FrameReader, frame_rate: float, declared_in: str) -> tuple[str, ...]:
-    """Warnings where a file without a camera's header states another rate: it may be that of a player."""
-    return tuple(
-        f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}, the {camera} file states {reader.frame_rate:g} Hz"
-        for camera, reader in zip(CAMERAS, (left, right), strict=True)
-        if header_of(reader) is None
-        and reader.frame_rate is not None
-        and abs(reader.frame_rate - frame_rate) > RATE_ROUNDING_HZ
-    )
-
-
-def _check_same_rate(left: CameraHeader, right: CameraHeader) -> None:
+def _check_instants(left: CameraHeader, right: CameraHeader) -> None:
+    """Raise RecordingError where frame i of both does not show the same instant."""
     if abs(left.frame_rate - right.frame_rate) > 1e-6 * left.frame_rate:
         raise RecordingError(
             f"the left camera's frames were recorded with {left.rate} ({left.file}), the right one's with {right.rate} "
             f"({right.file}): frame i of both does not show the same instant. Record with one rate, or export with the "
             "same step."
         )
-
-
-def _first_frames(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
-    """Equal modes count from the same event: equal numbers are the same instant. Of unequal modes nothing is known."""
-    if left.trigger != right.trigger:
-        return (
-            f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
-            f"{right.trigger or 'unknown'}. The headers cannot tell whether frame i of both shows the same instant",
-        )
     numbers = left.first_frame, right.first_frame
-    if None not in numbers and numbers[0] != numbers[1]:
+    if left.trigger == right.trigger and None not in numbers and numbers[0] != numbers[1]:
         raise RecordingError(
             f"the left file begins with the camera's frame {numbers[0]} ({left.file}), the right one with frame "
             f"{numbers[1]} ({right.file}), at the same trigger mode: frame i of both does not show the same instant. "
             "Export the same range of frames from both cameras."
         )
-    return ()
+    offset, period = start_offset(left, right), 1.0 / left.frame_rate
+    if offset is not None and abs(offset[0]) > 0.5 * period:
+        raise RecordingError(
+            f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was "
+            f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s. "
+            "Export the frames of the same instants, of the same take."
+        )
 
 
-def _exposures(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
-    if left.exposure is None or right.exposure is None:
-        return ()
-    difference = abs(left.exposure - right.exposure)
-    if difference <= SAME_EXPOSURE * max(left.exposure, right.exposure):
-        return ()
-    return (
-        f"the cameras exposed for different times: left {1e6 * left.exposure:g} us, right {1e6 * right.exposure:g} us. "
-        f"The middles of the exposures lie {0.5e6 * difference:g} us apart if both begin together",
-    )
+def _doubtful(left: CameraHeader, right: CameraHeader) -> list[str]:
+    found = []
+    if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
+        found.append(
+            f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
+            f"{right.trigger or 'unknown'}. The headers cannot tell whether frame i of both shows the same instant"
+        )
+    if left.exposure is not None and right.exposure is not None and _differ(left.exposure, right.exposure):
+        found.append(
+            f"the cameras exposed for different times: left {1e6 * left.exposure:g} us, right "
+            f"{1e6 * right.exposure:g} us. The middles of the exposures lie "
+            f"{0.5e6 * abs(left.exposure - right.exposure):g} us apart if both begin together"
+        )
+    if left.recorded is not None and right.recorded is not None:
+        apart = abs((left.recorded - right.recorded).total_seconds())
+        if apart > SAME_TAKE_S:
+            found.append(
+                f"the headers' dates lie {apart / 60:.0f} minutes apart: left {left.recorded:%Y-%m-%d %H:%M:%S}, right "
+                f"{right.recorded:%Y-%m-%d %H:%M:%S}. Are both files of the same take?"
+            )
+    return found
+
+
+def _differ(one: float, other: float) -> bool:
+    return abs(one - other) > SAME_EXPOSURE * max(one, other)
 
 
 def other_exposure(left: FrameReader, right: FrameReader, declared: float | None, declared_in: str) -> tuple[str, ...]:
     """Warnings where the declared exposure [s] is not that of a camera's header."""
-    headers = zip(CAMERAS, (header_of(left), header_of(right)), strict=True)
-    return tuple(
-        f"{declared_in}: [cameras] exposure_us is {1e6 * declared:g}, the {camera} camera's header says "
-        f"{1e6 * header.exposure:g} us ({header.file}); the declared one is used"
-        for camera, header in headers
-        if declared is not None and header is not None and header.exposure is not None
-        and abs(header.exposure - declared) > SAME_EXPOSURE * max(header.exposure, declared)
-    )  # fmt: skip
-
-
-def _takes(left: CameraHeader, right: CameraHeader) -> tuple[str, ...]:
-    if left.recorded is None or right.recorded is None:
-        return ()
-    apart = abs((left.recorded - right.recorded).total_seconds())
-    if apart <= SAME_TAKE_S:
-        return ()
-    return (
-        f"the headers' dates lie {apart / 60:.0f} minutes apart: left {left.recorded:%Y-%m-%d %H:%M:%S}, right "
-        f"{right.recorded:%Y-%m-%d %H:%M:%S}. Are both files of the same take?",
-    )
+    found = []
+    for reader in (left, right):
+        header = reader.header
+        if declared is None or header is None or header.exposure is None or not _differ(header.exposure, declared):
+            continue
+        found.append(
+            f"{declared_in}: [cameras] exposure_us is {1e6 * declared:g}, the {reader.camera} camera's header says "
+            f"{1e6 * header.exposure:g} us ({header.file}); the declared one is used"
+        )
+    return tuple(found)
 
 
 def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] | None:
@@ -174,13 +157,3 @@ def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] |
     if left.locked_clock and right.locked_clock and left.trigger_time and right.trigger_time:
         return later + (right.trigger_time - left.trigger_time), "the common clock's zero"
     return later, "the trigger"
-
-
-def _check_start(left: CameraHeader, right: CameraHeader) -> None:
-    offset, period = start_offset(left, right), 1.0 / left.frame_rate
-    if offset is not None and abs(offset[0]) > 0.5 * period:
-        raise RecordingError(
-            f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was "
-            f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s. "
-            "Export the frames of the same instants, of the same take."
-        )

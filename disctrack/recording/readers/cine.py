@@ -7,7 +7,6 @@ against the file's size before anything is read or made of that size.
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -17,16 +16,16 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import only_file
-from disctrack.recording.readers.camera_frames import (
-    PIXELS_PER_GROUP,
-    CameraFrames,
+from disctrack.recording.readers.camera_header import CameraHeader
+from disctrack.recording.readers.raw import (
     PixelLayout,
+    RawFile,
+    RawFrames,
     bit_depth_of,
+    check_frame_size,
     check_present,
     count_present,
 )
-from disctrack.recording.readers.camera_header import CameraHeader
-from disctrack.recording.readers.raw import RawFile, check_frame_size
 
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIII")
 _BITMAP_HEADER = struct.Struct("<IiiHHII")
@@ -49,46 +48,58 @@ _SETUP_FIELDS = {
     "EDRShutterNs": (1572, "<I"),
 }
 _SETUP_BYTES = 1576
+_FRACTION = 0xFFFFFFFC  # of a second, in 2**-32 s; the two lowest bits are flags
 # Way of packing (biCompression): bits per stored pixel; 0 is none.
 _PACKED = {256: 10, 1024: 12}
 
 
-def open_cine(files: Sequence[Path], camera: str) -> CameraFrames:
+def open_cine(files: Sequence[Path], camera: str) -> RawFrames:
     """Frames of one camera. Raises RecordingError if the file is damaged, compressed or of colours."""
     file = RawFile(only_file(files, camera))
-    cine = _read_headers(file)
-    layout = _layout(cine)
-    starts = _image_table(cine, camera)
-    check_present(file, camera, layout, len(starts), count_present(file, layout, starts))
-    offsets = _pixels(cine, starts, layout)
-    times, doubts = _times(cine)
-    header = _header(cine, layout, times)
-    notes = (header.sentence(), *doubts, *_setup_notes(cine))
-    return CameraFrames(file, camera, layout, offsets, header, notes, None if times is None else times - times[0])
+    cine = _Cine(file)
+    layout, depth = _layout(cine)
+    n = cine.n_images
+    starts = np.frombuffer(file.bytes_at(cine.table, 8 * n, f"{file.path}: table of {n} images"), "<i8")
+    check_present(file, camera, layout, n, count_present(layout, starts, file.size))
+    times, step, doubts = _times(cine)
+    header = _header(cine, depth, times, step)
+    return RawFrames(
+        camera=camera,
+        files=[file],
+        offsets=_pixels(cine, starts, layout),
+        layout=layout,
+        bit_depth=depth,
+        timestamps=None if times is None else times - times[0],
+        frame_rate=header.frame_rate,
+        header=header,
+        notes=(header.sentence(), *doubts, *_setup_notes(cine)),
+    )
 
 
-@dataclass(frozen=True)
 class _Cine:
     """The headers of one file."""
 
-    file: RawFile
-    first_image: int  # relative to the trigger
-    n_images: int
-    table: int  # offset of the table of images
-    trigger: tuple[int, int]  # fractions (2**-32 s) and seconds since 1970
-    width: int
-    height: int
-    bottom_up: bool
-    bits: int  # per pixel as the bitmap header says
-    packing: int
-    image_bytes: int
-    setup_offset: int
-    setup_length: int
-    setup: bytes
-
-    @property
-    def path(self) -> Path:
-        return self.file.path
+    def __init__(self, file: RawFile) -> None:
+        self.file, self.path = file, file.path
+        head = _FILE_HEADER.unpack(file.bytes_at(0, _FILE_HEADER.size, f"{file.path}: file header"))
+        mark, _, compression, version, _, _, *rest = head
+        self.first_image, self.n_images, bitmap_at, setup_at, self.table, *time = rest
+        if mark != b"CI" or version > 1:
+            raise RecordingError(f"{self.path}: not a cine file of a known version. Export the recording again.")
+        if compression == 1:  # 0: as they are; 2: as the sensor has them, which is grey without a colour filter
+            raise RecordingError(f"{self.path}: a compressed cine (JPEG). Save it uncompressed: cine raw.")
+        self.clock_is_free, self.trigger_second = bool(time[0] & 1), time[1]  # [s] since 1970
+        self.trigger = (time[0] & _FRACTION) * 2.0**-32  # [s] after that
+        bitmap = _BITMAP_HEADER.unpack(file.bytes_at(bitmap_at, _BITMAP_HEADER.size, f"{self.path}: bitmap header"))
+        _, self.width, height, _, self.bits, self.packing, self.image_bytes = bitmap
+        self.height = abs(height)
+        self.bottom_up = height > 0 and self.packing == 0  # as in a bitmap; packed images begin with the upper row
+        mark_and_length = file.bytes_at(setup_at + _SETUP_MARK, 4, f"{self.path}: camera setup")
+        length = int.from_bytes(mark_and_length[2:], "little")
+        if mark_and_length[:2] != b"ST":
+            raise RecordingError(f"{self.path}: no camera setup where the header says. Export the recording again.")
+        self.setup = file.bytes_at(setup_at, min(length, _SETUP_BYTES), f"{self.path}: camera setup")
+        self.blocks = setup_at + length  # where they begin
 
     def field(self, name: str) -> int | None:
         """A field of the camera setup, or None where the file's setup is older than the field."""
@@ -98,41 +109,8 @@ class _Cine:
         return int(struct.unpack_from(kind, self.setup, offset)[0])
 
 
-def _read_headers(file: RawFile) -> _Cine:
-    path = file.path
-    head = _FILE_HEADER.unpack(file.bytes_at(0, _FILE_HEADER.size, f"{path}: file header"))
-    mark, _, compression, version, _, _, first, n, bitmap_at, setup_at, table, fraction, second = head
-    if mark != b"CI" or version > 1:
-        raise RecordingError(f"{path}: not a cine file of a known version. Export the recording again.")
-    if compression == 1:  # 0: as they are; 2: as the sensor has them, which is grey without a colour filter
-        raise RecordingError(f"{path}: a compressed cine (JPEG). Save it uncompressed: cine raw.")
-    bitmap = _BITMAP_HEADER.unpack(file.bytes_at(bitmap_at, _BITMAP_HEADER.size, f"{path}: bitmap header"))
-    _, width, height, _, bits, packing, image_bytes = bitmap
-    check_frame_size(width, abs(height), str(path))
-    mark_and_length = file.bytes_at(setup_at + _SETUP_MARK, 4, f"{path}: camera setup")
-    length = int.from_bytes(mark_and_length[2:], "little")
-    if mark_and_length[:2] != b"ST":
-        raise RecordingError(f"{path}: no camera setup where the header says. Export the recording again.")
-    return _Cine(
-        file=file,
-        first_image=first,
-        n_images=n,
-        table=table,
-        trigger=(fraction, second),
-        width=width,
-        height=abs(height),
-        bottom_up=height > 0 and packing == 0,  # as in a bitmap; packed images begin with the upper row
-        bits=bits,
-        packing=packing,
-        image_bytes=image_bytes,
-        setup_offset=setup_at,
-        setup_length=length,
-        setup=file.bytes_at(setup_at, min(length, _SETUP_BYTES), f"{path}: camera setup"),
-    )
-
-
-def _layout(cine: _Cine) -> PixelLayout:
-    """How the pixels lie. Raises RecordingError for colours, and for what is not an uncompressed grey image."""
+def _layout(cine: _Cine) -> tuple[PixelLayout, int]:
+    """How the pixels lie, and the bits that carry grey values. RecordingError for colours, and what is compressed."""
     filter_code = (cine.field("CFA") or 0) & 0xFFFFFF  # the highest byte tells of grey heads
     if filter_code or cine.bits not in (8, 16):
         raise RecordingError(
@@ -144,30 +122,17 @@ def _layout(cine: _Cine) -> PixelLayout:
             f"{cine.path}: images are packed in a way (biCompression {cine.packing}) that is not read. Save them "
             "unpacked with 8 or 16 bit, or packed with 10 or 12 bit."
         )
-    stored = _PACKED.get(cine.packing, cine.bits)
-    plain = cine.width * cine.height * stored
-    if plain % 8 or cine.width * cine.height % PIXELS_PER_GROUP[stored]:
-        raise RecordingError(f"{cine.path}: {cine.width} x {cine.height} px of {stored} bit do not fill whole bytes.")
-    padding = 0 if cine.packing else _padding(cine, plain // 8)
-    if stored == 10:
-        return PixelLayout(cine.width, cine.height, 10, 12, table=linear_from_10_bits())
-    depth = bit_depth_of(stored, cine.field("RealBPP") or stored)
-    return PixelLayout(cine.width, cine.height, stored, depth, padding, cine.bottom_up)
-
-
-def _padding(cine: _Cine, plain_bytes: int) -> int:
-    """Bytes after each row: none, or as in a bitmap up to a multiple of 4, whichever gives the stated size."""
-    row = plain_bytes // cine.height
-    padding = -row % 4
-    return padding if padding and cine.image_bytes == plain_bytes + padding * cine.height else 0
-
-
-def _image_table(cine: _Cine, camera: str) -> NDArray[np.int64]:
-    """(n,) where each image's record begins."""
-    if cine.n_images < 1:
-        raise RecordingError(f"{cine.path} ({camera} camera): its header tells of no image. Export it again.")
-    table = cine.file.bytes_at(cine.table, 8 * cine.n_images, f"{cine.path}: table of {cine.n_images} images")
-    return np.frombuffer(table, "<i8").astype(np.int64)
+    packed, w, h = _PACKED.get(cine.packing, 0), cine.width, cine.height
+    check_frame_size(w, h, str(cine.path), packed or cine.bits)
+    if packed:
+        table = linear_from_10_bits() if packed == 10 else None
+        depth = 12 if packed == 10 else bit_depth_of(12, cine.field("RealBPP") or 12)
+        return PixelLayout(w, h, np.dtype("<u2"), packed, table=table), depth
+    row = w * cine.bits // 8
+    padding = -row % 4  # none, or as in a bitmap up to a multiple of 4, whichever gives the stated size
+    padding = padding if cine.image_bytes == (row + padding) * h else 0
+    layout = PixelLayout(w, h, np.dtype(f"<u{cine.bits // 8}"), padding=padding, bottom_up=cine.bottom_up)
+    return layout, bit_depth_of(cine.bits, cine.field("RealBPP") or cine.bits)
 
 
 def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDArray[np.int64]:
@@ -212,42 +177,31 @@ def linear_from_10_bits() -> NDArray[np.uint16]:
     return grey.astype(np.uint16)
 
 
-def _seconds(fractions: NDArray[np.uint32], seconds: NDArray[np.uint32], since: int) -> Array:
-    """Times [s] after the whole second `since`; the two lowest bits of the fraction are flags."""
-    return (seconds.astype(np.int64) - since) + (fractions & np.uint32(0xFFFFFFFC)) * 2.0**-32
+def _times(cine: _Cine) -> tuple[Array | None, int, list[str]]:
+    """(n,) [s] from the trigger to each frame by the camera's clock, or None and why they are not used.
 
-
-def _times(cine: _Cine) -> tuple[Array | None, list[str]]:
-    """(n,) [s] from the trigger to each frame by the camera's clock, or None and why they are not used."""
-    block = _find_block(cine, _TIMES_BLOCK)
+    Between them, of how many recorded frames one was saved: the setup does not tell.
+    """
+    block, n = _find_block(cine, _TIMES_BLOCK), cine.n_images
     if block is None:
-        return None, ["the file has no time stamps; frames are taken as evenly spaced"]
+        return None, 1, ["the file has no time stamps; frames are taken as evenly spaced"]
     start, size = block
-    if size < 8 * cine.n_images:
-        return None, [f"the file has {size // 8} time stamps for {cine.n_images} frames; they are not used"]
-    raw = np.frombuffer(cine.file.bytes_at(start, 8 * cine.n_images, str(cine.path)), "<u4").reshape(-1, 2)
-    fraction, second = cine.trigger
-    trigger = (fraction & 0xFFFFFFFC) * 2.0**-32
-    times = _seconds(raw[:, 0], raw[:, 1], second) - trigger
-    if not _saved_step(cine, times):
-        rate = cine.field("FrameRate") or 0
-        return None, [f"the time stamps do not belong to a recording with {rate} Hz; they are not used"]
-    return times, []
-
-
-def _saved_step(cine: _Cine, times: Array) -> int:
-    """Of how many recorded frames one was saved, by the time stamps (the setup does not tell); 0 if they cannot be."""
-    steps = np.diff(times)
-    if not len(steps):
-        return 1
-    periods = float(np.median(steps)) * (cine.field("FrameRate") or 0)
+    if size < 8 * n:
+        return None, 1, [f"the file has {size // 8} time stamps for {n} frames; they are not used"]
+    raw = np.frombuffer(cine.file.bytes_at(start, 8 * n, str(cine.path)), "<u4").reshape(-1, 2)
+    fractions = (raw[:, 0] & np.uint32(_FRACTION)) * 2.0**-32
+    times = (raw[:, 1].astype(np.int64) - cine.trigger_second) + fractions - cine.trigger
+    steps, rate = np.diff(times), cine.field("FrameRate") or 0
+    periods = float(np.median(steps)) * rate if len(steps) else 1.0
     step = round(periods)
-    return step if (steps > 0).all() and step >= 1 and abs(periods / step - 1) < 0.01 else 0
+    if not (steps > 0).all() or step < 1 or abs(periods / step - 1) >= 0.01:
+        return None, 1, [f"the time stamps do not belong to a recording with {rate} Hz; they are not used"]
+    return times, step, []
 
 
 def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
     """Offset and size of the content of a tagged block between the setup and the table of images."""
-    position = cine.setup_offset + cine.setup_length
+    position = cine.blocks
     for _ in range(_MOST_BLOCKS):
         if position + _BLOCK_HEADER.size > min(cine.table, cine.file.size):
             return None
@@ -261,28 +215,24 @@ def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
     return None
 
 
-def _header(cine: _Cine, layout: PixelLayout, times: Array | None) -> CameraHeader:
+def _header(cine: _Cine, depth: int, times: Array | None, step: int) -> CameraHeader:
     rate = cine.field("FrameRate")
     if not rate:
         raise RecordingError(f"{cine.path}: the camera setup states no frame rate. Export the recording again.")
-    nanoseconds = cine.field("ShutterNs") or 1000 * (cine.field("Shutter") or 0)
-    exposure = nanoseconds / 1e9
-    fraction, second = cine.trigger
-    trigger_time = second + (fraction & 0xFFFFFFFC) * 2.0**-32
-    version, serial = cine.field("CameraVersion"), cine.field("Serial")
-    step = 1 if times is None else _saved_step(cine, times)
+    exposure = (cine.field("ShutterNs") or 1000 * (cine.field("Shutter") or 0)) / 1e9
+    second = cine.trigger_second
     return CameraHeader(
         file=str(cine.path),
-        device=f"Phantom {version}, serial number {serial}",
+        device=f"Phantom {cine.field('CameraVersion')}, serial number {cine.field('Serial')}",
         frame_rate=rate / step,
         step=step,
         exposure=exposure if 0 < exposure * rate <= 1.001 else None,
         first_frame=cine.first_image,
         first_time=None if times is None else float(times[0]),
-        trigger_time=trigger_time if second else None,
-        locked_clock=bool(second) and not fraction & 1,
+        trigger_time=second + cine.trigger if second else None,
+        locked_clock=bool(second) and not cine.clock_is_free,
         recorded=datetime(1970, 1, 1) + timedelta(seconds=second) if second else None,
-        saturation=(1 << layout.bit_depth) - 1,
+        saturation=(1 << depth) - 1,
     )
 
 

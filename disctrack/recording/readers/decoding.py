@@ -1,20 +1,27 @@
-"""Image files as pixels: container and checksums are verified, and nothing is converted that would be lost."""
+"""Image files as pixels: container and checksums are verified, and nothing is converted that would be lost.
+
+Grey PNG files are decoded straight into the caller's memory: libpng inflates row by row; here the whole image is
+inflated at once and the row filters are undone in one compiled pass, in half the time. Other kinds of PNG (palette,
+colour, interlaced, fewer than 8 bits) are left to OpenCV.
+"""
 
 import struct
 import zlib
 
 import cv2
+import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
-from disctrack.recording.readers._png import PngHeader, decode_plain_grey
+from disctrack.recording.readers._png import undo_filters
 from disctrack.recording.readers.raw import check_claim
-from disctrack.recording.readers.tiff_pages import TiffContent, page_pixels, pages_of
+from disctrack.recording.readers.tiff_pages import Content, page_pixels, pages_of
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_AGAIN = "Copy or export this image again."
 
 
 def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
@@ -23,25 +30,28 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     Container and checksums are verified first: a decoder may return a torn image without a word.
     Raises RecordingError that begins with `where`.
     """
-    try:
-        header = _checked_container(content, where)
-        image = _tiff(content, where) if content[:4] in _TIFF_SIGNATURES else None
-    except _Damaged as fault:
-        raise RecordingError(f"{where}: {fault}. Copy or export this image again.") from fault
-    if header is not None and header.is_plain_grey:
-        image = decode_plain_grey(content, header, out)
-    elif image is None:
-        image = _by_opencv(content, where)
-    if image is None:
-        raise RecordingError(f"{where}: not a readable image, or damaged. Copy or export this image again.")
-    return image
+    if not content:
+        raise RecordingError(f"{where}: the file is empty. {_AGAIN}")
+    if content.startswith(_PNG_SIGNATURE):
+        return _png(content, where, out)
+    if content[:4] in _TIFF_SIGNATURES:
+        source = Content(content)
+        try:
+            page = next(pages_of(source))
+        except (RecordingError, StopIteration) as error:
+            raise RecordingError(f"{where}: not a readable image, or damaged ({error}). {_AGAIN}") from error
+        return page_pixels(source, page, where)
+    _check_length(content, where)
+    return _by_opencv(content, where)
 
 
-def _by_opencv(content: bytes, where: str) -> NDArray | None:
+def _by_opencv(content: bytes, where: str) -> NDArray:
     try:
         image: NDArray | None = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError) as error:
         raise RecordingError(f"{where}: not a readable image ({error.__class__.__name__}).") from error
+    if image is None:
+        raise RecordingError(f"{where}: not a readable image, or damaged. {_AGAIN}")
     return image
 
 
@@ -62,37 +72,18 @@ def as_grey(image: NDArray, where: str) -> Image:
     return np.ascontiguousarray(colours[..., 0])
 
 
-class _Damaged(Exception):
-    """The text says what is wrong with the file as a container."""
-
-
-def _checked_container(content: bytes, where: str) -> PngHeader | None:
-    """Header of a PNG, None for other formats; only PNG has checksums, the others an end or a length to check."""
-    if not content:
-        raise _Damaged("the file is empty")
-    if content.startswith(_PNG_SIGNATURE):
-        return _checked_png(content, where)
+def _check_length(content: bytes, where: str) -> None:
+    """Formats without checksums have an end or a length to check."""
     if content.startswith(b"\xff\xd8"):
         if b"\xff\xd9" not in content[-1024:]:
-            raise _Damaged("the JPEG file is truncated (no end marker)")
+            raise RecordingError(f"{where}: the JPEG file is truncated (no end marker). {_AGAIN}")
         check_claim(*_jpeg_size(content), len(content), where)
     if content.startswith(b"BM") and len(content) >= 26:
         declared = struct.unpack_from("<I", content, 2)[0]
         if declared > len(content):
-            raise _Damaged(f"the BMP file ends after {len(content)} of {declared} bytes")
+            raise RecordingError(f"{where}: the BMP file ends after {len(content)} of {declared} bytes. {_AGAIN}")
         width, height = struct.unpack_from("<ii", content, 18)
         check_claim(abs(width), abs(height), len(content), where)
-    return None
-
-
-def _tiff(content: bytes, where: str) -> NDArray:
-    """Pixels of the first page."""
-    source = TiffContent(content)
-    try:
-        page = next(pages_of(source))
-    except (RecordingError, StopIteration) as error:
-        raise _Damaged(f"not a readable image, or damaged ({error})") from error
-    return page_pixels(source, page, where)
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
@@ -109,10 +100,10 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def _checked_png(content: bytes, where: str) -> PngHeader:
+def _png(content: bytes, where: str, out: NDArray | None) -> NDArray:
     position, end, view = 8, len(content), memoryview(content)
     ihdr: tuple[int, ...] = ()
-    data: list[tuple[int, int]] = []
+    data: list[memoryview] = []
     transparent = False
     while position + 12 <= end:
         (length,) = struct.unpack_from(">I", content, position)
@@ -121,15 +112,52 @@ def _checked_png(content: bytes, where: str) -> PngHeader:
         if stop + 4 > end:
             break
         if zlib.crc32(view[position + 4 : stop]) != struct.unpack_from(">I", content, stop)[0]:
-            raise _Damaged(f"the PNG is damaged: wrong checksum of chunk {kind.decode('latin-1')!r} at byte {position}")
+            name = kind.decode("latin-1")
+            raise RecordingError(
+                f"{where}: the PNG is damaged: wrong checksum of chunk {name!r} at byte {position}. {_AGAIN}"
+            )
         if kind == b"IHDR" and length == 13:
             ihdr = struct.unpack_from(">IIBBBBB", content, start)
             check_claim(ihdr[0], ihdr[1], end, where)
         elif kind == b"IDAT":
-            data.append((start, stop))
+            data.append(view[start:stop])
         elif kind == b"tRNS":
             transparent = True
         elif kind == b"IEND" and ihdr:
-            return PngHeader(ihdr[0], ihdr[1], ihdr[2], ihdr[3], ihdr[6] != 0, transparent, tuple(data))
+            width, height, depth, colour, _, _, interlaced = ihdr
+            if colour or interlaced or transparent or depth not in (8, 16):
+                return _by_opencv(content, where)
+            image = _plain_grey(b"".join(data), width, height, depth, out)
+            if image is None:
+                raise RecordingError(f"{where}: not a readable image, or damaged. {_AGAIN}")
+            return image
         position = stop + 4
-    raise _Damaged(f"the PNG file is truncated after {end} bytes (no end chunk)")
+    raise RecordingError(f"{where}: the PNG file is truncated after {end} bytes (no end chunk). {_AGAIN}")
+
+
+def _plain_grey(stream: bytes, width: int, height: int, depth: int, out: NDArray | None) -> NDArray | None:
+    """Pixels (height, width) uint8 or uint16 into `out` or a new array; None if the stream is not what IHDR says.
+
+    The stream carries a checksum of its own, which is verified.
+    """
+    stride, dtype = width * depth // 8, np.uint8 if depth == 8 else np.uint16
+    raw = inflated(stream, (stride + 1) * height)
+    if raw is None:
+        return None
+    if out is None or out.dtype != dtype or out.shape != (height, width) or not out.flags.c_contiguous:
+        out = np.empty((height, width), dtype)
+    rows = np.frombuffer(raw, np.uint8).reshape(height, stride + 1)
+    if not undo_filters(rows, depth // 8, out.view(np.uint8)):
+        return None
+    if depth == 16 and np.little_endian:
+        out.byteswap(inplace=True)
+    return out
+
+
+def inflated(stream: bytes, size: int) -> bytes | bytearray | None:
+    """The `size` bytes that a zlib stream holds, never more; None where it holds another number or is damaged."""
+    try:
+        whole: bytes | bytearray = imagecodecs.deflate_decode(stream, out=size)
+    except imagecodecs.DeflateError:
+        return None
+    return whole if len(whole) == size else None

@@ -9,47 +9,33 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import NUMBER, FrameReader
+from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.files import NUMBER, file_number
 
 MOST_SLOTS_PER_FILE = 100  # a sequence with fewer of its frames is no recording, but time stamps or a slip of the pen
 _SHOWN = 3
 
 
-@dataclass(frozen=True)
-class NumberedFiles:
-    """Files on their places in time; None where a number is missing."""
-
-    slots: tuple[Path | None, ...]
-    first: int | None  # number of the first slot; None for a file that stands alone and has none
-    step: int  # between the numbers of neighbouring slots
-    notes: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()  # what had to be assumed
-
-    @property
-    def last(self) -> int | None:
-        """Number of the last slot."""
-        return None if self.first is None else self.first + (len(self.slots) - 1) * self.step
-
-
-def number_files(files: Sequence[Path], camera: str, pattern: str = "") -> NumberedFiles:
-    """Put files on their places in time by the numbers in their names.
+def number_files(
+    files: Sequence[Path], camera: str, pattern: str = ""
+) -> tuple[tuple[Path | None, ...], range | None, tuple[str, ...], tuple[str, ...]]:
+    """Files on their places in time (None where a number is missing), their numbers, what to know, and what is assumed.
 
     pattern : tells by {number} which digits count; "" where the names must tell it themselves
     Raises RecordingError that names the files if their names are not of one form, hold no number or one number twice,
     or if the numbers have no common step.
     """
     if len(files) == 1:
-        runs = re.findall(r"[0-9]+", files[0].stem)
-        return NumberedFiles((files[0],), int(runs[-1]) if runs else None, 1)
+        number = file_number(files[0])
+        return tuple(files), None if number is None else range(number, number + 1), (), ()
     columns = [_numbers_by_pattern(files, pattern)] if pattern else _numbers_by_form(files, camera)
     clocks = {step: column for column in columns if (step := _common_step(column, asked=bool(pattern)))}
     if len(clocks) > 1:
-        clocks = {step: column for step, column in clocks.items() if len(_missing(column, step)) == 0} or clocks
+        clocks = {step: column for step, column in clocks.items() if not _missing(column, step)} or clocks
     if len(clocks) > 1:
         raise RecordingError(
             f"{files[0]} ...: the names of the {camera} frames hold several numbers that could count them. Say which "
@@ -57,21 +43,20 @@ def number_files(files: Sequence[Path], camera: str, pattern: str = "") -> Numbe
         )
     if not clocks:
         _refuse_clock(files, columns[-1], camera)
-    ((step, numbers),) = clocks.items()
-    first, last = min(numbers), max(numbers)
-    slots: list[Path | None] = [None] * ((last - first) // step + 1)
-    for number, file in zip(numbers, files, strict=True):
-        slots[(number - first) // step] = file
-    missing = _missing(numbers, step)
-    notes = (
-        [f"{len(missing)} file(s) missing in the sequence, the first is number {missing[0]}; this camera says "
-         "nothing of these frames"] if missing else []
-    )  # fmt: skip
-    doubts = (
-        [f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz. If that is "
-         f"the camera's own rate and every {step}th frame was kept, declare {step} times less"] if step > 1 else []
-    )  # fmt: skip
-    return NumberedFiles(tuple(slots), first, step, tuple(notes), tuple(doubts))
+    ((step, column),) = clocks.items()
+    numbers, by_number = range(min(column), max(column) + 1, step), dict(zip(column, files, strict=True))
+    notes, doubts = [], []
+    if missing := _missing(column, step):
+        notes.append(
+            f"{len(missing)} file(s) missing in the sequence, the first is number {missing[0]}; this camera says "
+            "nothing of these frames"
+        )
+    if step > 1:
+        doubts.append(
+            f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz. If that "
+            f"is the camera's own rate and every {step}th frame was kept, declare {step} times less"
+        )
+    return tuple(map(by_number.get, numbers)), numbers, tuple(notes), tuple(doubts)
 
 
 def check_same_numbers(left: FrameReader, right: FrameReader) -> tuple[str, ...]:
@@ -79,17 +64,15 @@ def check_same_numbers(left: FrameReader, right: FrameReader) -> tuple[str, ...]
 
     Raises RecordingError where both count with the same numbers, but do not begin with the same.
     """
-    ours, theirs = getattr(left, "numbered", None), getattr(right, "numbered", None)
-    if ours is None or theirs is None or ours.first is None or theirs.first is None:
-        return ()
-    if (ours.first, ours.step) == (theirs.first, theirs.step):
+    ours, theirs = left.numbers, right.numbers
+    if ours is None or theirs is None or (ours[0], ours.step) == (theirs[0], theirs.step):
         return ()
     spans = (
-        f"left files are numbered {ours.first} to {ours.last} in steps of {ours.step}, right ones {theirs.first} to "
-        f"{theirs.last} in steps of {theirs.step}"
+        f"left files are numbered {ours[0]} to {ours[-1]} in steps of {ours.step}, right ones {theirs[0]} to "
+        f"{theirs[-1]} in steps of {theirs.step}"
     )
-    if ours.step == theirs.step and (ours.last < theirs.first or theirs.last < ours.first):
-        return (f"{spans}: they are taken as pairs in their order, number {ours.first} with {theirs.first}",)
+    if ours.step == theirs.step and (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
+        return (f"{spans}: they are taken as pairs in their order, number {ours[0]} with {theirs[0]}",)
     raise RecordingError(
         f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant. Copy what is "
         "missing, or number the frames of both cameras alike."
@@ -103,9 +86,9 @@ def check_continuation(files: Sequence[Path], camera: str) -> None:
     if len(files) < 2:
         return
     rest = files[1:] if files[1].stem.startswith(files[0].stem) else files
-    numbered = number_files(rest, camera)
-    if None in numbered.slots or numbered.step != 1:
-        absent = [(numbered.first or 0) + i for i, file in enumerate(numbered.slots) if file is None]
+    slots, numbers, _, _ = number_files(rest, camera)
+    absent = [number for number, file in zip(numbers or (), slots, strict=False) if file is None]
+    if absent or (numbers is not None and numbers.step != 1):
         raise RecordingError(
             f"{files[0]} ...: a {camera} stack that goes on in several files lacks number "
             f"{absent[0] if absent else 'of every second one'}. How many frames it held is not known, so all that "

@@ -6,8 +6,28 @@ import re
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import keep, why_not_regular
-from disctrack.recording.readers.base import SUFFIXES
+from disctrack.files.inputs import MOST_IMAGE, keep, read_regular, why_not_regular
+
+IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
+VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
+MRAW_SUFFIXES = frozenset({".cih", ".cihx", ".mraw"})  # Photron
+CINE_SUFFIXES = frozenset({".cine", ".cin", ".cci"})  # Phantom
+HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
+SUFFIXES = IMAGE_SUFFIXES | VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES | HDF5_SUFFIXES
+NUMBER = "{number}"  # in a pattern: these digits count the frames
+
+
+def split_member(pattern: str) -> tuple[str, str]:
+    """Pattern of the files and what else a pattern says, "" for most.
+
+    "frames.h5:/left" is ("frames.h5", "/left"), "a/{number}.png" is ("a/*.png", "a/{number}.png").
+    """
+    if NUMBER in pattern:
+        return pattern.replace(NUMBER, "*"), pattern
+    file, colon, member = pattern.rpartition(":")
+    if colon and Path(file).suffix.lower() in HDF5_SUFFIXES:
+        return file, member
+    return pattern, ""
 
 
 def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
@@ -49,3 +69,11 @@ def file_number(file: Path) -> int | None:
     """The last run of digits in a file's name, which is the frame's number as the camera counted; None without one."""
     runs = re.findall(r"[0-9]+", file.stem)
     return int(runs[-1]) if runs else None
+
+
+def content_of(file: Path, where: str, most: int = MOST_IMAGE) -> bytes:
+    """Of a file of at most so many bytes. Raises RecordingError that begins with `where`."""
+    try:
+        return read_regular(file, most)
+    except OSError as error:
+        raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy it again.") from error

@@ -21,8 +21,8 @@ from calibration.kit.stuck_pixels import repair
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import IMAGE_SUFFIXES, Changed, FrameReader, split_member
-from disctrack.recording.readers.files import match_files
+from disctrack.recording.readers.base import Changed, FrameReader
+from disctrack.recording.readers.files import IMAGE_SUFFIXES, match_files, split_member
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
 MOST_DEAD = 0.01  # of all pixels: more, and it is the flat image that is wrong
@@ -47,13 +47,12 @@ class FlatField:
         """Is this a grey image of the camera's size and depth?"""
         return image.shape == self.dark.shape and image.dtype == _stored(self.bit_depth)
 
-    def corrected(self, image: Image, out: Image | None = None) -> Image:
-        """(height, width) uint16, full scale 65535, with offsets and gains taken out; into `out` if given."""
-        clipped = image >= 2**self.bit_depth - 1
+    def corrected(self, image: Image) -> Image:
+        """(height, width) uint16, full scale 65535, with offsets and gains taken out."""
         signal = cv2.subtract(image, self.dark, dtype=cv2.CV_32F)
-        found = np.empty(image.shape, np.uint16) if out is None else out
-        found[...] = cv2.multiply(signal, self.gain, scale=2.0 ** (16 - self.bit_depth), dtype=cv2.CV_16U)
-        found[clipped] = FULL_SCALE
+        scale = 2.0 ** (16 - self.bit_depth)
+        found: Image = np.asarray(cv2.multiply(signal, self.gain, scale=scale, dtype=cv2.CV_16U), np.uint16)
+        found[image >= 2**self.bit_depth - 1] = FULL_SCALE
         if self.dead is not None:
             repair(found, self.dead)
         return found
@@ -63,22 +62,7 @@ def _stored(bit_depth: int) -> type[np.uint8] | type[np.uint16]:
     return np.uint8 if bit_depth == 8 else np.uint16
 
 
-class FlatFielded(Changed):
-    """A camera's frames with its pixels' offsets and gains taken out."""
-
-    def __init__(self, reader: FrameReader, field: FlatField) -> None:
-        """Reader of the frames as the camera wrote them."""
-        super().__init__(reader, field.sha256)
-        self._field = field
-        self.notes = (*reader.notes, *field.notes)
-        self.bit_depth = 16
-
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, corrected."""
-        return self._field.corrected(self._reader.read(index), out)
-
-
-FlatFields = tuple[FlatField | None, FlatField | None]  # of the left and of the right camera
+FlatFields = tuple[FlatField | None, ...]  # of the left and of the right camera
 
 
 def flat_fields(folder: Path, patterns: Sequence[tuple[str | None, str | None]]) -> FlatFields:
@@ -86,8 +70,7 @@ def flat_fields(folder: Path, patterns: Sequence[tuple[str | None, str | None]])
 
     patterns : of each camera its flat and its dark images, relative to `folder`: a file, a pattern, or a folder
     """
-    left, right = (_flat_field(*images, folder, camera) for images, camera in zip(patterns, CAMERAS, strict=True))
-    return left, right
+    return tuple(_flat_field(*images, folder, camera) for images, camera in zip(patterns, CAMERAS, strict=True))
 
 
 def flat_fielded(readers: Sequence[FrameReader], fields: FlatFields) -> list[FrameReader]:
@@ -104,7 +87,7 @@ def _corrected(reader: FrameReader, field: FlatField | None, camera: str) -> Fra
     shape, depth = reader.image_size[::-1], reader.bit_depth
     if field is None:
         zero = np.zeros(shape, np.float32)
-        return FlatFielded(reader, FlatField(zero, zero + 1, None, depth, "none"))
+        field = FlatField(zero, zero + 1, None, depth, "none")
     if field.dark.shape != shape or field.bit_depth != depth:
         w, h = reader.image_size
         raise RecordingError(
@@ -112,7 +95,8 @@ def _corrected(reader: FrameReader, field: FlatField | None, camera: str) -> Fra
             f"{camera}_dark have {field.dark.shape[1]} x {field.dark.shape[0]} px of {field.bit_depth} bit. Take these "
             "with the settings of the recording, or leave them out."
         )
-    return FlatFielded(reader, field)
+    notes = (*reader.notes, *field.notes)
+    return Changed(reader, field.corrected, field.sha256, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))
 
 
 @dataclass(frozen=True)

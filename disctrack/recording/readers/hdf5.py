@@ -5,10 +5,10 @@ data set (or of its group) that are understood: `frame_rate` [Hz], `bit_depth`; 
 data set (n,) beside it. A data set that lies in one piece is read at the speed of memory.
 """
 
-import contextlib
 import hashlib
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ import numpy as np
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.recording.readers._inflate import inflated
-from disctrack.recording.readers.base import FrameReader, Frames, only_file
-from disctrack.recording.readers.raw import RawFile, RawFrames, check_frame_size
+from disctrack.recording.readers.base import FrameReader, only_file
+from disctrack.recording.readers.decoding import inflated
+from disctrack.recording.readers.raw import PixelLayout, RawFile, RawFrames, check_frame_size
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
@@ -37,8 +37,7 @@ def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameRead
     except OSError as error:
         raise RecordingError(f"{file}: not a readable HDF5 file ({error}). Copy it again.") from error
     try:
-        stack = _named(handle, member, file) if member else _only_stack(handle, file)
-        return _open(handle, stack, file, camera)
+        return _open(handle, _stack(handle, member, file), file, camera)
     except RecordingError:
         handle.close()
         raise
@@ -51,28 +50,26 @@ def _is_stack(item: object) -> bool:
     return isinstance(item, h5py.Dataset) and item.ndim == 3 and item.dtype.kind == "u" and item.dtype.itemsize <= 2
 
 
-def _named(handle: h5py.File, member: str, file: Path) -> h5py.Dataset:
-    item = handle.get(member)
+def _stack(handle: h5py.File, member: str, file: Path) -> h5py.Dataset:
+    """The data set of this name, or the only one that may be frames."""
+    item = handle.get(member) if member else None
     if _is_stack(item):
         return item
-    found = "nothing" if item is None else "a group"
-    if isinstance(item, h5py.Dataset):
-        found = f"a data set {item.shape} of {item.dtype}"
-    stacks = ", ".join(stack.name for stack in stacks_of(handle))
-    raise RecordingError(
-        f"{file}:{member} is {found}; expected frames (n, height, width) of 8 or 16 bit without sign. "
-        + (f"There are {stacks}." if stacks else "The file holds none.")
-    )
-
-
-def _only_stack(handle: h5py.File, file: Path) -> h5py.Dataset:
     stacks = stacks_of(handle)
-    if len(stacks) == 1:
-        return stacks[0]
+    names = ", ".join(stack.name for stack in stacks)
+    if member:
+        found = "nothing" if item is None else "a group"
+        if isinstance(item, h5py.Dataset):
+            found = f"a data set {item.shape} of {item.dtype}"
+        raise RecordingError(
+            f"{file}:{member} is {found}; expected frames (n, height, width) of 8 or 16 bit without sign. "
+            + (f"There are {names}." if stacks else "The file holds none.")
+        )
     if not stacks:
         raise RecordingError(f"{file}: holds no frames (n, height, width) of 8 or 16 bit without sign.")
-    names = ", ".join(stack.name for stack in stacks)
-    raise RecordingError(f"{file}: holds several stacks of frames: {names}. Name one: {file.name}:{stacks[0].name}")
+    if len(stacks) > 1:
+        raise RecordingError(f"{file}: holds several stacks of frames: {names}. Name one: {file.name}:{stacks[0].name}")
+    return stacks[0]
 
 
 def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
@@ -109,22 +106,34 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
             "write it again, or give the data set its true length."
         )
     _check_other_files(stack, file, where)
-    rate = _attribute(stack, "frame_rate")
-    bits = _attribute(stack, "bit_depth")
-    common: dict[str, Any] = {
-        "bit_depth": int(bits) if bits in _DEPTHS and stack.dtype.itemsize == 2 else None,
+    rate, bits = _attribute(stack, "frame_rate"), _attribute(stack, "bit_depth")
+    told: dict[str, Any] = {
+        "camera": camera,
+        "bit_depth": int(bits) if bits in _DEPTHS and stack.dtype.itemsize == 2 else 0,
         "timestamps": _timestamps(stack, n, where),
         "frame_rate": rate if rate is not None and rate > 0 else None,
     }
+    whole = _fills_its_bytes(stack)
     offset = stack.id.get_offset() if stack.chunks is None and not stack.external and not stack.is_virtual else None
-    if offset is not None and _fills_its_bytes(stack):
-        size = height * width * stack.dtype.itemsize
-        dtype = stack.dtype
+    if offset is not None and whole:
+        layout = PixelLayout(width, height, stack.dtype)
         handle.close()
         return RawFrames(
-            [RawFile(file)], np.zeros(n, int), offset + size * np.arange(n), (width, height), dtype, camera, **common
+            files=[RawFile(file)], offsets=offset + layout.frame_bytes * np.arange(n), layout=layout, **told
         )
-    return Hdf5Frames(file, handle, stack, camera, **common)
+    filters, together = _filters(stack), stack.chunks[0] if stack.chunks else 1
+    here = whole and stack.chunks == (1, height, width) and _DEFLATE in filters <= {_SHUFFLE, _DEFLATE}
+    slow = f"chunks of {together} frames are decompressed anew for each of them; chunks of one frame are read faster"
+    return Hdf5Frames(
+        file=file,
+        stack=stack,
+        shuffled=_SHUFFLE in filters,
+        random_access=bool(here),
+        notes=(slow,) if together > max(1, _LARGEST_CACHE // (width * height * stack.dtype.itemsize)) else (),
+        image_size=(int(width), int(height)),
+        dtype=stack.dtype.newbyteorder("="),
+        **told,
+    )
 
 
 def _frames_stored(stack: h5py.Dataset) -> int:
@@ -188,55 +197,27 @@ def _timestamps(stack: h5py.Dataset, n: int, where: str) -> Array | None:
     return values.astype(np.float64)
 
 
-class Hdf5Frames(Frames):
-    """A data set in chunks, with or without compression; see FrameReader.
+@dataclass(eq=False, kw_only=True)
+class Hdf5Frames(FrameReader):
+    """A data set in chunks, with or without compression.
 
     The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are, it delivers
-    the compressed bytes only, and frames are inflated side by side.
+    the compressed bytes only, and frames are inflated side by side: with random access.
     """
 
-    def __init__(
-        self,
-        file: Path,
-        handle: h5py.File,
-        stack: h5py.Dataset,
-        camera: str,
-        bit_depth: int | None,
-        timestamps: Array | None,
-        frame_rate: float | None,
-    ) -> None:
-        self.file, self.camera = file, camera
-        self._handle, self._stack = handle, stack
+    file: Path
+    stack: h5py.Dataset
+    shuffled: bool
+
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
-        self.image_size = (int(stack.shape[2]), int(stack.shape[1]))
-        self.dtype = stack.dtype.newbyteorder("=")
-        self.bit_depth = bit_depth or 8 * self.dtype.itemsize
-        self.timestamps, self.frame_rate = timestamps, frame_rate
-        self._digests: list[bytes | None] = [None] * int(stack.shape[0])
-        self._shuffled = _SHUFFLE in _filters(stack)
-        self.random_access = self._inflated_here = bool(
-            stack.chunks == (1, *stack.shape[1:])
-            and _DEFLATE in _filters(stack) <= {_SHUFFLE, _DEFLATE}
-            and _fills_its_bytes(stack)
-        )
-        frames_per_chunk = stack.chunks[0] if stack.chunks else 1
-        chunk_row = frames_per_chunk * self.image_size[0] * self.image_size[1] * self.dtype.itemsize
-        self.notes: tuple[str, ...] = ()
-        if frames_per_chunk > 1 and chunk_row > _LARGEST_CACHE:
-            self.notes = (
-                f"{camera} camera: chunks of {frames_per_chunk} frames are decompressed anew for each of them; "
-                "chunks of one frame are read faster",
-            )
+        super().__post_init__()
 
     def __len__(self) -> int:
-        return int(self._stack.shape[0])
-
-    def describe(self, index: int) -> str:
-        """File, data set and frame."""
-        return f"{self._place(index)}, frame {index}"
+        return int(self.stack.shape[0])
 
     def _place(self, index: int) -> str:
-        return f"{self.file}:{self._stack.name}"
+        return f"{self.file}:{self.stack.name}"
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         image, content = self._buffer(out), None
@@ -245,11 +226,11 @@ class Hdf5Frames(Frames):
                 size = self._stored_size(index)
                 if size == 0:
                     raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
-                if self._inflated_here and size <= 2 * image.nbytes + _SMALL:
-                    mask, content = self._stack.id.read_direct_chunk((index, 0, 0))
+                if self.random_access and size <= 2 * image.nbytes + _SMALL:
+                    mask, content = self.stack.id.read_direct_chunk((index, 0, 0))
                     content = None if mask else content  # some filter was left out
                 if content is None:
-                    self._stack.read_direct(image, np.s_[index])
+                    self.stack.read_direct(image, np.s_[index])
             except (OSError, RuntimeError, ValueError) as error:
                 raise RecordingError(f"{where}: cannot be read ({error}). Copy the file again.") from error
         if content is not None:
@@ -266,26 +247,15 @@ class Hdf5Frames(Frames):
                 "Copy the file again."
             )
         raw = np.frombuffer(whole, np.uint8)
-        if self._shuffled and self.dtype.itemsize > 1:
+        if self.shuffled and self.dtype.itemsize > 1:
             raw = np.ascontiguousarray(raw.reshape(self.dtype.itemsize, -1).T).reshape(-1)
-        image[...] = raw.view(self._stack.dtype).reshape(image.shape)
+        image[...] = raw.view(self.stack.dtype).reshape(image.shape)
 
     def _stored_size(self, index: int) -> int:
         """Bytes of the frame's chunks; 0 where one is missing: the library would deliver zeros without a word."""
-        if self._stack.chunks is None:
+        if self.stack.chunks is None:
             return 1
-        (frames, rows, columns), (_, height, width) = self._stack.chunks, self._stack.shape
+        (frames, rows, columns), (_, height, width) = self.stack.chunks, self.stack.shape
         corners = ((index - index % frames, y, x) for y in range(0, height, rows) for x in range(0, width, columns))
-        found = [self._stack.id.get_chunk_info_by_coord(corner) for corner in corners]
+        found = [self.stack.id.get_chunk_info_by_coord(corner) for corner in corners]
         return 0 if any(info.byte_offset is None for info in found) else sum(int(info.size) for info in found)
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 of size, type and grey values of frames start..stop-1; those already read are not read again."""
-        digest = hashlib.sha256(f"{self.image_size} {self.dtype.str}".encode())
-        image = np.empty(self.image_size[::-1], self.dtype)
-        for index in range(start, stop):
-            if self._digests[index] is None:
-                with contextlib.suppress(RecordingError):
-                    self.read(index, image)
-            digest.update(self._digests[index] or b"unreadable")
-        return digest.hexdigest()

@@ -1,6 +1,6 @@
 """Photron recordings: a header, .cih (text) or .cihx (XML), beside an .mraw file of frames without a gap."""
 
-import dataclasses
+import contextlib
 import math
 import re
 from collections.abc import Sequence
@@ -11,17 +11,18 @@ from xml.etree import ElementTree
 import numpy as np
 
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import MOST_TEXT, read_regular
+from disctrack.files.inputs import MOST_TEXT
 from disctrack.recording.readers.base import only_file
-from disctrack.recording.readers.camera_frames import (
-    PIXELS_PER_GROUP,
-    CameraFrames,
+from disctrack.recording.readers.camera_header import CameraHeader
+from disctrack.recording.readers.files import content_of
+from disctrack.recording.readers.raw import (
     PixelLayout,
+    RawFile,
+    RawFrames,
     bit_depth_of,
+    check_frame_size,
     check_present,
 )
-from disctrack.recording.readers.camera_header import CameraHeader
-from disctrack.recording.readers.raw import RawFile, check_frame_size
 
 # Where the entries that matter lie: name in the .cih, path below <cih> in the .cihx.
 _ENTRIES = {
@@ -49,34 +50,36 @@ _ENTRIES = {
 _TRIGGERS = ("Start", "Center", "End", "Random", "Manual", "Random Reset", "Random Center", "Random Manual")
 
 
-def open_mraw(files: Sequence[Path], camera: str) -> CameraFrames:
+def open_mraw(files: Sequence[Path], camera: str) -> RawFrames:
     """Frames of one camera. files: the header, or the .mraw file, or both.
 
     Raises RecordingError if header or frames are missing, do not fit each other, or are not grey values.
     """
     header_file, data_file = _pair_of(files, camera)
     entries = _Entries(header_file)
-    layout, saturation = _layout(entries)
-    file = RawFile(data_file)
+    layout, depth, saturation = _layout(entries)
+    file, notes = RawFile(data_file), []
     n = entries.whole("Total Frame")
     check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
-    layout, saturation, notes = _as_stored(file, layout, saturation)
-    header, remarks, doubts = _header(entries, saturation)
+    if layout.stored_bits == 16 and saturation != 0xFFFF:
+        largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file.path)), "<u2").max())
+        if largest > saturation:
+            notes.append(f"grey values go up to {largest}, not {saturation} as the header says; used as they are")
+            depth, saturation = 16, 0xFFFF
     if file.size >= (n + 1) * layout.frame_bytes:
         notes.append(f"{data_file.name} is longer than the {n} frames of its header; what follows them is not read")
-    offsets = np.arange(n, dtype=np.int64) * layout.frame_bytes
-    return CameraFrames(file, camera, layout, offsets, header, (header.sentence(), *remarks, *notes), doubts=doubts)
-
-
-def _as_stored(file: RawFile, layout: PixelLayout, saturation: int) -> tuple[PixelLayout, int, list[str]]:
-    """Layout and saturation, corrected where the first frame has larger values than the header allows."""
-    if layout.stored_bits != 16 or saturation == 0xFFFF:
-        return layout, saturation, []
-    largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file.path)), "<u2").max())
-    if largest <= saturation:
-        return layout, saturation, []
-    note = f"grey values go up to {largest}, not {saturation} as the header says; used as they are"
-    return dataclasses.replace(layout, bit_depth=16), 0xFFFF, [note]
+    header, remarks, doubts = _header(entries, saturation)
+    return RawFrames(
+        camera=camera,
+        files=[file],
+        offsets=np.arange(n, dtype=np.int64) * layout.frame_bytes,
+        layout=layout,
+        bit_depth=depth,
+        frame_rate=header.frame_rate,
+        header=header,
+        notes=(header.sentence(), *remarks, *notes),
+        doubts=doubts,
+    )
 
 
 def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
@@ -105,7 +108,7 @@ class _Entries:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        content = _content(file)
+        content = content_of(file, str(file), MOST_TEXT)
         self._texts = _from_xml(content, file) if file.suffix.lower() == ".cihx" else _from_text(content)
 
     def text(self, name: str) -> str:
@@ -130,13 +133,6 @@ class _Entries:
 
 
 _EXPORT = "Export the recording again, or copy its header again."
-
-
-def _content(file: Path) -> bytes:
-    try:
-        return read_regular(file, MOST_TEXT)
-    except OSError as error:
-        raise RecordingError(f"{file}: cannot be read: {error.strerror}. Copy it again.") from error
 
 
 def _from_text(content: bytes) -> dict[str, str]:
@@ -177,44 +173,35 @@ def _trigger_name(mode: str, pdc_mode: str) -> str:
     return _TRIGGERS[number] if number < len(_TRIGGERS) else f"mode {code}"
 
 
-def _layout(entries: _Entries) -> tuple[PixelLayout, int]:
-    """How the pixels lie, and the largest grey value that the header allows."""
+def _layout(entries: _Entries) -> tuple[PixelLayout, int, int]:
+    """How the pixels lie, the bits that carry grey values, and the largest one that the header allows."""
     file = entries.file
     if entries.text("File Format").lower() != "mraw":
         raise RecordingError(
             f"{file}: the frames were saved as {entries.text('File Format')[:20] or 'nothing known'}, not as MRAW. "
             "Name the image files instead."
         )
-    _refuse_colour(entries)
-    width, height = entries.whole("Image Width"), entries.whole("Image Height")
-    check_frame_size(width, height, str(file))
-    bits, effective = entries.whole("Color Bit"), entries.whole("EffectiveBit Depth")
-    if bits not in (8, 10, 12, 16):
-        raise RecordingError(
-            f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames in one of these."
-        )
-    if width * height % PIXELS_PER_GROUP[bits]:
-        raise RecordingError(
-            f"{file}: frames of {width} x {height} px with {bits} bit do not fill whole groups of bytes. Save them "
-            "with 16 bit."
-        )
-    effective = effective if 0 < effective <= bits else bits
-    high = bits == 16 and entries.text("EffectiveBit Side").lower() == "higher"
-    depth = 16 if high else bit_depth_of(bits, effective)
-    layout = PixelLayout(width, height, bits, depth)
-    return layout, ((1 << effective) - 1) << (bits - effective if high else 0)
-
-
-def _refuse_colour(entries: _Entries) -> None:
     kind, device = entries.text("Color Type").lower(), entries.text("Camera Type")
     mosaic = kind == "raw" and re.search(r"-C\b", device)  # the type's letter: -M- monochrome, -C- colour
     if kind not in ("mono", "raw", "") or mosaic:
         found = "a colour mosaic" if mosaic else f"of colour type {kind[:20]!r}"
         raise RecordingError(
-            f"{entries.file}: the frames are {found} "
-            f"({device[:60]}); expected grey values. A conversion here would mix what the sensor measured: record with "
-            "a monochrome camera."
+            f"{file}: the frames are {found} ({device[:60]}); expected grey values. A conversion here would mix what "
+            "the sensor measured: record with a monochrome camera."
         )
+    width, height = entries.whole("Image Width"), entries.whole("Image Height")
+    bits, effective = entries.whole("Color Bit"), entries.whole("EffectiveBit Depth")
+    if bits not in (8, 10, 12, 16):
+        raise RecordingError(
+            f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames in one of these."
+        )
+    check_frame_size(width, height, str(file), bits)
+    effective = effective if 0 < effective <= bits else bits
+    high = bits == 16 and entries.text("EffectiveBit Side").lower() == "higher"
+    packed = bits if bits in (10, 12) else 0
+    layout = PixelLayout(width, height, np.dtype("u1" if bits == 8 else "<u2"), packed)
+    depth = 16 if high else bit_depth_of(bits, effective)
+    return layout, depth, ((1 << effective) - 1) << (bits - effective if high else 0)
 
 
 def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
@@ -223,15 +210,21 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
     if rate is None:
         shown = entries.text("Record Rate(fps)")[:40]
         raise RecordingError(f"{entries.file}: 'Record Rate(fps)' is {shown!r}; expected a number above 0. {_EXPORT}")
-    step, doubts = _saved_step(entries)
-    remarks: list[str] = []
+    remarks, doubts = [], []
+    step, n = max(int(entries.number("Save Step") or 1), 1), entries.whole("Total Frame")
+    recorded = entries.number("Original Total Frame")
+    if step > 1 and recorded is not None and (n - 1) * step >= recorded:
+        doubts.append(
+            f"the header says that one frame in {step} was saved, but {n} of {recorded:g} recorded frames are there; "
+            "taken as consecutive"
+        )
+        step = 1
     nanoseconds = entries.number("Shutter Type2(nsec)")
     exposure = nanoseconds / 1e9 if nanoseconds else entries.number("Shutter Speed(s)")
     if exposure is not None and exposure * rate > 1.001:
         remarks.append(f"the header's exposure of {exposure:g} s is longer than a frame of {1 / rate:g} s; not used")
         exposure = None
-    first = entries.text("Start Frame")
-    name = entries.text("User Defined Camera Name")
+    first, name = entries.text("Start Frame"), entries.text("User Defined Camera Name")
     header = CameraHeader(
         file=str(entries.file),
         device=entries.text("Camera Type")[:80] + (f" ({name[:40]})" if name else ""),
@@ -240,28 +233,14 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
         exposure=exposure,
         trigger=entries.text("Trigger Mode")[:40],
         first_frame=int(first) if re.fullmatch(r"-?[0-9]{1,15}", first) else None,
-        recorded=_date(entries.text("Date"), entries.text("Time")),
+        recorded=_date(f"{entries.text('Date')} {entries.text('Time')}".strip()),
         saturation=saturation,
     )
     return header, remarks, tuple(doubts)
 
 
-def _saved_step(entries: _Entries) -> tuple[int, list[str]]:
-    """Of how many recorded frames one was saved; 1 and why where the header contradicts itself."""
-    step, n = int(entries.number("Save Step") or 1), entries.whole("Total Frame")
-    recorded = entries.number("Original Total Frame")
-    if step > 1 and recorded is not None and (n - 1) * step >= recorded:
-        return 1, [
-            f"the header says that one frame in {step} was saved, but {n} of {recorded:g} recorded frames are there; "
-            "taken as consecutive"
-        ]
-    return max(step, 1), []
-
-
-def _date(date: str, time: str) -> datetime | None:
+def _date(text: str) -> datetime | None:
     for form in ("%Y/%m/%d %H:%M:%S", "%Y/%m/%d %H:%M", "%Y/%m/%d"):
-        try:
-            return datetime.strptime(f"{date} {time}".strip() if "H" in form else date, form)
-        except ValueError:
-            continue
+        with contextlib.suppress(ValueError):
+            return datetime.strptime(text, form)
     return None

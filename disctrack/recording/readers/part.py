@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import Changed, FrameReader
@@ -35,31 +34,12 @@ class ImagePart:
         return f"[{self.x}, {self.y}, {self.width}, {self.height}]"
 
 
-ImageParts = tuple[ImagePart | None, ImagePart | None]  # of the left and of the right camera
+ImageParts = tuple[ImagePart | None, ...]  # of the left and of the right camera
 
 
 def image_parts(declared: Sequence[tuple[int, int, int, int] | None]) -> ImageParts:
     """Parts of the left and of the right camera, each as (x, y, width, height) [px] or None."""
-    left, right = (None if part is None else ImagePart(*part) for part in declared)
-    return left, right
-
-
-class FramesInPart(Changed):
-    """A camera's frames where they are a part of the file's."""
-
-    def __init__(self, reader: FrameReader, part: ImagePart) -> None:
-        """Reader of the whole images."""
-        super().__init__(reader, str(part))
-        self._part = part
-        self.image_size = (part.width, part.height)
-
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """The part of frame `index`."""
-        image = self._part.of(self._reader.read(index))
-        if out is None:
-            return image
-        out[...] = image
-        return out
+    return tuple(None if part is None else ImagePart(*part) for part in declared)
 
 
 def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> list[FrameReader]:
@@ -67,11 +47,14 @@ def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: st
     found: list[FrameReader] = []
     for reader, part, camera in zip(readers, parts, CAMERAS, strict=True):
         width, height = reader.image_size
-        if part is not None and not part.lies_in(width, height):
+        if part is None:
+            found.append(reader)
+            continue
+        if not part.lies_in(width, height):
             raise RecordingError(
                 f"{where}: [cameras] {camera}_part is {part}, columns {part.x} to {part.x + part.width - 1} and rows "
                 f"{part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It is "
                 "[x, y, width, height] in pixels, from the upper left corner."
             )
-        found.append(reader if part is None else FramesInPart(reader, part))
+        found.append(Changed(reader, part.of, str(part), image_size=(part.width, part.height)))
     return found

@@ -1,4 +1,4 @@
-"""Frames that lie uncompressed in a file, read at the speed of memory.
+"""Frames whose pixels lie in a file as they are, or packed, at known places: read at the speed of memory.
 
 Bytes go from the system's file cache straight into the caller's array by positioned reads. A memory map would need the
 same copy and its page faults, and a file that is cut short or a network that goes away would end the process instead of
@@ -7,26 +7,29 @@ raising an error.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import threading
 import weakref
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import open_regular
-from disctrack.recording.readers.base import Frames
+from disctrack.recording.readers._unpack_kernels import unpack_10, unpack_12
+from disctrack.recording.readers.base import FrameReader
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
 # Even a black image does not shrink by more than this when compressed (deflate: 1032); small ones are let pass.
 _MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
-_PIECE = 1 << 20  # bytes hashed at a time
+# A file that was cut short is worth measuring while most of it is there; a header that promises far more than the file
+# holds is not believed: all that follows is sized by it.
+LEAST_PRESENT = 0.5
 
 
 class RawFile:
@@ -83,77 +86,133 @@ class RawFile:
             view[: len(piece)] = piece
             return len(piece)
 
-    def update_digest(self, digest: hashlib._Hash, offset: int, size: int) -> None:
-        """Add `size` bytes from `offset` on to a digest; those that cannot be read count as missing."""
-        buffer = np.empty(min(_PIECE, max(size, 1)), np.uint8)
-        for start in range(offset, offset + size, _PIECE):
-            piece = buffer[: min(_PIECE, offset + size - start)]
-            try:
-                self.read_into(piece, start, "")
-            except RecordingError:
-                digest.update(b"unreadable")
-                return
-            digest.update(piece.data)
+
+@dataclass(frozen=True)
+class PixelLayout:
+    """How the pixels of one frame lie in the file."""
+
+    width: int  # [px]
+    height: int
+    dtype: np.dtype  # of a pixel in the file, with the order of its bytes; or of what packed ones become
+    packed_bits: int = 0  # 10 or 12 where pixels lie without a gap, most significant bit first
+    padding: int = 0  # bytes after each row; packed rows have none
+    bottom_up: bool = False
+    table: NDArray[np.uint16] | None = None  # grey value of each stored one
+
+    @property
+    def stored_bits(self) -> int:
+        """Of a pixel."""
+        return self.packed_bits or 8 * self.dtype.itemsize
+
+    @property
+    def frame_bytes(self) -> int:
+        """Of one frame."""
+        return self.width * self.height * self.stored_bits // 8 + self.padding * self.height
+
+    @property
+    def is_plain(self) -> bool:
+        """True where the bytes of the file are the image, but for their order in a pixel."""
+        return not (self.packed_bits or self.padding or self.bottom_up) and self.table is None
+
+    def decode(self, stored: NDArray[np.uint8], out: Image) -> None:
+        """Bytes of one frame (frame_bytes,) into pixels (height, width), contiguous, native uint8 or uint16."""
+        if self.packed_bits:
+            (unpack_10 if self.packed_bits == 10 else unpack_12)(stored, out.reshape(-1))
+        else:
+            rows = stored.reshape(self.height, -1)[:, : self.width * self.dtype.itemsize].view(self.dtype)
+            out[...] = rows[::-1] if self.bottom_up else rows
+        if self.table is not None:
+            np.take(self.table, out, out=out, mode="clip")
 
 
-class RawFrames(Frames):
-    """Frames of equal size at known places in one or several files; see FrameReader."""
+@dataclass(eq=False, kw_only=True)
+class RawFrames(FrameReader):
+    """Frames of equal size at known places in one or several files.
 
-    def __init__(
-        self,
-        files: Sequence[RawFile],
-        file_of_frame: NDArray[np.integer],
-        offsets: NDArray[np.integer],
-        image_size: tuple[int, int],
-        dtype: DTypeLike,
-        camera: str,
-        *,
-        bit_depth: int | None = None,
-        notes: tuple[str, ...] = (),
-        timestamps: Array | None = None,
-        frame_rate: float | None = None,
-    ) -> None:
-        """Frame i begins at byte offsets[i] of files[file_of_frame[i]]; dtype is that of the file, with byte order."""
-        self.files, self.camera, self.image_size = list(files), camera, image_size
-        self.file_of_frame, self.offsets = np.asarray(file_of_frame), np.asarray(offsets)
-        self.stored = np.dtype(dtype)
-        self.dtype = self.stored.newbyteorder("=")
-        self.bit_depth = bit_depth or 8 * self.stored.itemsize
-        self.notes, self.timestamps, self.frame_rate = notes, timestamps, frame_rate
-        self.frame_bytes = image_size[0] * image_size[1] * self.stored.itemsize
+    Frame i begins at byte offsets[i] of files[file_of_frame[i]]; it is lost where that is below 0, or where the file
+    ends before its end.
+    """
+
+    image_size: tuple[int, int] = field(init=False)
+    dtype: np.dtype = field(init=False)
+    files: Sequence[RawFile]
+    offsets: NDArray[np.integer]
+    layout: PixelLayout
+    file_of_frame: NDArray[np.integer] | int = 0
+
+    def __post_init__(self) -> None:
+        layout, n = self.layout, len(self.offsets)
+        self.image_size, self.dtype = (layout.width, layout.height), layout.dtype.newbyteorder("=")
+        self._coding = f"{layout.stored_bits} {layout.dtype.str} {layout.bottom_up} {layout.table is not None}"
+        self._file_of_frame = np.broadcast_to(self.file_of_frame, n)
+        ends = np.array([file.size for file in self.files])[self._file_of_frame]
+        lost = n - count_present(layout, self.offsets, ends)
+        if lost:
+            cut = f"{self.files[0].path}: lacks {lost} of {n} frames; they are left without an answer"
+            self.notes = (*self.notes, cut)
+        super().__post_init__()
 
     def __len__(self) -> int:
         return len(self.offsets)
 
-    def describe(self, index: int) -> str:
-        """File, frame and the byte where it begins."""
-        return f"{self._place(index)}, frame {index} at byte {self.offsets[index]}"
-
     def _place(self, index: int) -> str:
-        return str(self.files[self.file_of_frame[index]].path)
+        return str(self.files[self._file_of_frame[index]].path)
+
+    def _fill(self, buffer: NDArray[np.uint8], index: int, where: str) -> NDArray[np.uint8]:
+        if self.offsets[index] < 0:
+            raise RecordingError(f"{where}: there is no image of the right size where the file says. Copy it again.")
+        self.files[self._file_of_frame[index]].read_into(buffer, int(self.offsets[index]), where)
+        return buffer
+
+    def _stored(self, index: int) -> memoryview:
+        return self._fill(np.empty(self.layout.frame_bytes, np.uint8), index, "").data
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        image, file = self._buffer(out), self.files[self.file_of_frame[index]]
-        file.read_into(image.reshape(-1).view(np.uint8), int(self.offsets[index]), where)
-        if self.stored != self.dtype:
+        image = self._buffer(out)
+        if not self.layout.is_plain:
+            self.layout.decode(self._fill(np.empty(self.layout.frame_bytes, np.uint8), index, where), image)
+            return image
+        self._fill(image.reshape(-1).view(np.uint8), index, where)
+        if not self.layout.dtype.isnative:
             image.byteswap(inplace=True)
         return image
 
-    def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 of size, type and bytes of frames start..stop-1."""
-        digest = hashlib.sha256(f"{self.image_size} {self.stored.str}".encode())
-        for index in range(start, stop):
-            file = self.files[self.file_of_frame[index]]
-            file.update_digest(digest, int(self.offsets[index]), self.frame_bytes)
-        return digest.hexdigest()
+
+def count_present(layout: PixelLayout, offsets: NDArray[np.integer], ends: NDArray[np.integer] | int) -> int:
+    """How many of the frames at offsets (n,) lie wholly before the ends of their files."""
+    return int(np.sum((offsets >= 0) & (offsets <= np.subtract(ends, layout.frame_bytes))))
 
 
-def check_frame_size(width: int, height: int, where: str) -> None:
-    """Raise RecordingError, beginning with `where`, unless a header's image size is one that a camera can have."""
+def check_present(file: RawFile, camera: str, layout: PixelLayout, n: int, present: int) -> None:
+    """Raise RecordingError unless there are frames, and `present` of the n promised, most of them, are in the file."""
+    if n < 1:
+        raise RecordingError(f"{file.path} ({camera} camera): its header tells of no frame. Export it again.")
+    if present < LEAST_PRESENT * n or present * layout.frame_bytes > file.size:
+        raise RecordingError(
+            f"{file.path} ({camera} camera): the header tells of {n} frames of {layout.width} x {layout.height} px, "
+            f"{layout.stored_bits} bit, which need {n * layout.frame_bytes} bytes, but the file has {file.size}: it is "
+            "cut short, or the header is of another file. Copy both again."
+        )
+
+
+def bit_depth_of(stored_bits: int, effective_bits: int) -> int:
+    """Bits that carry grey values: as the header says where that is possible, else as stored."""
+    return effective_bits if 8 < effective_bits <= stored_bits else stored_bits
+
+
+def check_frame_size(width: int, height: int, where: str, bits: int = 8) -> None:
+    """Raise RecordingError, beginning with `where`, unless a header's image is one that a camera can have.
+
+    bits : of a pixel in the file; those of a frame must fill whole bytes
+    """
     if not (0 < width <= MOST_PIXELS and 0 < height <= MOST_PIXELS and width * height <= MOST_PIXELS):
         raise RecordingError(
             f"{where}: the header claims images of {width} x {height} px, which no camera of this kind has. "
             "The header is damaged, or not of this format: copy the file again."
+        )
+    if width * height * bits % 8:
+        raise RecordingError(
+            f"{where}: {width} x {height} px of {bits} bit do not fill whole bytes. Save them with 16 bit."
         )
 
 

@@ -3,24 +3,24 @@
 Pages without compression are read at the speed of memory.
 """
 
-import hashlib
 import json
 import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import FrameReader, Frames, first_readable
+from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey
-from disctrack.recording.readers.raw import RawFile, RawFrames, check_frame_size
+from disctrack.recording.readers.raw import PixelLayout, RawFile, RawFrames, check_frame_size
 from disctrack.recording.readers.tiff_pages import Page, page_pixels, pages_of
 
 
@@ -41,73 +41,54 @@ def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     The frame rate is taken from the notes of ImageJ or OME in the first page, time stamps from those of OME.
     """
     raw_files = [RawFile(file) for file in files]
-    pages, notes = [], []
+    pages: list[Page] = []
+    numbers: list[int] = []
+    notes = []
     for number, file in enumerate(raw_files):
         found, note = _pages(file)
-        pages += [(number, page) for page in found]
-        notes += [f"{camera} camera: {note}"] if note else []
+        pages += found
+        numbers += [number] * len(found)
+        notes += [note] if note else []
     if not pages:
         raise RecordingError(f"{files[0]}: a TIFF file without a page that can be read. Export it again.")
-    first = pages[0][1]
+    first = pages[0]
     rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.width, first.height, str(files[0]))
-    offsets = np.array([page.plain_offset for _, page in pages], np.int64)
-    if (offsets >= 0).all() and all(page.layout == first.layout for _, page in pages):
-        return RawFrames(
-            raw_files,
-            np.array([number for number, _ in pages]),
-            offsets,
-            (first.width, first.height),
-            first.dtype,
-            camera,
-            notes=tuple(notes),
-            timestamps=stamps,
-            frame_rate=rate,
-        )
-    return TiffPages(raw_files, pages, camera, tuple(notes), stamps, rate)
+    told: dict[str, Any] = {"camera": camera, "notes": tuple(notes), "timestamps": stamps, "frame_rate": rate}
+    offsets = np.array([page.plain_offset for page in pages], np.int64)
+    if (offsets >= 0).all() and all(page.layout == first.layout for page in pages):
+        layout = PixelLayout(first.width, first.height, first.dtype)
+        return RawFrames(files=raw_files, file_of_frame=np.array(numbers), offsets=offsets, layout=layout, **told)
+    sources = [raw_files[number] for number in numbers]
+
+    def decoded(index: int) -> Image:
+        where = str(sources[index].path)
+        return as_grey(page_pixels(sources[index], pages[index], where), where)
+
+    image = first_readable(len(pages), camera, decoded)
+    size = image.shape[1], image.shape[0]
+    return TiffPages(files=sources, pages=pages, image_size=size, dtype=image.dtype, **told)
 
 
-class TiffPages(Frames):
-    """Pages that are compressed, or otherwise not plain; see FrameReader."""
+@dataclass(eq=False, kw_only=True)
+class TiffPages(FrameReader):
+    """Pages that are compressed, or otherwise not plain."""
 
-    def __init__(
-        self,
-        files: Sequence[RawFile],
-        pages: Sequence[tuple[int, Page]],
-        camera: str,
-        notes: tuple[str, ...],
-        timestamps: Array | None,
-        frame_rate: float | None,
-    ) -> None:
-        """Frames from pages, each with the number of its file."""
-        self._files, self._pages, self.camera = list(files), list(pages), camera
-        self.timestamps, self.frame_rate, self.notes = timestamps, frame_rate, notes
-        first = first_readable(len(pages), camera, lambda index: self._decoded(index, None, self._place(index)))
-        self.image_size, self.dtype = first.shape[::-1], first.dtype
-        self.bit_depth = 8 * first.itemsize
+    files: Sequence[RawFile]  # of each frame
+    pages: Sequence[Page]
 
     def __len__(self) -> int:
-        return len(self._pages)
-
-    def describe(self, index: int) -> str:
-        """File and page."""
-        return f"{self._place(index)}, frame {index} (directory at byte {self._pages[index][1].directory})"
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 of the pages of frames start..stop-1, as they are stored."""
-        total = hashlib.sha256()
-        for number, page in self._pages[start:stop]:
-            total.update(hashlib.sha256(page.layout.encode()).digest())
-            for place, size in zip(page.places, page.sizes, strict=True):
-                self._files[number].update_digest(total, place, size)
-        return total.hexdigest()
+        return len(self.pages)
 
     def _place(self, index: int) -> str:
-        return str(self._files[self._pages[index][0]].path)
+        return str(self.files[index].path)
+
+    def _stored(self, index: int) -> bytes:
+        page = self.pages[index]
+        return page.layout.encode() + b"".join(page.pieces(self.files[index], ""))
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        number, page = self._pages[index]
-        return as_grey(page_pixels(self._files[number], page, where), where)
+        return as_grey(page_pixels(self.files[index], self.pages[index], where), where)
 
 
 def _pages(file: RawFile) -> tuple[list[Page], str | None]:
@@ -143,14 +124,16 @@ def _without_directories(file: RawFile, first: Page) -> list[Page]:
 
 def _pages_announced(description: str) -> int:
     """Frames behind one directory by ImageJ's note, or by that of tifffile where it left out the others."""
-    if description.startswith("ImageJ="):
-        found = re.search(r"^images=([0-9]{1,12})\s*$", description, re.MULTILINE)
-        return int(found.group(1)) if found else 0
-    if description.startswith("{") and '"truncated"' in description:
-        with suppress(ValueError, TypeError, KeyError, OverflowError, RecursionError):  # no note of that kind
-            *several, _, _ = json.loads(description)["shape"]
-            return math.prod(map(int, several))
+    with suppress(ValueError, TypeError, KeyError, OverflowError, RecursionError):  # no note of that kind
+        if description.startswith("ImageJ="):
+            return int(_imagej(description)["images"])
+        *several, _, _ = json.loads(description)["shape"]
+        return math.prod(map(int, several)) if '"truncated"' in description else 0
     return 0
+
+
+def _imagej(description: str) -> dict[str, str]:
+    return dict(re.findall(r"^(\w+)=(\S+)\s*$", description, re.MULTILINE))
 
 
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -159,11 +142,8 @@ _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-
 def _times(description: str, n: int) -> tuple[float | None, Array | None]:
     """Frame rate [Hz] and time stamps [s] by ImageJ's or OME's notes, None where they say nothing."""
     if description.startswith("ImageJ="):
-        for key, invert in (("finterval", True), ("fps", False)):
-            found = re.search(rf"^{key}=(\S+)\s*$", description, re.MULTILINE)
-            value = _positive(found.group(1)) if found else None
-            if value is not None:
-                return (1.0 / value if invert else value), None
+        interval, rate = (_positive(_number(_imagej(description).get(key))) for key in ("finterval", "fps"))
+        return (1.0 / interval if interval else rate), None
     if "<OME" in description[:1000]:
         return _ome_times(description, n)
     return None, None
@@ -178,25 +158,23 @@ def _ome_times(description: str, n: int) -> tuple[float | None, Array | None]:
     pixels = next((item for item in root.iter() if item.tag.endswith("Pixels")), None)
     if pixels is None:
         return None, None
-    increment = _positive(pixels.get("TimeIncrement", ""))
-    unit = _TIME_UNITS.get(pixels.get("TimeIncrementUnit", "s"))
-    stamps = []
-    for plane in (item for item in pixels if item.tag.endswith("Plane")):
-        seconds, scale = _finite(plane.get("DeltaT", "")), _TIME_UNITS.get(plane.get("DeltaTUnit", "s"))
-        if seconds is not None and scale is not None:
-            stamps.append(seconds * scale)
-    rate = 1.0 / (increment * unit) if increment and unit else None
-    return rate, np.array(stamps) if len(stamps) == n else None
+
+    def seconds(item: ElementTree.Element, key: str) -> float:
+        return _number(item.get(key)) * _TIME_UNITS.get(item.get(f"{key}Unit", "s"), math.nan)
+
+    stamps = np.array([seconds(item, "DeltaT") for item in pixels if item.tag.endswith("Plane")])
+    stamps = stamps[np.isfinite(stamps)]
+    interval = _positive(seconds(pixels, "TimeIncrement"))
+    return 1.0 / interval if interval else None, stamps if len(stamps) == n else None
 
 
-def _finite(text: str) -> float | None:
+def _number(text: object) -> float:
+    """NaN where it is none."""
     try:
-        value = float(text)
+        return float(str(text))
     except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+        return math.nan
 
 
-def _positive(text: str) -> float | None:
-    value = _finite(text)
-    return value if value is not None and value > 0 and math.isfinite(1.0 / value) else None
+def _positive(value: float) -> float | None:
+    return value if 0 < value < math.inf and 1.0 / value < math.inf else None

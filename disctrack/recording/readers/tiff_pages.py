@@ -27,27 +27,21 @@ _READ = frozenset((1, 5, 7, 8, 32773, 32946))  # compressions: none, LZW, JPEG, 
 _LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
 
 
-class TiffContent:
+class Content(RawFile):
     """A file's content that was read already."""
 
-    def __init__(self, content: bytes, path: Path = Path("TIFF content")) -> None:
-        self._content, self.size, self.path = content, len(content), path
+    def __init__(self, content: bytes) -> None:
+        self._content, self.size, self.path = content, len(content), Path("TIFF content")
 
-    def bytes_at(self, offset: int, size: int, where: str) -> bytes:
-        """Bytes from an offset on. Raises RecordingError where there are fewer."""
-        if offset < 0 or size < 0 or offset + size > self.size:
-            raise RecordingError(f"{where}: {size} bytes at byte {offset} are announced, but there are {self.size}.")
-        return self._content[offset : offset + size]
-
-
-Source = RawFile | TiffContent
+    def _read_some(self, view: memoryview, offset: int) -> int:
+        view[:] = self._content[offset : offset + len(view)]
+        return len(view)
 
 
 @dataclass(frozen=True)
 class Page:
     """One page: where its directory and the pieces of its pixels lie."""
 
-    directory: int  # byte offset
     places: tuple[int, ...]  # byte offsets of strips or tiles
     sizes: tuple[int, ...]  # [bytes]
     layout: str  # all by which the pixels are decoded
@@ -81,8 +75,12 @@ class Page:
         one = len(self.places) == 1
         return self.places[0] if one or (follow and sum(self.sizes) == size) else -1
 
+    def pieces(self, source: RawFile, where: str) -> list[bytes]:
+        """Strips or tiles as they are stored. Raises RecordingError."""
+        return [source.bytes_at(a, n, where) for a, n in zip(self.places, self.sizes, strict=True)]
 
-def pages_of(source: Source) -> Iterator[Page]:
+
+def pages_of(source: RawFile) -> Iterator[Page]:
     """The pages of a file but for thumbnails. Raises RecordingError where they break off, or there is none."""
     layouts: dict[str, tifffile.TiffPage] = {}
     seen: set[int] = set()
@@ -113,7 +111,7 @@ def pages_of(source: Source) -> Iterator[Page]:
 class _Stream(io.RawIOBase):
     """A source as tifffile wants it; never more bytes at once than the file has."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: RawFile) -> None:
         self._source, self._at = source, 0
 
     def seekable(self) -> bool:
@@ -138,28 +136,29 @@ def _page(page: tifffile.TiffPage, layouts: dict[str, tifffile.TiffPage]) -> Pag
     layout = page.parent.byteorder + repr([page.tags.valueof(code) for code in _LAYOUT])
     places, sizes = (tuple(map(int, numbers)) for numbers in (page.dataoffsets, page.databytecounts))
     like = layouts.setdefault(layout, page)
-    return Page(page.offset, places, sizes, layout, like, page.description)
+    return Page(places, sizes, layout, like, page.description)
 
 
 def _orientation(page: tifffile.TiffPage) -> int:
     return int(page.tags.valueof(274, default=1))
 
 
-def page_pixels(source: Source, page: Page, where: str) -> NDArray:
+def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
     """Pixels of a page, (height, width) or (height, width, channels), upright and light is more; a palette looked up.
 
     Raises RecordingError that begins with `where`.
     """
     try:
-        return np.ascontiguousarray(_decoded(page.like, _checked_pieces(source, page, where)))
+        _check(page, where)
+        return np.ascontiguousarray(_decoded(page.like, page.pieces(source, where)))
     except RecordingError:
         raise
     except Exception as error:  # whatever damaged numbers and pieces make of it
         raise RecordingError(f"{where}: the page is damaged ({error}). Copy or export it again.") from error
 
 
-def _checked_pieces(source: Source, page: Page, where: str) -> list[bytes]:
-    """Compressed strips or tiles, of a page whose numbers fit each other and the file."""
+def _check(page: Page, where: str) -> None:
+    """Raise RecordingError unless a page's numbers fit each other, and its pixels are compressed in a known way."""
     like = page.like
     check_frame_size(page.width, page.height, where)
     if like.compression not in _READ:
@@ -176,7 +175,6 @@ def _checked_pieces(source: Source, page: Page, where: str) -> list[bytes]:
             f"{where}: {len(page.places)} pieces of {sum(page.sizes)} bytes in all do not make up its {page.width} x "
             f"{page.height} px; the page is damaged. Copy it again."
         )
-    return [source.bytes_at(a, n, where) for a, n in zip(page.places, page.sizes, strict=True)]
 
 
 def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> NDArray:

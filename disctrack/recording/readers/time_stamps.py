@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.camera_header import header_of, start_offset
+from disctrack.recording.readers.camera_header import start_offset
 
 RATE_TOLERANCE = 0.01  # of the declared rate; a clock's error is a thousandth of that, a wrong unit far more
 LOST = 1.5  # periods between two frames: beyond, at least one is missing
@@ -44,7 +44,7 @@ def check_time_stamps(
         else:
             usable.append(reader.timestamps)
             warnings += _lost_frames(camera, reader.timestamps, frame_rate)
-    ours, theirs = header_of(left), header_of(right)
+    ours, theirs = left.header, right.header
     offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
     if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
         theirs_shifted = usable[1] + (0.0 if offset is None else offset[0])

@@ -6,8 +6,8 @@ import ctypes
 import hashlib
 import os
 import threading
+import zlib
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
-from disctrack.recording.readers._ffv1 import checksums_hold
-from disctrack.recording.readers.base import Frames, first_readable, only_file
+from disctrack.recording.readers.base import FrameReader, first_readable, only_file
 from disctrack.recording.readers.decoding import as_grey
 from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size
 
@@ -29,7 +28,6 @@ if TYPE_CHECKING:  # an optional package
 # Nothing but containers for frames: a play list under a video's name could make the library open other files.
 _CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
 _LOSSLESS = frozenset({"ffv1", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "magicyuv", "png", "tiff", "v210", "qtrle"})
-_MOST_CURSORS = 2  # stretches of a recording that may be read side by side
 _LOOKED_AT = 8  # packets: one with a right checksum among the first tells that there are checksums
 _DECODED_ON = 8  # frames: opening the file anew and seeking costs more than to decode these and drop them
 
@@ -43,44 +41,47 @@ def open_video(files: Sequence[Path], camera: str) -> VideoFile:
     return VideoFile(only_file(files, camera), camera)
 
 
-class VideoFile(Frames):
-    """Frames of a video in order of presentation; see FrameReader. Best read forwards, by one thread.
+class VideoFile(FrameReader):
+    """Frames of a video in order of presentation. Best read forwards, by one thread.
 
     Grey values are the luma plane as it is stored, not stretched from limited to full range. Frames are found by their
-    time in the container: going back starts at the key frame before.
+    time in the container: going back starts at the key frame before. There are no time stamps: those of the container
+    are a player's, not the camera's.
     """
-
-    random_access = False  # and without time stamps: those of the container are a player's, not the camera's
 
     def __init__(self, file: Path, camera: str) -> None:
         self.file, self.camera = file, camera
         self._lock = threading.Lock()
-        self._cursors: list[_Cursor] = []  # the last used one last
-        self._digest: bytes | None = None
+        self._container: InputContainer | None = None
+        self._frames: Generator[_Decoded, None, None]
+        self._next = 0  # the next frame of the decoder is this one, or one that follows
+        self._held: _Decoded = (-1, None, "")
+        self._content: bytes | None = None
         with _opened(file, camera) as container:
             codec = container.streams.video[0].codec_context
             check_frame_size(codec.width, codec.height, str(file))
             codec_name = str(codec.name)
-            self._index = _index(container, codec_name, file)
+            # in order of presentation, in units of the container; without usable times frames are counted
+            self._times, self._keys, self._timed, self._checked = _index(container, codec_name, file)
 
         def looked_at(index: int) -> tuple[av.VideoFrame, Image]:
             frame = self._frame(index, self.describe(index))
             return frame, _luma(frame, self.describe(index))
 
         frame, first = first_readable(len(self), camera, looked_at)
-        notes = _format_notes(frame)
-        self.image_size, self.dtype, self.bit_depth = first.shape[::-1], first.dtype, _depth(frame)
-        if codec_name not in _LOSSLESS:
-            notes.append(f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss")
-        self.notes = tuple(f"{camera} camera: {note}" for note in notes)
-        self.doubts = tuple(f"{camera} camera: {doubt}" for doubt in _gap_doubts(self._index.times))
+        lossy = f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss"
+        super().__init__(
+            camera=camera,
+            image_size=(first.shape[1], first.shape[0]),
+            dtype=first.dtype,
+            bit_depth=_depth(frame),
+            notes=(*_format_notes(frame), *((lossy,) if codec_name not in _LOSSLESS else ())),
+            doubts=tuple(_gap_doubts(self._times)),
+            random_access=False,
+        )
 
     def __len__(self) -> int:
-        return len(self._index.times)
-
-    def describe(self, index: int) -> str:
-        """File and frame."""
-        return f"{self.file}, frame {index}"
+        return len(self._times)
 
     def _place(self, index: int) -> str:
         return str(self.file)
@@ -92,121 +93,53 @@ class VideoFile(Frames):
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 of the file and the range: compressed frames cannot be told apart without decoding them."""
-        if self._digest is None:
+        if self._content is None:
             try:
                 with self.file.open("rb") as stream:
-                    self._digest = hashlib.file_digest(stream, "sha256").digest()
+                    self._content = hashlib.file_digest(stream, "sha256").digest()
             except OSError:  # the file went away: what was measured stays, but no other run will be taken for the same
-                self._digest = b"unreadable" + os.urandom(16)
-        return hashlib.sha256(self._digest + f"{start}:{stop}".encode()).hexdigest()
+                self._content = b"unreadable" + os.urandom(16)
+        return hashlib.sha256(self._content + f"{start}:{stop}".encode()).hexdigest()
 
     def _frame(self, index: int, where: str) -> av.VideoFrame:
-        try:
-            cursor = self._cursor_near(index)
-        except RecordingError as error:  # the file is opened anew to go back
-            raise RecordingError(f"{where}: {error}") from error
-        return cursor.frame(index, where)
-
-    def _cursor_near(self, index: int) -> _Cursor:
-        """A place in the file from which frame `index` is reached soonest."""
-        start = min(self._index.key_before(index), max(index - _DECODED_ON, 0))
-        behind = [cursor for cursor in self._cursors if start <= cursor.next <= index]
-        if behind:
-            cursor = max(behind, key=lambda cursor: cursor.next)
-            self._cursors.remove(cursor)
-        else:
-            if len(self._cursors) >= _MOST_CURSORS:
-                self._cursors.pop(0).close()
-            cursor = _Cursor(self.file, self.camera, self._index, self._index.key_before(index))
-        self._cursors.append(cursor)
-        return cursor
-
-
-@dataclass(frozen=True)
-class _Index:
-    """Where the frames of a video are in its own time."""
-
-    times: NDArray[np.int64]  # (n,) in order of presentation, in units of the container
-    key_frames: NDArray[np.int64]  # indices of the frames at which decoding can begin; 0 is one
-    timed: bool  # False where the container has no times: frames are counted
-    checked: bool  # packets carry checksums that the decoder does not enforce
-
-    def key_before(self, index: int) -> int:
-        return int(self.key_frames[np.searchsorted(self.key_frames, index, side="right") - 1])
-
-
-def _index(container: InputContainer, codec: str, file: Path) -> _Index:
-    """Times of all packets; in containers without usable times, their numbers, and one key frame: the first."""
-    import av
-
-    times: list[int | None] = []
-    order: list[int | None] = []
-    keys: list[bool] = []
-    checked = False
-
-    try:
-        for packet in container.demux(container.streams.video[0]):
-            if packet.size:
-                if codec == "ffv1" and not checked and len(times) < _LOOKED_AT:
-                    checked = checksums_hold(bytes(packet))
-                times.append(packet.pts)
-                order.append(packet.dts)
-                keys.append(bool(packet.is_keyframe))
-    except (av.FFmpegError, OSError) as error:
-        if not times:
-            raise RecordingError(f"{file}: damaged video ({error}). Copy it again.") from error
-    if not times:
-        raise RecordingError(f"{file}: a video without frames. Export it again.")
-    if None in times or len(set(times)) < len(times):
-        times = order
-    if None in times or len(set(times)) < len(times):
-        return _Index(np.arange(len(times)), np.zeros(1, np.int64), False, checked)
-    stamps = np.array(times, np.int64)
-    presented = np.argsort(stamps, kind="stable")
-    key_frames = np.flatnonzero(np.array(keys)[presented])
-    return _Index(stamps[presented], np.union1d(key_frames, [0]), True, checked)
-
-
-class _Cursor:
-    """A decoder at some place of the file. Frames that it must pass over are decoded and dropped."""
-
-    def __init__(self, file: Path, camera: str, index: _Index, start: int) -> None:
-        self.next = start
-        self._index = index
-        self._container = _opened(file, camera)
-        self._held: _Decoded | None = None  # decoded already, but not asked for yet
-        try:
-            if start:
-                stream = self._container.streams.video[0]
-                self._container.seek(int(index.times[start]), stream=stream, backward=True)
-        except (OSError, ValueError):
-            self._container.close()
-            self._container, self.next = _opened(file, camera), 0
-        self._frames = self._decode()
-
-    def close(self) -> None:
-        self._frames.close()
-        self._container.close()
-
-    def frame(self, index: int, where: str) -> av.VideoFrame:
-        """The decoded frame `index`, which must not lie before `next`."""
-        self.next = index + 1
-        position, frame, problem = self._held or (-1, None, "")
-        while position < index:
-            position, frame, problem = next(self._frames, (len(self._index.times), None, ""))
-        self._held = (position, frame, problem) if position > index else None
+        """The decoded frame. Raises RecordingError."""
+        key = int(self._keys[np.searchsorted(self._keys, index, side="right") - 1])
+        if self._container is None or not min(key, index - _DECODED_ON) <= self._next <= index:
+            try:
+                self._start_at(key)
+            except RecordingError as error:  # the file is opened anew
+                raise RecordingError(f"{where}: {error}") from error
+        self._next = index + 1
+        while self._held[0] < index:
+            self._held = next(self._frames, (len(self), None, ""))
+        position, frame, problem = self._held
         if position > index:
             raise RecordingError(f"{where}: the video does not hold this frame, or it is cut short. Copy it again.")
         if frame is None:
             raise RecordingError(f"{where}: cannot be decoded ({problem}). Copy or export the video again.")
         return frame
 
-    def _decode(self) -> Generator[_Decoded, None, None]:
-        """All frames from here on in order; after damage none is trusted up to the next key frame."""
+    def _start_at(self, key: int) -> None:
+        """Decode from a key frame on; from the beginning where it cannot be found."""
+        if self._container is not None:
+            self._frames.close()
+            self._container.close()
+        self._container, self._next, self._held = _opened(self.file, self.camera), key, (-1, None, "")
+        try:
+            if key:
+                stream = self._container.streams.video[0]
+                self._container.seek(int(self._times[key]), stream=stream, backward=True)
+        except (OSError, ValueError):
+            self._container.close()
+            self._container, self._next = _opened(self.file, self.camera), 0
+        self._frames = self._decoding(self._container, self._next)
+
+    def _decoding(self, container: InputContainer, count: int) -> Generator[_Decoded, None, None]:
+        """All frames from number `count` on in order; after damage none is trusted up to the next key frame."""
         import av
 
-        count, damage = self.next, ""
-        packets = self._container.demux(self._container.streams.video[0])
+        damage = ""
+        packets = container.demux(container.streams.video[0])
         while True:
             try:
                 packet = next(packets, None)
@@ -217,7 +150,7 @@ class _Cursor:
             if packet.is_keyframe and packet.size:
                 damage = ""
             try:
-                if self._index.checked and packet.size and not checksums_hold(bytes(packet)):
+                if self._checked and packet.size and not checksums_hold(bytes(packet)):
                     damage = damage or "wrong checksum"
                 frames = packet.decode()
             except (av.FFmpegError, OSError, ValueError) as error:
@@ -234,9 +167,63 @@ class _Cursor:
 
     def _position(self, item: av.Packet | av.VideoFrame, count: int) -> int:
         """Index of a packet or frame by its time; by counting where the container has no times."""
-        if not self._index.timed or item.pts is None:
-            return count
-        return int(np.searchsorted(self._index.times, item.pts))
+        return int(np.searchsorted(self._times, item.pts)) if self._timed and item.pts is not None else count
+
+
+def _index(
+    container: InputContainer, codec: str, file: Path
+) -> tuple[NDArray[np.int64], NDArray[np.int64], bool, bool]:
+    """Times of all packets, and the indices at which decoding can begin; 0 is one.
+
+    Are the times the container's (in those without usable ones, frames are counted); do packets carry checksums, that
+    the decoder does not enforce?
+    """
+    import av
+
+    stamps: list[tuple[int | None, int | None, bool]] = []  # of presentation, of decoding; key frame
+    checked = False
+    try:
+        for packet in container.demux(container.streams.video[0]):
+            if packet.size:
+                if codec == "ffv1" and not checked and len(stamps) < _LOOKED_AT:
+                    checked = checksums_hold(bytes(packet))
+                stamps.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
+    except (av.FFmpegError, OSError) as error:
+        if not stamps:
+            raise RecordingError(f"{file}: damaged video ({error}). Copy it again.") from error
+    if not stamps:
+        raise RecordingError(f"{file}: a video without frames. Export it again.")
+    *both, keys = zip(*stamps, strict=True)
+    times = next((times for times in both if None not in times and len(set(times)) == len(times)), None)
+    if times is None:
+        return np.arange(len(stamps)), np.zeros(1, np.int64), False, checked
+    presented = np.argsort(times, kind="stable")
+    first_of_all = np.union1d(np.flatnonzero(np.array(keys)[presented]), [0])
+    return np.array(times, np.int64)[presented], first_of_all, True, checked
+
+
+# zlib computes the CRC of FFV1 with the bits of every byte in the other order
+_REVERSED = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1).ravel()
+_FOOTER = 8
+
+
+def checksums_hold(packet: bytes) -> bool:
+    """True if a packet of FFV1 is a chain of slices whose checksums are right.
+
+    The decoder reports a wrong one to its log alone and delivers the damaged frame. RFC 9043, section 4.9: each slice
+    ends in its size (24 bits), and with error detection in an error status (8 bits) and a parity that makes the CRC of
+    the whole slice zero (polynomial 0x04C11DB7, start 0, most significant bit first).
+    """
+    mirrored = _REVERSED[np.frombuffer(packet, np.uint8)].tobytes()
+    stop = len(packet)
+    while stop:
+        if stop < _FOOTER:
+            return False
+        start = stop - _FOOTER - int.from_bytes(packet[stop - _FOOTER : stop - _FOOTER + 3], "big")
+        if start < 0 or packet[stop - 5] or zlib.crc32(memoryview(mirrored)[start:stop], 0xFFFFFFFF) != 0xFFFFFFFF:
+            return False
+        stop = start
+    return True
 
 
 def _opened(file: Path, camera: str) -> InputContainer:

@@ -15,7 +15,7 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.recording.readers.camera_header import check_headers, header_of
+from disctrack.recording.readers.camera_header import check_headers
 from disctrack.recording.readers.cine import linear_from_10_bits
 from disctrack.recording.readers.time_stamps import check_time_stamps
 from tests.oracles.camera_files import TRIGGER, write_cine
@@ -40,7 +40,7 @@ def test_every_depth_returns_the_pixels_that_were_written(tmp_path, rng, bits, p
     reader = open_frames("left.cine", tmp_path, "left")
     assert isinstance(reader, FrameReader)
     assert (len(reader), reader.image_size) == (7, (32, 24))
-    assert (reader.bit_depth, header_of(reader).saturation) == (int(np.log2(largest + 1)), largest)
+    assert (reader.bit_depth, reader.header.saturation) == (int(np.log2(largest + 1)), largest)
     out = np.zeros((24, 32), codes.dtype)
     for i in range(len(reader)):
         assert_array_equal(reader.read(i), grey[i])
@@ -124,7 +124,7 @@ def test_codes_of_10_bits_agree_with_the_published_table():
 def test_settings_and_times_come_from_the_file(tmp_path, rng):
     write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8)
     reader = open_frames("left.cine", tmp_path, "left")
-    header = header_of(reader)
+    header = reader.header
     assert (header.frame_rate, reader.frame_rate, header.first_frame) == (2000.0, 2000.0, -3)
     assert header.exposure == pytest.approx(50e-6, rel=1e-12)
     assert header.trigger_time == TRIGGER[1] + 0.25
@@ -141,7 +141,7 @@ def test_an_older_setup_lacks_its_later_fields(tmp_path, rng):
     write_cine(tmp_path / "left.cine", codes, 8, setup_bytes=1200)
     reader = open_frames("left.cine", tmp_path, "left")
     assert_array_equal(reader.read(0), codes[0])
-    assert header_of(reader).exposure == pytest.approx(50e-6)  # in microseconds there
+    assert reader.header.exposure == pytest.approx(50e-6)  # in microseconds there
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_a_recording_of_which_every_tenth_frame_was_saved_has_a_tenth_of_the_rat
     write_cine(
         tmp_path / "left.cine", random_codes(rng, 8), 8, rate=90_000, times=np.arange(7) / 9000, exposure_ns=10_000
     )
-    header = header_of(open_frames("left.cine", tmp_path, "left"))
+    header = open_frames("left.cine", tmp_path, "left").header
     assert (header.frame_rate, header.step) == (9000, 10)
     assert "9000 Hz (90000 Hz, one frame in 10 saved)" in header.sentence()
 
@@ -197,7 +197,7 @@ def test_a_grey_head_of_a_colour_camera_is_grey(tmp_path, rng):
     ("offset", "kind", "value", "reason"),
     [
         (0, "2s", b"XX", "not a cine file"),
-        (20, "I", 0, "no image"),
+        (20, "I", 0, "no frame"),
         (20, "I", 0xFFFFFFFF, "table of 4294967295 images"),
         (24, "I", 0xFFFFFF00, "bitmap header"),
         (28, "I", 0xFFFFFF00, "camera setup"),
@@ -321,7 +321,7 @@ def test_a_file_with_any_bytes_changed_is_read_or_refused(tmp_path, kind, data):
         reader = open_frames("left.cine", tmp_path, "left")
     except RecordingError:
         return
-    assert len(reader) * reader.frame_bytes <= 2 * len(content)
+    assert len(reader) * reader.layout.frame_bytes <= 2 * len(content)
     for index in range(len(reader)):
         try:
             reader.read(index)

@@ -15,7 +15,7 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.recording.readers.camera_header import check_headers, header_of
+from disctrack.recording.readers.camera_header import check_headers
 from tests.oracles.camera_files import write_mraw
 
 DEPTHS = (8, 10, 12, 16)
@@ -34,7 +34,7 @@ def test_every_depth_returns_the_pixels_that_were_written(tmp_path, rng, bits, k
         reader = open_frames(named, tmp_path, "left")
         assert isinstance(reader, FrameReader)
         assert (len(reader), reader.image_size, reader.bit_depth) == (7, (32, 24), bits)
-        assert header_of(reader).saturation == (1 << bits) - 1
+        assert reader.header.saturation == (1 << bits) - 1
         out = np.zeros((24, 32), images.dtype)
         for i in range(len(reader)):
             assert_array_equal(reader.read(i), images[i])
@@ -60,7 +60,7 @@ def test_files_of_another_writer_are_read(tmp_path, rng, bits):
     py_mraw.save_mraw(images, str(tmp_path / "left.cih"), bit_depth=bits, info_dict=settings)
     reader = open_frames("left.cih", tmp_path, "left")
     assert_array_equal([reader.read(i) for i in range(7)], images)
-    header = header_of(reader)
+    header = reader.header
     assert (header.frame_rate, header.exposure) == (5000.0, 1 / 20000)
 
 
@@ -84,7 +84,7 @@ def test_settings_come_from_the_header(tmp_path, rng, kind):
     header = write_mraw(
         tmp_path / "left", random_images(rng, 12), 16, depth=12, kind=kind, Start_Frame="-40", Save_Step="4"
     )
-    found = header_of(open_frames(header.name, tmp_path, "left"))
+    found = open_frames(header.name, tmp_path, "left").header
     assert (found.frame_rate, found.step) == (500.0, 4)  # of 2000 frames per second, one in four
     assert found.exposure == pytest.approx(1e-4, rel=1e-12)
     assert (found.trigger, found.first_frame, found.saturation) == ("Start", -40, 4095)
@@ -97,14 +97,14 @@ def test_bits_at_the_high_side_are_used_as_they_are(tmp_path, rng):
     images = random_images(rng, 12) << 4
     write_mraw(tmp_path / "left", images, 16, depth=12, EffectiveBit_Side="Higher")
     reader = open_frames("left.cih", tmp_path, "left")
-    assert (reader.bit_depth, header_of(reader).saturation) == (16, 4095 << 4)
+    assert (reader.bit_depth, reader.header.saturation) == (16, 4095 << 4)
     assert_array_equal(reader.read(3), images[3])
 
 
 def test_values_beyond_the_stated_depth_are_used_and_said(tmp_path, rng):
     write_mraw(tmp_path / "left", random_images(rng, 16), 16, depth=12)
     reader = open_frames("left.cih", tmp_path, "left")
-    assert (reader.bit_depth, header_of(reader).saturation) == (16, 65535)
+    assert (reader.bit_depth, reader.header.saturation) == (16, 65535)
     assert any("grey values go up to" in note for note in reader.notes)
 
 
@@ -133,8 +133,8 @@ def test_what_cannot_be_read_is_refused_with_the_reason(tmp_path, rng, entries, 
 def test_an_impossible_exposure_or_step_is_not_used_and_said(tmp_path, rng):
     write_mraw(tmp_path / "left", random_images(rng, 8), 8, Shutter_Type2="900000", Save_Step="2500")
     reader = open_frames("left.cih", tmp_path, "left")
-    assert header_of(reader).exposure is None
-    assert header_of(reader).frame_rate == 2000
+    assert reader.header.exposure is None
+    assert reader.header.frame_rate == 2000
     assert any("longer than a frame" in note for note in reader.notes)
     assert any("taken as consecutive" in doubt for doubt in reader.doubts)
 

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.camera_header import header_of
 
 SHIPPED = Path(__file__).resolve().parents[4] / "sample_data" / "camera_files"
 
@@ -53,7 +52,7 @@ def test_cines_of_seven_cameras_have_the_pixels_that_dice_finds(name, bits, requ
 def test_a_cine_s_time_stamps_tell_how_many_frames_were_left_out(request):
     camera_files = folder_of("cine_781.cine", request)
     reader = open_frames("cine_781.cine", camera_files, "left")
-    header = header_of(reader)
+    header = reader.header
     assert (len(reader), header.step, header.frame_rate) == (15, 10, 9000)
     assert_allclose(np.diff(reader.timestamps), 1 / 9000, rtol=1e-3)
     assert header.exposure == pytest.approx(10e-6)
@@ -74,7 +73,7 @@ def test_mraw_has_the_pixels_that_pymraw_finds(name, rate, exposure, first, size
     py_mraw = pytest.importorskip("pyMRAW")
     theirs, _ = py_mraw.load_video(str(camera_files / f"{name}.cihx"))
     reader = open_frames(f"{name}.cihx", camera_files, "left")
-    header = header_of(reader)
+    header = reader.header
     assert (reader.image_size, reader.bit_depth, header.saturation) == (size, 12, 4095)
     assert (header.frame_rate, header.exposure, header.first_frame) == (rate, pytest.approx(exposure), first)
     assert_array_equal([reader.read(i) for i in range(len(reader))], theirs)

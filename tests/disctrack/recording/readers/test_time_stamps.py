@@ -12,7 +12,9 @@ EVEN = 17.25 + np.arange(N) / RATE
 
 
 def warnings_of(left, right=EVEN) -> tuple[str, ...]:
-    doubts, warnings = check_time_stamps(SimpleNamespace(timestamps=left), SimpleNamespace(timestamps=right), RATE)
+    doubts, warnings = check_time_stamps(
+        *(SimpleNamespace(timestamps=stamps, header=None) for stamps in (left, right)), RATE
+    )
     return (*warnings, *doubts)
 
 
