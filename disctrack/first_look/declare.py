@@ -20,7 +20,7 @@ from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml, toml_value
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
-from disctrack.recording.declaration import FILE_NAME, OPTIONAL
+from disctrack.recording.declaration import FILE_NAME, KEYS
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
@@ -317,11 +317,8 @@ def _calibration_lines(found: FolderContent, line: Any, example: Mapping[str, An
 def _optional(section: str, example: Mapping[str, Any]) -> list[str]:
     """Keys with a default, where the example gives them."""
     given = example.get(section, {})
-    return [
-        f"{key} = {toml_value(given[key])}"
-        for home, key in sorted(OPTIONAL)
-        if home == section and key in given and key != "rig"
-    ]
+    keys = [key for key, meant in sorted(KEYS[section].items()) if not meant.needed and key in given and key != "rig"]
+    return [f"{key} = {toml_value(given[key])}" for key in keys]
 
 
 def _aligned(text: str, remark: str) -> str:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from calibration.board.target import Board, CharucoBoard, Target
 from calibration.judge.tolerances import BoardTolerances
@@ -16,63 +16,77 @@ from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml
+from disctrack.frames import CAMERAS
 
 FILE_NAME = RECORDING_FILE
-_T = TypeVar("_T")
-
-# Every key that a recording.toml may hold, in the order of the reference example.
-KEYS: dict[str, tuple[str, ...]] = {
-    "": ("name", "case", "surface"),
-    "cameras": (
-        *("frame_rate_hz", "left", "right", "exposure_us"),
-        *("left_flat", "left_dark", "left_part", "right_flat", "right_dark", "right_part"),
-    ),
-    "disc": ("radius_mm", "thickness_mm", "mass_g", "radius_tolerance_mm", "thickness_tolerance_mm", "name"),
-    "markers": ("diameter_mm", "centres_mm"),
-    "calibration": (
-        "left",
-        "right",
-        "target",
-        "inner_corners",
-        "square_mm",
-        "squares",
-        "marker_mm",
-        "dictionary",
-        "rig",
-        "square_tolerance_mm",
-        "flatness_tolerance_mm",
-    ),
-    "table": ("view", "board_thickness_mm", "from", "board_thickness_tolerance_mm"),
-    "gravity": ("g_m_s2",),
-    "air": ("pressure_hPa", "density_kg_m3"),
-}
-
-# What every number may be, both ends included, in the unit that its key names. Wide enough for a coin and for a mill
-# stone, narrow enough that a wrong unit or a slip of the pen is told before it becomes a wrong answer.
-RANGES: dict[str, tuple[float, float]] = {
-    "frame_rate_hz": (0.1, 1e7),
-    "exposure_us": (0, 1e7),
-    "radius_mm": (0.1, 1e4),
-    "thickness_mm": (0.001, 1e4),
-    "mass_g": (0.001, 1e7),
-    "radius_tolerance_mm": (0, 2),
-    "thickness_tolerance_mm": (0, 2),
-    "diameter_mm": (0.001, 1e3),
-    "centres_mm": (-1e4, 1e4),
-    "square_mm": (0.01, 1e4),
-    "marker_mm": (0.01, 1e4),
-    "square_tolerance_mm": (0, 2),
-    "flatness_tolerance_mm": (0, 2),
-    "view": (0, 1e5),
-    "board_thickness_mm": (0, 1e3),
-    "board_thickness_tolerance_mm": (0, 2),
-    "g_m_s2": (0.001, 1e3),
-    "pressure_hPa": (1e-9, 1e5),
-    "density_kg_m3": (1e-9, 1e3),
-}
 MOST_DOTS = 100
 MOST_CELLS = 100  # corners or squares along a side of a target
 MOST_COLUMNS = 10**6  # [px] of an image
+
+
+class Key(NamedTuple):
+    """What may stand at a key."""
+
+    expected: str  # in words
+    fits: Callable[[Any], bool]
+    needed: bool = True  # in its section, where that is there
+    between: tuple[float, float] | None = None  # of a number, both ends included, in the unit that the key names
+
+
+def _in_range(value: object, least: float, most: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
+
+
+def _number(least: float, most: float, needed: bool = True) -> Key:
+    return Key(
+        f"a number from {least:g} to {most:g}", lambda value: _in_range(value, least, most), needed, (least, most)
+    )
+
+
+def _whole(value: object, n: int, least: int, most: int) -> bool:
+    """Is this a list of n whole numbers in a range?"""
+    return isinstance(value, list) and len(value) == n and all(type(x) is int and least <= x <= most for x in value)
+
+
+def _text(example: str, needed: bool = False) -> Key:
+    return Key(example, lambda value: isinstance(value, str) and bool(value.strip()) and "\0" not in value, needed)
+
+
+def _one_of(*words: str) -> Key:
+    quoted = [f'"{word}"' for word in words]
+    return Key(f"{', '.join(quoted[:-1])} or {quoted[-1]}", lambda value: value in words, needed=False)
+
+
+def _counts(what: str, needed: bool = True) -> Key:
+    expected = f"two whole numbers from 1 to {MOST_CELLS}, {what}, e.g. [9, 6]"
+    return Key(expected, lambda value: _whole(value, 2, 1, MOST_CELLS), needed)
+
+
+def _are_centres(value: object) -> bool:
+    return (
+        isinstance(value, list)
+        and 3 <= len(value) <= MOST_DOTS
+        and all(isinstance(dot, list) and len(dot) == 2 for dot in value)
+        and all(_in_range(x, -_FARTHEST, _FARTHEST) for dot in value for x in dot)
+    )
+
+
+_FARTHEST = 1e4  # [mm] from the disc's centre
+_LABEL = _text('text in quotes, e.g. "rec_a"')
+_FILES = _text('a file pattern in quotes, e.g. "left/*.png"', needed=True)
+_MORE_FILES = _FILES._replace(needed=False)
+_TOLERANCE = _number(0, 2, needed=False)
+_PART = Key(
+    f"[x, y, width, height] in pixels up to {MOST_COLUMNS}, a width and a height above 0",
+    lambda value: _whole(value, 4, 0, MOST_COLUMNS) and min(value[2:]) > 0,
+    needed=False,
+)
+_VIEW = Key("a whole number from 0 to 100000", lambda value: _whole([value], 1, 0, 100_000), between=(0, 1e5))
+_CENTRES = Key(
+    f"a list of [x, y] pairs, at least 3 and at most {MOST_DOTS} of them, each number from {-_FARTHEST:g} to "
+    f"{_FARTHEST:g}, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]",
+    _are_centres,
+)
 
 # What declares each kind of calibration target.
 TARGET_KEYS: dict[str, tuple[str, ...]] = {
@@ -80,22 +94,53 @@ TARGET_KEYS: dict[str, tuple[str, ...]] = {
     "charuco": ("squares", "square_mm", "marker_mm", "dictionary"),
 }
 
-# Keys that have a default, or belong to another target than a chessboard; a calibration is either views or a rig.
-OPTIONAL = {
-    ("air", "pressure_hPa"),
-    ("air", "density_kg_m3"),
-    ("cameras", "exposure_us"),
-    *(("cameras", f"{camera}_{kind}") for camera in ("left", "right") for kind in ("flat", "dark", "part")),
-    ("disc", "name"),
-    ("calibration", "target"),
-    *(("calibration", key) for keys in TARGET_KEYS.values() for key in keys if key not in TARGET_KEYS["chessboard"]),
-    ("disc", "radius_tolerance_mm"),
-    ("disc", "thickness_tolerance_mm"),
-    ("calibration", "rig"),
-    ("calibration", "square_tolerance_mm"),
-    ("calibration", "flatness_tolerance_mm"),
-    ("table", "board_thickness_tolerance_mm"),
-    ("table", "from"),
+# Every key that a recording.toml may hold, in the order of the reference example. Ranges are wide enough for a coin and
+# for a mill stone, narrow enough that a wrong unit or a slip of the pen is told before it becomes a wrong answer.
+# A calibration is either views or a rig; the keys of a target are needed where it is that one.
+KEYS: dict[str, dict[str, Key]] = {
+    "": {"name": _LABEL, "case": _LABEL, "surface": _LABEL},
+    "cameras": {
+        "frame_rate_hz": _number(0.1, 1e7),
+        "left": _FILES,
+        "right": _FILES,
+        "exposure_us": _number(0, 1e7, needed=False),
+        "left_flat": _MORE_FILES,
+        "left_dark": _MORE_FILES,
+        "left_part": _PART,
+        "right_flat": _MORE_FILES,
+        "right_dark": _MORE_FILES,
+        "right_part": _PART,
+    },
+    "disc": {
+        "radius_mm": _number(0.1, 1e4),
+        "thickness_mm": _number(0.001, 1e4),
+        "mass_g": _number(0.001, 1e7),
+        "radius_tolerance_mm": _TOLERANCE,
+        "thickness_tolerance_mm": _TOLERANCE,
+        "name": _LABEL,
+    },
+    "markers": {"diameter_mm": _number(0.001, 1e3), "centres_mm": _CENTRES},
+    "calibration": {
+        "left": _FILES,
+        "right": _FILES,
+        "target": _one_of(*TARGET_KEYS),
+        "inner_corners": _counts("inner corners along the long and the short side"),
+        "square_mm": _number(0.01, 1e4),
+        "squares": _counts("columns and rows of squares, dark and light", needed=False),
+        "marker_mm": _number(0.01, 1e4, needed=False),
+        "dictionary": _LABEL,
+        "rig": _MORE_FILES,
+        "square_tolerance_mm": _TOLERANCE,
+        "flatness_tolerance_mm": _TOLERANCE,
+    },
+    "table": {
+        "view": _VIEW,
+        "board_thickness_mm": _number(0, 1e3),
+        "from": _one_of("board", "disc", "both"),
+        "board_thickness_tolerance_mm": _TOLERANCE,
+    },
+    "gravity": {"g_m_s2": _number(0.001, 1e3)},
+    "air": {"pressure_hPa": _number(1e-9, 1e5, needed=False), "density_kg_m3": _number(1e-9, 1e3, needed=False)},
 }
 
 
@@ -106,13 +151,6 @@ class CalibrationViews:
     left: str  # file pattern relative to the recording's folder
     right: str
     target: Target
-
-
-class SensorImages(NamedTuple):
-    """What shows the gain and the offset of a camera's pixels: file patterns, or folders of images to be averaged."""
-
-    flat: str | None = None  # an evenly lit surface
-    dark: str | None = None  # no light at all
 
 
 @dataclass(frozen=True)
@@ -142,7 +180,9 @@ class Recording(Outline):
     board_tolerances: BoardTolerances
     declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
     air_density: float = AIR_DENSITY  # [kg/m^3] round the disc
-    sensors: tuple[SensorImages, SensorImages] = (SensorImages(), SensorImages())  # left, right
+    # left, right: file patterns, or folders of images to be averaged, that show the gain and the offset of a camera's
+    # pixels: of an evenly lit surface, and without any light
+    sensors: tuple[tuple[str | None, str | None], ...] = ((None, None), (None, None))
     # left, right: x, y of the upper left corner, width and height [px] where a camera's images are a part of the files'
     parts: tuple[tuple[int, int, int, int] | None, ...] = (None, None)
 
@@ -166,48 +206,50 @@ def read_recording(path: str | Path) -> Recording:
     keep(file)
     declared = read_toml(file, RecordingError)
     _refuse_unknown_keys(file, declared)
-    cameras, disc, markers = (_Section(file, declared, name) for name in ("cameras", "disc", "markers"))
-    calibration = _Section(file, declared, "calibration")
-    views, rig_file = _calibration_source(calibration)
-    for label in ("case", "surface"):  # what repeats are grouped by; kept with the results in `declared`
-        if label in declared:
-            _Section(file, declared, "").get(label, _text)
-    if "name" in declared.get("disc", {}):  # which disc it was, where sizes and mass do not tell; also kept there
-        disc.get("name", _text)
+    _refuse_missing(file, declared)
+    _refuse_unfit(file, declared)
+    cameras, calibration = declared["cameras"], declared["calibration"]
+    rate = float(cameras["frame_rate_hz"])
+    exposure = float(cameras["exposure_us"]) / 1e6 if "exposure_us" in cameras else None
+    if exposure is not None and exposure * rate > 1.001:
+        raise RecordingError(
+            f"{file}: [cameras] exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 / rate:g} us at "
+            "frame_rate_hz. It is in microseconds: 0.2 ms is 200."
+        )
+    _refuse_mixed_calibration(file, calibration)
+    views, table = None, None
+    if "rig" not in calibration:
+        views = CalibrationViews(calibration["left"], calibration["right"], _target(file, calibration))
+    if on_table := declared.get("table", {}):
+        thickness = on_table["board_thickness_mm"] * 1e-3
+        table = TableView(on_table["view"], thickness, on_table.get("from", "both"))
     return Recording(
         folder=file.parent,
-        name=_Section(file, declared, "").get("name", _text) if "name" in declared else file.parent.resolve().name,
-        frame_rate=cameras.number("frame_rate_hz"),
-        exposure=_exposure(cameras) if "exposure_us" in cameras else None,
-        left=cameras.get("left", _pattern),
-        right=cameras.get("right", _pattern),
-        disc=_disc(disc, markers),
+        name=declared.get("name", file.parent.resolve().name),
+        frame_rate=rate,
+        exposure=exposure,
+        left=cameras["left"],
+        right=cameras["right"],
+        disc=_disc(file, declared["disc"], declared["markers"]),
         views=views,
-        table=_table(file, declared, required=rig_file is None),
-        rig_file=rig_file,
-        board_tolerances=_tolerances(file, declared),
-        gravity=_Section(file, declared, "gravity").number("g_m_s2"),
-        air_density=_air_density(_Section(file, declared, "air")) if "air" in declared else AIR_DENSITY,
+        table=table,
+        rig_file=file.parent / calibration["rig"] if "rig" in calibration else None,
+        board_tolerances=_tolerances(calibration, on_table),
+        gravity=float(declared["gravity"]["g_m_s2"]),
+        air_density=_air_density(file, declared.get("air", {})),
         declared=declared,
-        sensors=(_sensor(cameras, "left"), _sensor(cameras, "right")),
-        parts=tuple(cameras.get(key, _part) if key in cameras else None for key in ("left_part", "right_part")),
+        sensors=tuple((cameras.get(f"{name}_flat"), cameras.get(f"{name}_dark")) for name in CAMERAS),
+        parts=tuple(cameras.get(f"{name}_part") for name in CAMERAS),
     )
 
 
-def _air_density(air: _Section) -> float:
+def _air_density(file: Path, air: Mapping[str, float]) -> float:
     """[kg/m^3] as declared, or in proportion to the pressure at room temperature."""
     if "density_kg_m3" in air and "pressure_hPa" in air:
-        raise air.error("has both pressure_hPa and density_kg_m3; expected one of them. Keep the one you measured.")
-    if "density_kg_m3" in air:
-        return float(air.number("density_kg_m3"))
-    return AIR_DENSITY * (float(air.number("pressure_hPa")) / STANDARD_PRESSURE)
-
-
-def _sensor(cameras: _Section, camera: str) -> SensorImages:
-    flat, dark = (
-        cameras.get(key, _pattern) if key in cameras else None for key in (f"{camera}_flat", f"{camera}_dark")
-    )
-    return SensorImages(flat, dark)
+        raise RecordingError(
+            f"{file}: [air] has both pressure_hPa and density_kg_m3; expected one of them. Keep the one you measured."
+        )
+    return float(air.get("density_kg_m3", AIR_DENSITY * air.get("pressure_hPa", STANDARD_PRESSURE) / STANDARD_PRESSURE))
 
 
 def _recording_file(path: Path) -> Path:
@@ -251,52 +293,30 @@ def _nearest(name: str, section: str, kind: str = "key") -> str:
     return f"Known here: {', '.join(here)}."
 
 
-def _missing(declared: Mapping[str, Any]) -> list[str]:
-    """Keys without a default that sections which are there lack, so that one message names them all."""
+def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:
+    """One message names all keys without a default that sections which are there lack."""
     calibration = declared.get("calibration", {})
-    target = calibration.get("target", "chessboard")
-    needed = {
-        section: [key for key in keys if (section, key) not in OPTIONAL] for section, keys in KEYS.items() if section
-    }
-    needed["calibration"] = ["left", "right", *TARGET_KEYS.get(str(target), ())] if "rig" not in calibration else []
-    return [f"[{s}] {key}" for s, keys in needed.items() for key in keys if s in declared and key not in declared[s]]
+    needed = {section: [key for key, meant in keys.items() if meant.needed] for section, keys in KEYS.items()}
+    if "rig" in calibration:
+        needed["calibration"] = []
+    else:
+        needed["calibration"] = ["left", "right", *TARGET_KEYS.get(str(calibration.get("target", "chessboard")), ())]
+    for section, keys in needed.items():
+        if keys and section not in declared and not (section == "table" and "rig" in calibration):
+            raise RecordingError(f"{file}: section [{section}] is missing; it holds {', '.join(KEYS[section])}.")
+    names = [f"[{s}] {key}" for s, keys in needed.items() for key in keys if s in declared and key not in declared[s]]
+    if names:
+        said = "is missing. Add it" if len(names) == 1 else "are missing. Add them"
+        raise RecordingError(f"{file}: {', '.join(names)} {said}: every length in mm, mass in g, time in s.")
 
 
-class _Section:
-    """One section of a recording.toml; `get` converts a value or says what is wrong with it."""
-
-    def __init__(self, file: Path, declared: Mapping[str, Any], name: str) -> None:
-        self.file, self.name = file, name
-        if name and name not in declared:
-            raise RecordingError(f"{file}: section [{name}] is missing; it holds {', '.join(KEYS[name])}.")
-        self.values: Mapping[str, Any] = declared[name] if name else declared
-        self.declared = declared
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.values
-
-    def get(self, key: str, convert: Callable[[object], _T]) -> _T:
-        where = f"[{self.name}] {key}" if self.name else key
-        if key not in self.values:
-            names = _missing(self.declared)
-            names = names if where in names else [where, *names]
-            said = "is missing. Add it" if len(names) == 1 else "are missing. Add them"
-            raise RecordingError(f"{self.file}: {', '.join(names)} {said}: every length in mm, mass in g, time in s.")
-        try:
-            return convert(self.values[key])
-        except _Unfit as error:
-            raise RecordingError(f"{self.file}: {where} is {_shown(self.values[key])}; expected {error}.") from error
-
-    def number(self, key: str) -> float:
-        """The number at a key, within its range."""
-        return float(self.get(key, lambda value: _number(value, *RANGES[key])))
-
-    def error(self, message: str) -> RecordingError:
-        return RecordingError(f"{self.file}: [{self.name}] {message}")
-
-
-class _Unfit(Exception):
-    """The text says what was expected instead."""
+def _refuse_unfit(file: Path, declared: Mapping[str, Any]) -> None:
+    for section, keys in KEYS.items():
+        given = declared.get(section, {}) if section else declared
+        for key, meant in keys.items():
+            if key in given and not meant.fits(given[key]):
+                where = f"[{section}] {key}" if section else key
+                raise RecordingError(f"{file}: {where} is {_shown(given[key])}; expected {meant.expected}.")
 
 
 def _shown(value: object) -> str:
@@ -307,153 +327,64 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _number(value: object, least: float = -math.inf, most: float = math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise _Unfit(f"a number from {least:g} to {most:g}")
-    return float(value)
-
-
-def _index(value: object) -> int:
-    if type(value) is not int or not 0 <= value <= RANGES["view"][1]:
-        raise _Unfit(f"a whole number from 0 to {RANGES['view'][1]:g}")
-    return value
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise _Unfit('text in quotes, e.g. "rec_a"')
-    return value
-
-
-def _pattern(value: object) -> str:
-    if not isinstance(value, str) or not value.strip() or "\0" in value:
-        raise _Unfit('a file pattern in quotes, e.g. "left/*.png"')
-    return value
-
-
-def _whole_numbers(value: object, n: int, least: int, most: int) -> list[int]:
-    """The value as a list of n whole numbers in a range; an empty list where it is anything else."""
-    fits = isinstance(value, list) and len(value) == n and all(type(x) is int and least <= x <= most for x in value)
-    return list(value) if fits and isinstance(value, list) else []
-
-
-def _part(value: object) -> tuple[int, int, int, int]:
-    x, y, width, height = _whole_numbers(value, 4, 0, MOST_COLUMNS) or [0, 0, 0, 0]
-    if not (width and height):
-        raise _Unfit(f"[x, y, width, height] in pixels up to {MOST_COLUMNS}, a width and a height above 0")
-    return x, y, width, height
-
-
-def _table_source(value: object) -> str:
-    if value not in ("board", "disc", "both"):
-        raise _Unfit('"board", "disc" or "both"')
-    return str(value)
-
-
-def _counts_of(what: str) -> Callable[[object], tuple[int, int]]:
-    def convert(value: object) -> tuple[int, int]:
-        numbers = _whole_numbers(value, 2, 1, MOST_CELLS)
-        if not numbers:
-            raise _Unfit(f"two whole numbers from 1 to {MOST_CELLS}, {what}, e.g. [9, 6]")
-        return numbers[0], numbers[1]
-
-    return convert
-
-
-def _target_kind(value: object) -> str:
-    if not isinstance(value, str) or value not in TARGET_KEYS:
-        raise _Unfit("one of " + ", ".join(f'"{name}"' for name in TARGET_KEYS))
-    return value
-
-
-def _centres(value: object) -> list[list[float]]:
-    least, most = RANGES["centres_mm"]
-    try:
-        if isinstance(value, list) and 3 <= len(value) <= MOST_DOTS:
-            return [[_number(x, least, most), _number(y, least, most)] for x, y in value]
-    except (_Unfit, TypeError, ValueError):  # not a number, not a list, not two of them
-        pass
-    raise _Unfit(
-        f"a list of [x, y] pairs, at least 3 and at most {MOST_DOTS} of them, each number from {least:g} to {most:g}, "
-        "e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
-    )
-
-
-def _exposure(cameras: _Section) -> float:
-    exposure, interval = cameras.number("exposure_us") / 1e6, 1 / cameras.number("frame_rate_hz")
-    if exposure > 1.001 * interval:
-        raise cameras.error(
-            f"exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 * interval:g} us at frame_rate_hz. "
-            "It is in microseconds: 0.2 ms is 200."
-        )
-    return float(exposure)
-
-
-def _disc(disc: _Section, markers: _Section) -> Disc:
-    radius_mm = disc.number("radius_mm")
-    diameter_mm = markers.number("diameter_mm")
-    centres_mm = markers.get("centres_mm", _centres)
-    for number, (x, y) in enumerate(centres_mm):
-        if math.hypot(x, y) + diameter_mm / 2 > radius_mm:
-            raise markers.error(
-                f"centres_mm: dot {number} at ({x:g}, {y:g}) with diameter {diameter_mm:g} reaches over the disc's rim "
-                f"(radius {radius_mm:g}). Centres are in mm from the disc's centre."
+def _disc(file: Path, disc: Mapping[str, Any], markers: Mapping[str, Any]) -> Disc:
+    radius, diameter, centres = disc["radius_mm"], markers["diameter_mm"], markers["centres_mm"]
+    for number, (x, y) in enumerate(centres):
+        if math.hypot(x, y) + diameter / 2 > radius:
+            raise RecordingError(
+                f"{file}: [markers] centres_mm: dot {number} at ({x:g}, {y:g}) with diameter {diameter:g} reaches over "
+                f"the disc's rim (radius {radius:g}). Centres are in mm from the disc's centre."
             )
-        for other, (u, v) in enumerate(centres_mm[:number]):
-            if math.hypot(x - u, y - v) < diameter_mm:
-                raise markers.error(
-                    f"centres_mm: dots {other} and {number} overlap: {math.hypot(x - u, y - v):g} mm apart with "
-                    f"diameter {diameter_mm:g}. Give each dot once."
+        for other, (u, v) in enumerate(centres[:number]):
+            if math.hypot(x - u, y - v) < diameter:
+                raise RecordingError(
+                    f"{file}: [markers] centres_mm: dots {other} and {number} overlap: "
+                    f"{math.hypot(x - u, y - v):g} mm apart with diameter {diameter:g}. Give each dot once."
                 )
-    sizes = radius_mm, disc.number("thickness_mm"), disc.number("mass_g")
-    tolerances = {key: disc.number(key) for key in ("radius_tolerance_mm", "thickness_tolerance_mm") if key in disc}
-    return disc_from_mm(*sizes, centres_mm, diameter_mm, **tolerances)
+    tolerances = {key: disc[key] for key in ("radius_tolerance_mm", "thickness_tolerance_mm") if key in disc}
+    return disc_from_mm(radius, disc["thickness_mm"], disc["mass_g"], centres, diameter, **tolerances)
 
 
-def _calibration_source(section: _Section) -> tuple[CalibrationViews | None, Path | None]:
-    kind = section.get("target", _target_kind) if "target" in section else "chessboard"
-    of_targets = {key: [name for name, keys in TARGET_KEYS.items() if key in keys] for key in KEYS["calibration"]}
-    for key, kinds in of_targets.items():
-        if kinds and key in section and kind not in kinds and "rig" not in section:
-            named = " or ".join(f'target = "{name}"' for name in kinds)
-            raise section.error(f"{key} belongs to {named}; the target here is {kind}: {', '.join(TARGET_KEYS[kind])}.")
-    views = [key for key in ("left", "right", *dict.fromkeys(sum(TARGET_KEYS.values(), ()))) if key in section]
-    if "rig" in section:
+def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> None:
+    """Raise RecordingError for keys of another target, and for views beside a rig."""
+    of_targets = dict.fromkeys(key for keys in TARGET_KEYS.values() for key in keys)
+    if "rig" in calibration:
+        views = [key for key in ("left", "right", *of_targets) if key in calibration]
         if views:
-            raise section.error(f"has both rig and {', '.join(views)}. Keep the rig file, or the chessboard views.")
-        return None, section.file.parent / section.get("rig", _pattern)
-    return CalibrationViews(section.get("left", _pattern), section.get("right", _pattern), _target(section, kind)), None
+            raise RecordingError(
+                f"{file}: [calibration] has both rig and {', '.join(views)}. Keep the rig file, or the chessboard "
+                "views."
+            )
+        return
+    kind = calibration.get("target", "chessboard")
+    for key in of_targets:
+        if key in calibration and key not in TARGET_KEYS[kind]:
+            named = " or ".join(f'target = "{name}"' for name, keys in TARGET_KEYS.items() if key in keys)
+            raise RecordingError(
+                f"{file}: [calibration] {key} belongs to {named}; the target here is {kind}: "
+                f"{', '.join(TARGET_KEYS[kind])}."
+            )
 
 
-def _target(section: _Section, kind: str) -> Target:
+def _target(file: Path, calibration: Mapping[str, Any]) -> Target:
     """The target as declared. Raises RecordingError."""
+    square = calibration["square_mm"] * 1e-3
     try:
-        if kind == "chessboard":
-            corners = section.get("inner_corners", _counts_of("inner corners along the long and the short side"))
-            return Board(corners, section.number("square_mm") * 1e-3)
-        squares = section.get("squares", _counts_of("columns and rows of squares, dark and light"))
-        square, marker = (section.number(key) * 1e-3 for key in ("square_mm", "marker_mm"))
-        return CharucoBoard(squares, square, marker, section.get("dictionary", _text))
+        if "inner_corners" in calibration:
+            return Board(tuple(calibration["inner_corners"]), square)
+        marker = calibration["marker_mm"] * 1e-3
+        return CharucoBoard(tuple(calibration["squares"]), square, marker, calibration["dictionary"])
     except CalibrationError as error:
-        raise section.error(str(error)) from error
+        raise RecordingError(f"{file}: [calibration] {error}") from error
 
 
-def _tolerances(file: Path, declared: Mapping[str, Any]) -> BoardTolerances:
+def _tolerances(calibration: Mapping[str, float], table: Mapping[str, float]) -> BoardTolerances:
     """What is not declared takes its default."""
     given: dict[str, float] = {}
-    calibration = _Section(file, declared, "calibration")
     if "square_tolerance_mm" in calibration and "square_mm" in calibration:
-        given["square"] = calibration.number("square_tolerance_mm") / calibration.number("square_mm")
+        given["square"] = calibration["square_tolerance_mm"] / calibration["square_mm"]
     if "flatness_tolerance_mm" in calibration:
-        given["flatness"] = calibration.number("flatness_tolerance_mm") * 1e-3
-    if "board_thickness_tolerance_mm" in declared.get("table", {}):
-        given["thickness"] = _Section(file, declared, "table").number("board_thickness_tolerance_mm") * 1e-3
+        given["flatness"] = calibration["flatness_tolerance_mm"] * 1e-3
+    if "board_thickness_tolerance_mm" in table:
+        given["thickness"] = table["board_thickness_tolerance_mm"] * 1e-3
     return BoardTolerances(**given)
-
-
-def _table(file: Path, declared: Mapping[str, Any], required: bool) -> TableView | None:
-    if "table" not in declared and not required:
-        return None
-    table = _Section(file, declared, "table")
-    source = table.get("from", _table_source) if "from" in table else "both"
-    return TableView(table.get("view", _index), table.number("board_thickness_mm") * 1e-3, source)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.recording.declaration import KEYS, OPTIONAL, RANGES, read_recording
+from disctrack.recording.declaration import KEYS, read_recording
 
 REFERENCE = """
 name = "clip"
@@ -36,6 +36,9 @@ board_thickness_mm = 3.0
 [gravity]
 g_m_s2 = 9.81
 """
+
+
+NEEDED = [(section, key) for section, keys in KEYS.items() for key, meant in keys.items() if meant.needed]
 
 
 def write(folder: Path, text: str | bytes) -> Path:
@@ -66,8 +69,8 @@ def test_every_key_of_the_reference_recording_is_known(shared_data):
     recording = read_recording(shared_data / "rec_a")
     assert recording.frame_rate == 1000.0
     assert recording.disc.n_markers == 6
-    named = {(section, key) for section in KEYS for key in KEYS[section] if section} - OPTIONAL
-    assert named == {(s, k) for s, values in recording.declared.items() if isinstance(values, dict) for k in values}
+    sections = {section: keys for section, keys in recording.declared.items() if isinstance(keys, dict)}
+    assert set(NEEDED) == {(section, key) for section, keys in sections.items() for key in keys}
 
 
 @pytest.mark.parametrize(
@@ -93,7 +96,7 @@ def test_a_shared_rig_replaces_views_and_table(tmp_path):
     assert recording.table is None
 
 
-@pytest.mark.parametrize(("section", "key"), [(s, k) for s in KEYS if s for k in KEYS[s] if (s, k) not in OPTIONAL])
+@pytest.mark.parametrize(("section", "key"), NEEDED)
 def test_each_missing_key_is_named_with_its_section(tmp_path, section, key):
     lines = REFERENCE.splitlines()
     start = lines.index(f"[{section}]")
@@ -107,7 +110,7 @@ def test_keys_that_init_leaves_open_are_named_at_once(tmp_path):
     assert re.search(r"\[disc\] mass_g, \[calibration\] square_mm, \[table\] view are missing", message(tmp_path, text))
 
 
-@pytest.mark.parametrize("section", [s for s, keys in KEYS.items() if s and any((s, k) not in OPTIONAL for k in keys)])
+@pytest.mark.parametrize("section", sorted({s for s, _ in NEEDED}))
 def test_each_missing_section_is_named(tmp_path, section):
     start = REFERENCE.index(f"[{section}]")
     end = REFERENCE.find("\n[", start)
@@ -158,7 +161,7 @@ def test_a_wrong_value_is_shown_with_what_was_expected(tmp_path, written, found,
     assert expected in message(tmp_path, REFERENCE.replace(written, found, 1))
 
 
-NUMBERS = [(key, *between) for key, between in RANGES.items() if key != "centres_mm"]
+NUMBERS = [(key, *meant.between) for keys in KEYS.values() for key, meant in keys.items() if meant.between]
 
 ELSEWHERE = {  # keys that the reference does not hold: section, and what must stand there besides
     "exposure_us": ("cameras", ""), "radius_tolerance_mm": ("disc", ""), "thickness_tolerance_mm": ("disc", ""),
@@ -188,9 +191,9 @@ def test_every_number_has_a_range_and_the_message_tells_it(tmp_path, key, least,
 
 
 def test_every_number_that_is_declared_has_a_range():
-    assert set(RANGES) <= {key for keys in KEYS.values() for key in keys}
     units = ("_mm", "_g", "_hz", "_us", "_s2", "_hPa", "_m3")
-    assert {k for keys in KEYS.values() for k in keys if k.endswith(units)} <= RANGES.keys()
+    named = {k for keys in KEYS.values() for k in keys if k.endswith(units)} - {"centres_mm"}
+    assert named <= {key for key, *_ in NUMBERS}
 
 
 def test_dots_are_bounded_in_number(tmp_path):
